@@ -338,8 +338,8 @@ def of_estimator(row):
     looks, observers = {}, {}
     for rays in RAYS:
         of_paper = PaperReference(rows=int(rays**0.5), columns=int(rays**0.5))
-        of_surface = SurfaceReference(AREAS, rays=rays, band_frame=band_frame)
-        looks[rays] = frames.with_reference_sensor(of_paper if measure == "known" else of_surface)
+        of_surface = SurfaceReference(AREAS, num_rays=rays, band_frame=band_frame)
+        looks[rays] = frames.replace_reference_sensor(of_paper if measure == "known" else of_surface)
         metric = CoverageMetric(grid, max_radius=grid.diagonal_m, square_metres=measure == "area")
         observers[rays] = CoverageObserver(metric)
     for index, cloud in enumerate(rig_clouds(frames)):
@@ -361,7 +361,7 @@ def of_draws(scenario):
     for index, cloud in enumerate(rig_clouds(frames)):
         for draw in range(DRAWS):
             for at, rays in enumerate((FEW, MANY)):
-                look = frames.with_reference_sensor(SurfaceReference(AREAS, rays=rays, band_frame="ground"))
+                look = frames.replace_reference_sensor(SurfaceReference(AREAS, num_rays=rays, band_frame="ground"))
                 look.simulator.seed = draw  # of places and points; what stands there is drawn already
                 sums[at, draw] += sums_of(look[index], cloud)
     few, many = sums[..., 1:] / sums[..., :1]
@@ -406,10 +406,12 @@ def shown(pair):
 
 def frames_of(scenario, *, cities=BUDGET_CITIES, seed=0, vehicle=None, frame_interval_s=EVERY_S):
     """All instants of whole cities, or of a scenario that repeats itself; no rig is in them."""
-    few = SimulatedFrames(scenario, rigs={}, steps=1, seed=seed, frame_interval_s=frame_interval_s, vehicle=vehicle)
-    steps = few.simulator.distinct_steps or STEPS_OF_A_CITY * cities
+    few = SimulatedFrames(
+        scenario, rigs={}, num_frames=1, seed=seed, frame_interval_s=frame_interval_s, vehicle=vehicle
+    )
+    steps = few.simulator.num_distinct_frames or STEPS_OF_A_CITY * cities
     return SimulatedFrames(
-        scenario, rigs={}, steps=steps, seed=seed, frame_interval_s=frame_interval_s, vehicle=vehicle
+        scenario, rigs={}, num_frames=steps, seed=seed, frame_interval_s=frame_interval_s, vehicle=vehicle
     )
 
 

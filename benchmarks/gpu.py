@@ -12,7 +12,7 @@ import torch
 
 from benchmarks import table
 from torchcover import nearest
-from torchcover.data import RegionsOfInterest, SimulatedFrames, reference_called
+from torchcover.data import RegionsOfInterest, SimulatedFrames, create_reference_sensor
 from torchcover.evaluation import CoverageObserver, Settings
 from torchcover.evaluation.measuring import build_metric
 from torchcover.neighbors.warp import wp
@@ -68,8 +68,10 @@ def wall_ms(function, device):
 
 
 def frames_of(device=None, steps=1, rays=16_384):
-    reference = reference_called(rays=rays)
-    return SimulatedFrames(SCENARIO, RIG, steps=steps, frame_interval_s=10.0, reference_sensor=reference, device=device)
+    reference = create_reference_sensor(num_rays=rays)
+    return SimulatedFrames(
+        SCENARIO, RIG, num_frames=steps, frame_interval_s=10.0, reference_sensor=reference, device=device
+    )
 
 
 def searches(device, most):
@@ -125,21 +127,21 @@ def moved_and_added(observer, frame):
 
 
 def observer_on(device):
-    asked = RegionsOfInterest().around(cell_m=0.25)
+    asked = RegionsOfInterest().build_query_plan(cell_m=0.25)
     return CoverageObserver(build_metric(Settings(), asked, has_area_weights=True).to(device), RIG)
 
 
 def rays(device):
     """From the vehicle's roof, all around, at what never moves: of a scan, and of the paper's reference."""
-    scene, _ = frames_of().simulator.scene_of(0)
-    origin_m = scene.world.ego.trajectory.interpolate(0.0)[:3, 3] + (0.0, 0.0, 1.9)
-    casters = [RayCaster(scene.world.static, where) for where in (None, str(device))]
+    scene, _ = frames_of().simulator.get_scene_geometry(0)
+    origin_m = scene.scene.ego.trajectory.interpolate(0.0)[:3, 3] + (0.0, 0.0, 1.9)
+    casters = [RayCaster(scene.scene.static_meshes, where) for where in (None, str(device))]
     for size in (480, 1024):
-        directions = PaperReference(rows=size, columns=size).directions().reshape(3, -1).astype(np.float32)
+        directions = PaperReference(rows=size, columns=size).compute_directions().reshape(3, -1).astype(np.float32)
         limit_m = np.full(directions.shape[1], 200.0, dtype=np.float32)
         hits = [caster.cast(origin_m, directions, limit_m) for caster in casters]
         times = [wall_ms(partial(caster.cast, origin_m, directions, limit_m), device) for caster in casters]
-        differ = int((hits[0].body != hits[1].body).sum())
+        differ = int((hits[0].body_indices != hits[1].body_indices).sum())
         yield f"{directions.shape[1]:,}", *times, times[0] / times[1], differ
 
 
@@ -151,14 +153,14 @@ def steps(device, count):
             frames = frames_of(where, count, rays)
             observer = observer_on(where or "cpu")
             for index in range(count):
-                frames.simulator.scene_of(index)
+                frames.simulator.get_scene_geometry(index)
             moved_and_added(observer, frames[0])
             begin_s = time.perf_counter()
             for index in range(1, count):
                 moved_and_added(observer, frames[index])
             times.append(1e3 * (time.perf_counter() - begin_s) / (count - 1))
             found.append(observer.metric.compute())
-        regions = RegionsOfInterest().around(cell_m=0.25).regions
+        regions = RegionsOfInterest().build_query_plan(cell_m=0.25).regions
         shares = [{name: value for name, value in one.scalars(regions).items() if "detect" in name} for one in found]
         differ = max(abs(shares[0][name] - shares[1][name]) for name in shares[0])
         yield f"{rays:,} rays of the reference", *times, times[0] / times[1], 100 * differ

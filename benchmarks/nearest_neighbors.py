@@ -97,7 +97,7 @@ def cases():
     }
     for name, sensor in references.items():
         frame = SimulatedFrames(
-            "urban", rigs={rig: rig for rig in RIGS}, steps=1, reference_sensor=sensor, vehicle="suv"
+            "urban", rigs={rig: rig for rig in RIGS}, num_frames=1, reference_sensor=sensor, vehicle="suv"
         )[0]
         for rig in RIGS:
             yield f"{rig}, {name}", frame.reference.numpy(), frame.get_cloud(rig).numpy()

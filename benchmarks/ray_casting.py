@@ -14,11 +14,11 @@ from embreex.rtcore_scene import EmbreeScene
 from benchmarks import compare, table
 from torchcover.data import SimulatedFrames
 from torchcover.evaluation.cores import set_threads
-from torchcover.simulation import Draws, PaperReference, Rig, Scenario
+from torchcover.simulation import PaperReference, Rig, Scenario, SensorNoise
 from torchcover.simulation.instant import SensorScan
-from torchcover.simulation.raycaster import cast_from
-from torchcover.simulation.rays import into_tiles, rotate
-from torchcover.simulation.scene import Scene
+from torchcover.simulation.raycaster import cast_from_vehicle
+from torchcover.simulation.rays import rotate, split_into_tiles
+from torchcover.simulation.scene import SceneGeometry
 from torchcover.simulation.sight import MountedSensor
 
 RANGE_M = 120.0
@@ -31,13 +31,16 @@ def main():
     set_threads()  # as the command line does
     show_ray_casting()
     print()
-    urban = Scene(Scenario.load("urban").world())
-    roof, kitti = (Rig.load(rig).sensing("ideal").sensors[0] for rig in ("front_roof_128", "kitti"))
+    urban = SceneGeometry(Scenario.load("urban").build_scene())
+    roof, kitti = (Rig.load(rig).apply_sensor_model("ideal").sensors[0] for rig in ("front_roof_128", "kitti"))
     rows = [
         row("bodies that a ray cannot meet", *rays_that_pass_by(urban)),
         row("the ego, seen by `front_roof_128`", *ego_again(urban, roof)),
         row("the ego, seen by the LiDAR of `kitti`", *ego_again(urban, kitti)),
-        row("a rig where nothing moves (`courtyard`)", *scan_again(Scene(Scenario.load("courtyard").world()), roof)),
+        row(
+            "a rig where nothing moves (`courtyard`)",
+            *scan_again(SceneGeometry(Scenario.load("courtyard").build_scene()), roof),
+        ),
         row("building the static world (`urban`)", *world_again(urban, roof)),
     ]
     table(("left out", "off (ms)", "on (ms)", "off / on", "same result"), rows)
@@ -77,26 +80,26 @@ def endless(tile):
 
 def show_ray_casting():
     """Print the ratio for the paper's reference sensor at four poses in the courtyard."""
-    world = Scenario.load("courtyard").world()
-    scene, bare = Scene(world), bare_scene(world)
+    world = Scenario.load("courtyard").build_scene()
+    scene, bare = SceneGeometry(world), bare_scene(world)
     sensor = PaperReference()
-    tiles = into_tiles(sensor.directions())
-    instant = scene.at(0)
+    tiles = split_into_tiles(sensor.compute_directions())
+    instant = scene.get_snapshot(0)
     rows = []
     with ThreadPoolExecutor(THREADS) as pool:
         for seed in range(4):
-            pose = sensor.vehicle_T_reference(scene.ego_box, np.random.default_rng([0, seed]))
+            pose = sensor.sample_pose(scene.ego_box, np.random.default_rng([0, seed]))
             rays = bare_rays(sensor, pose)
 
             def embreex(rays=rays):
                 list(pool.map(lambda part: bare.run(*part, output=True), rays))
 
             def generate_and_cast(pose=pose):
-                bodies = instant.outlines(pose[:3, 3])
+                bodies = instant.compute_outlines(pose[:3, 3])
                 list(pool.map(lambda tile: instant.cast(pose, tile, endless(tile), bodies), tiles))
 
             def scan(pose=pose):
-                instant.scan(pose, tiles, threads=THREADS)
+                instant.scan(pose, tiles, num_threads=THREADS)
 
             seconds, ratios = compare(embreex, generate_and_cast, scan, rounds=7)
             rows.append((seed, *seconds, 1 / ratios[1], 1 / ratios[2]))
@@ -108,8 +111,8 @@ def rays_that_pass_by(scene):
     """65,536 reference rays: without this, each is cast at each body in range."""
     reference, instant = PaperReference(rows=256, columns=256), scene.at(STEP, within_m=RANGE_M)
     generator = np.random.default_rng(0)
-    pose = reference.vehicle_T_reference(scene.ego_box, generator)
-    tiles = into_tiles(reference.directions())
+    pose = reference.sample_pose(scene.ego_box, generator)
+    tiles = split_into_tiles(reference.compute_directions())
     return (
         lambda: at_every_body(instant, pose, tiles),
         lambda: instant.scan(pose, tiles, max_range_m=RANGE_M),
@@ -122,15 +125,15 @@ def at_every_body(instant, pose, tiles):
     for tile in tiles:
         directions = rotate(pose[:3, :3], tile.directions)
         limit_m = np.full(directions.shape[1], RANGE_M, dtype=np.float32)
-        hits = cast_from(instant.static, instant.static_T_vehicle, pose[:3, 3], directions, limit_m)
+        hits = cast_from_vehicle(instant.static, instant.static_T_vehicle, pose[:3, 3], directions, limit_m)
         moving = instant.moving
         for caster, part_T_vehicle, body in zip(moving.casters, moving.part_T_vehicle, moving.body, strict=True):
-            nearer = cast_from(caster, part_T_vehicle, pose[:3, 3], directions, hits.range_m)
+            nearer = cast_from_vehicle(caster, part_T_vehicle, pose[:3, 3], directions, hits.range_m)
             hits.range_m[:] = nearer.range_m
-            hits.body[nearer.body >= 0] = body
-        seen = (hits.body >= 0) & (hits.body != instant.ego)
+            hits.body_indices[nearer.body_indices >= 0] = body
+        seen = (hits.body_indices >= 0) & (hits.body_indices != instant.ego)
         found.append((directions * hits.range_m + pose[:3, 3].astype(np.float32)[:, None])[:, seen].T)
-        self_hits += int((hits.body == instant.ego).sum())
+        self_hits += int((hits.body_indices == instant.ego).sum())
     points = np.concatenate(found)
     return SensorScan(points, np.arange(len(points)), np.empty(0, dtype=np.float32), 0, self_hits)
 
@@ -138,13 +141,13 @@ def at_every_body(instant, pose, tiles):
 def ego_again(scene, sensor):
     """A sensor fixed to the ego need not be cast at it at every step."""
     instant, mounted = scene.at(STEP, within_m=RANGE_M), MountedSensor(sensor, scene, sensor.max_range_m)
-    return afresh(instant, sensor, mounted.tiles), lambda: mounted.scan(instant, Draws(None))
+    return afresh(instant, sensor, mounted.tiles), lambda: mounted.scan(instant, SensorNoise(None))
 
 
 def scan_again(scene, sensor):
     """Where nothing moves one scan serves for all steps."""
     instant, mounted = scene.at(0), MountedSensor(sensor, scene, sensor.max_range_m)
-    return afresh(instant, sensor, mounted.tiles), lambda: mounted.scan(instant, Draws(None))
+    return afresh(instant, sensor, mounted.tiles), lambda: mounted.scan(instant, SensorNoise(None))
 
 
 def afresh(instant, sensor, tiles):
@@ -154,12 +157,12 @@ def afresh(instant, sensor, tiles):
 
 def world_again(scene, sensor):
     """The meshes are at hand; what is left out is to give them to the ray caster at every step."""
-    tiles, world = into_tiles(sensor.directions()), scene.world
+    tiles, world = split_into_tiles(sensor.directions()), scene.world
 
     def step(built):
         return afresh(built.at(STEP, within_m=RANGE_M), sensor, tiles)()
 
-    return lambda: step(Scene(world)), lambda: step(scene)
+    return lambda: step(SceneGeometry(world)), lambda: step(scene)
 
 
 def totals():
@@ -169,7 +172,7 @@ def totals():
         frames = SimulatedFrames(
             scenario,
             rig,
-            steps=10,
+            num_frames=10,
             seed=0,
             frame_interval_s=1.0,
             reference_sensor=PaperReference(rows=256, columns=256),

@@ -27,7 +27,7 @@ from torchcover.data import (
     RegionsOfInterest,
     Scan,
     SimulatedFrames,
-    reference_called,
+    create_reference_sensor,
 )
 from torchcover.detection import find_points_in_boxes
 from torchcover.geometry import build_transform, convert_euler_to_rotation, invert, transform_points
@@ -57,7 +57,7 @@ MOVES_MPS, POINTS, WITHIN_MPS, LEAST_LENGTH_M = 0.5, 50, 0.5, 3.0
 # With the ground: noise, how near to it points lie on it, and how far up they are lifted, lest noise takes them below.
 NOISE_M, ON_GROUND_M, LIFT_M = 0.03, 0.1, 0.3
 RANGES_M = (0.0, 40.0, 80.0, 160.0)
-MOUNTS = {"judged": JUDGED.mount.matrix(), "other": OTHER.mount.matrix()}
+MOUNTS = {"judged": JUDGED.mount.matrix(), "other": OTHER.mount.to_matrix()}
 
 
 class Case(NamedTuple):
@@ -149,7 +149,9 @@ def main():
 def measured(sweeps, cases, many, longest_s):
     """The true numbers of each rig; of each case those of its rigs, the processor time a frame, and `found_movers`."""
     surface = sweeps.with_reference_sensor(
-        reference_called(rays=TRUTH_RAYS, asked=RegionsOfInterest().around(sweeps.ego_outline_m))
+        create_reference_sensor(
+            num_rays=TRUTH_RAYS, query_plan=RegionsOfInterest().build_query_plan(sweeps.ego_outline_m)
+        )
     )
     truths = {rig: metric() for rig in MOUNTS}
     metrics = {case: {rig: metric() for rig in case.sensors} for case in cases}
@@ -252,7 +254,7 @@ def drive(options):
     return SimulatedFrames(
         scenario,
         rigs={sensor.name: Rig(name=sensor.name, sensors=[sensor]) for sensor in lidars},
-        steps=1_000_000,
+        num_frames=1_000_000,
         seed=options.seed,
         frame_interval_s=EVERY_S,
         reference_sensor=PaperReference(rows=4, columns=4),

@@ -25,7 +25,7 @@ import numpy as np
 import torch
 
 from benchmarks import table
-from torchcover.data import RegionsOfInterest, SimulatedFrames, reference_called
+from torchcover.data import RegionsOfInterest, SimulatedFrames, create_reference_sensor
 from torchcover.evaluation import CoverageObserver, Settings
 from torchcover.evaluation.checkpoint import write_checkpoint
 from torchcover.evaluation.measuring import build_metric
@@ -103,12 +103,12 @@ def main():
 
 def frames_of(steps, *, rays=16_384, rigs=1, scenario=SCENARIO):
     rigs = {f"rig {number}": RIG for number in range(rigs)}
-    reference = reference_called(rays=rays)
-    return SimulatedFrames(scenario, rigs=rigs, steps=steps, frame_interval_s=EVERY_S, reference_sensor=reference)
+    reference = create_reference_sensor(num_rays=rays)
+    return SimulatedFrames(scenario, rigs=rigs, num_frames=steps, frame_interval_s=EVERY_S, reference_sensor=reference)
 
 
 def observers_of(frames, cell_m=0.25):
-    asked = RegionsOfInterest().around(cell_m=cell_m)
+    asked = RegionsOfInterest().build_query_plan(cell_m=cell_m)
     return [CoverageObserver(build_metric(Settings(), asked, has_area_weights=True), name) for name in frames.rigs]
 
 
@@ -119,7 +119,7 @@ def times(steps, *, cell_m=0.25, **settings):
     worlds_s = steps_s = 0.0
     for index in range(steps):
         begin_s = time.process_time()
-        frames.simulator.scene_of(index)
+        frames.simulator.get_scene_geometry(index)
         built_s = time.process_time()
         frame = frames[index]
         for observer in observers:
@@ -137,8 +137,8 @@ def by_traffic(steps):
     for vehicles in TRAFFIC:
         traffic = scenario.traffic.model_copy(update={"traffic_per_km": vehicles})
         worlds_s, steps_s, frames, _ = times(steps, scenario=scenario.model_copy(update={"traffic": traffic}))
-        world = frames.simulator.scene_of(0)[0].world
-        meshes = [*world.static, world.ego.mesh, *(actor.mesh for actor in world.actors)]
+        world = frames.simulator.get_scene_geometry(0)[0].scene
+        meshes = [*world.static_meshes, world.ego.mesh, *(actor.mesh for actor in world.actors)]
         triangles = sum(len(mesh.faces) for mesh in meshes)
         worlds = steps / STEPS_A_WORLD
         yield f"{vehicles:g} vehicles/km", len(world.actors), triangles, worlds_s / worlds, steps_s / steps

@@ -19,8 +19,8 @@ from torchcover.data import SimulatedFrames, open_recording
 from torchcover.geometry import invert, transform_points
 from torchcover.recordings.in_vehicle import transform_to_vehicle
 from torchcover.simulation import Lidar, Material, PaperReference, Rig, Scenario, Simulator
-from torchcover.simulation.recorded_returns import HALF_LANES_M, fit_returns, ground_rays, road_profile
-from torchcover.simulation.returns import log_excess, return_probability
+from torchcover.simulation.recorded_returns import HALF_LANES_M, count_ground_rays, fit_returns, fit_road_profile
+from torchcover.simulation.returns import compute_log_excess, compute_return_probability
 
 BINS_M = (10.0, 20.0, 30.0, 40.0, 50.0, 70.0, 100.0)
 VEHICLE_BINS_M = (5.0, 10.0, 20.0, 40.0, 60.0, 100.0)
@@ -56,10 +56,10 @@ IMPERFECT = {
 
 
 def probabilities(rays, material, range_at_10_percent_m, spread):
-    excess = log_excess(
+    excess = compute_log_excess(
         rays.range_m, rays.cos_incidence, material.share, material.incidence_exponent, range_at_10_percent_m
     )
-    return return_probability(excess, spread, material.spread)
+    return compute_return_probability(excess, spread, material.spread)
 
 
 def predicted(rays, road):
@@ -68,7 +68,7 @@ def predicted(rays, road):
     probability = np.empty(len(first))
     for half in (first, ~first):
         fit = fit_returns(rays.some(~half), road)
-        probability[half] = probabilities(rays.some(half), road, fit.range_at_10_percent_m, fit.spread)
+        probability[half] = probabilities(rays.some(half), road, fit.range_at_10_percent_m, fit.log_range_std)
     return probability
 
 
@@ -165,14 +165,14 @@ def on_vehicles(sweeps, recording, lidar):
     for part, (_, _, name) in PARTS.items():
         of_part = np.concatenate([np.empty((0, 3)), *(one[part] for one in met)])
         material = Material.load(name)
-        excess = log_excess(
+        excess = compute_log_excess(
             of_part[:, 0],
             of_part[:, 1],
-            material.share,
+            material.numeric_reflectivity,
             material.incidence_exponent,
             lidar.range_at_10_percent_m or np.inf,
         )
-        modelled = return_probability(excess, lidar.spread, material.spread)
+        modelled = compute_return_probability(excess, lidar.spread, material.log_reflectivity_std)
         for low_m, high_m in pairwise(VEHICLE_BINS_M):
             there = (of_part[:, 0] >= low_m) & (of_part[:, 0] < high_m)
             if there.sum() >= 50:
@@ -240,9 +240,9 @@ def main():
         name, _, folder = pair.partition("=")
         rig, recording = Rig.load(name), open_recording(folder)
         scans = Simulator(
-            Scenario.model_validate(PLAIN), {"rig": rig.sensing("ideal")}, PaperReference(rows=2, columns=2)
+            Scenario.model_validate(PLAIN), {"rig": rig.apply_sensor_model("ideal")}, PaperReference(rows=2, columns=2)
         )
-        simulated = dict(zip([one.name for one in rig.sensors], scans.scans(0)["rig"], strict=True))
+        simulated = dict(zip([one.name for one in rig.sensors], scans.simulate_scans(0)["rig"], strict=True))
         for lidar in rig.sensors:
             if not isinstance(lidar, Lidar):
                 continue
@@ -252,15 +252,15 @@ def main():
                 as_cast(transform_to_vehicle(one, recording.ego_box).points_m.astype(float), lidar) for one in scans
             ]
             label = f"{Path(folder).name} {lidar.name}"
-            rows = curves[label] = by_range(ground_rays(sweeps, lidar), lidar, road)
+            rows = curves[label] = by_range(count_ground_rays(sweeps, lidar), lidar, road)
             returns += [
                 (label, f"{low_m:.0f}-{high_m:.0f}", f"{n:.0f}", *(f"{p:.2f}" for p in rest))
                 for low_m, high_m, n, *rest in rows
             ]
             misfits.append((label, *(f"{value:.3f}" for column in (4, 5) for value in misfit(rows, column))))
-            place_m, on_road = lidar.mount.matrix()[:3, 3], []
+            place_m, on_road = lidar.mount.to_matrix()[:3, 3], []
             for points_m in sweeps:
-                above_m = points_m[:, 2] - road_profile(points_m).height_m(points_m)
+                above_m = points_m[:, 2] - fit_road_profile(points_m).compute_heights_m(points_m)
                 on_road.append(points_m[(np.abs(above_m) < 0.15) & (np.abs(points_m[:, 1]) < 3 * HALF_LANES_M)])
             real = [nearest_road(one, place_m) for one in on_road]
             model = nearest_road(simulated[lidar.name].points, place_m)
@@ -309,7 +309,7 @@ def show_imperfections():
     """Print detection within 80 m, by area, of sensors with noise and drop-out."""
     torch.set_num_threads(1)
     rigs = {f"{name}: {words(keys)}": imperfect(name, keys) for name, each in IMPERFECT.items() for keys in each}
-    frames = SimulatedFrames("urban", rigs=rigs, steps=NUM_FRAMES, frame_interval_s=EVERY_S, seed=0)
+    frames = SimulatedFrames("urban", rigs=rigs, num_frames=NUM_FRAMES, frame_interval_s=EVERY_S, seed=0)
     metrics = {(rig, landed): CoverageMetric(GRID, square_metres=True) for rig in rigs for landed in (False, True)}
     for frame in frames:
         for (rig, landed), metric in metrics.items():

@@ -20,10 +20,10 @@ from torchcover.recordings.ground_model import GroundModel, extract_low_surfaces
 from torchcover.recordings.in_vehicle import transform_to_vehicle
 from torchcover.recordings.recording import Scan
 from torchcover.simulation import PaperReference, Rig, Scenario, Simulator
-from torchcover.simulation.returns import material_number
-from torchcover.simulation.scene import Scene as Scenery
+from torchcover.simulation.returns import get_material_index
+from torchcover.simulation.scene import SceneGeometry as Scenery
 from torchcover.simulation.traffic.fleet import REAR_OF
-from torchcover.simulation.world import World
+from torchcover.simulation.world import Scene
 
 WORLDS = ("urban", "sumo_random", "parking", "highway")
 TRACKS = ("tracks_argoverse2", "tracks_nuscenes")
@@ -84,7 +84,7 @@ class Scene(NamedTuple):
     ego: Body
     others: list
     times_s: np.ndarray
-    world: World | None = None
+    world: Scene | None = None
 
     @classmethod
     def of_world(cls, world, frame_interval_s=1.0):
@@ -290,13 +290,13 @@ def kerbs(scene, beside_m=(2.0, 12.0), beyond_m=40.0, shortest_m=30.0):
 
 def wheels_m(world, looks=12):
     """How far the lowest points of the wheels of what moves are from the ground, kerbs included, at the worst."""
-    ground, tyre, worst_m = Scenery(world).ground, material_number("tyre"), 0.0
+    ground, tyre, worst_m = Scenery(world).ground, get_material_index("tyre"), 0.0
     for actor in (world.ego, *world.actors):
         low_m = actor.mesh.vertices_m[np.unique(actor.mesh.faces[actor.mesh.materials == tyre])]
         low_m = low_m[low_m[:, 2] < 0.02]
         own_s = actor.trajectory.times_s
         for time_s in np.linspace(own_s[0], own_s[-1], looks) if len(low_m) else ():
-            above_m = ground.heights_m(transform_points(actor.trajectory.at(time_s), low_m) + UP_M) - UP_M[2]
+            above_m = ground.compute_heights_m(transform_points(actor.trajectory.at(time_s), low_m) + UP_M) - UP_M[2]
             worst_m = max(worst_m, float(np.abs(above_m[np.isfinite(above_m)]).max(initial=0.0)))
     return worst_m
 
@@ -340,13 +340,13 @@ def sight(points_m):
 def simulated(world, rig, runs=RUNS, seed=0):
     """`sight` of what a rig sees in several runs of a world."""
     rig, scenario = Rig.load(rig), Scenario.load(world)
-    frame_interval_s = None if scenario.repeats else EVERY_S
+    frame_interval_s = None if scenario.is_repeating else EVERY_S
     simulator = Simulator(
         scenario, {"rig": rig}, PaperReference(rows=2, columns=2), seed=seed, frame_interval_s=frame_interval_s
     )
     return [
-        sight(np.concatenate([scan.points for scan in simulator.scans(index)["rig"]]))
-        for index in range(1 if scenario.repeats else runs)
+        sight(np.concatenate([scan.points for scan in simulator.simulate_scans(index)["rig"]]))
+        for index in range(1 if scenario.is_repeating else runs)
     ]
 
 
@@ -434,8 +434,8 @@ def main():
     scenes = {Path(path).stem: [Scene.of_recording(read_objects(path))] for path in options.logs}
     for world in options.worlds:
         scenario = Scenario.load(world)
-        ego, runs = scenario.ego_mesh(), 1 if scenario.repeats else options.runs
-        scenes[f"`{world}`"] = [Scene.of_world(scenario.world(0, run, ego), 5.0) for run in range(runs)]
+        ego, runs = scenario.build_ego_mesh(), 1 if scenario.is_repeating else options.runs
+        scenes[f"`{world}`"] = [Scene.of_world(scenario.build_scene(0, run, ego), 5.0) for run in range(runs)]
     found = {name: objects(of_name) for name, of_name in scenes.items()}
     rows = [
         (name, spread(counts.sum(axis=1), 0), *(spread(column, 1) for column in (*counts.T, *ring.T)))

@@ -130,7 +130,7 @@ def pose_of(transform):
 
 def random_pose(vehicle, generator):
     """x, y, z, roll, pitch, yaw of the paper's reference sensor on the actor, in CARLA's axes."""
-    drawn = PaperReference().vehicle_T_reference(vehicle.ego_box, generator)
+    drawn = PaperReference().sample_pose(vehicle.ego_box, generator)
     actor_T_reference = invert(vehicle.vehicle_T_actor) @ drawn
     yaw, pitch, roll = convert_rotation_to_euler(actor_T_reference[:3, :3])
     x, y, z = actor_T_reference[:3, 3]

@@ -62,7 +62,7 @@ def main():
 
     console = Console()
     generator = torch.Generator().manual_seed(options.seed)
-    frame = SimulatedFrames("urban", "front_roof_32", steps=1, seed=options.seed)[0]
+    frame = SimulatedFrames("urban", "front_roof_32", num_frames=1, seed=options.seed)[0]
     reference = some(inside(frame.reference), 20_000, generator)
     before = some(inside(frame.sensor), options.points, generator)
 

@@ -93,7 +93,7 @@ def simulate(rigs, steps, seed, name):
     frames = SimulatedFrames(
         "urban",
         rigs=rigs,
-        steps=steps,
+        num_frames=steps,
         seed=seed,
         frame_interval_s=SECONDS_APART,
         reference_sensor=PaperReference(rows=1, columns=1),  # which nobody looks at

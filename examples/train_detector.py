@@ -78,7 +78,7 @@ def simulate(steps, seed, reference, name, keep_clouds):
     """Frames with both rigs, 4 from each drive of a minute; `network RIG` is what the detector is fed."""
     rigs = {rig: rig for rig in RIGS}
     frames = SimulatedFrames(
-        "urban", rigs=rigs, steps=steps, seed=seed, frame_interval_s=15.0, reference_sensor=reference, boxes=True
+        "urban", rigs=rigs, num_frames=steps, seed=seed, frame_interval_s=15.0, reference_sensor=reference, boxes=True
     )
     kept = []
     for index in track(range(steps), description=f"simulating {name}"):
@@ -308,7 +308,7 @@ def train(rig, training_frames, validation_frames, metric, options, console, **o
 
 def compare_labels(options, console):
     """Train on all cars, and on those only that the rig can show, from several seeds; AP by visibility of both."""
-    rig, surface = RIGS[-1], SurfaceReference(((X_M, Y_M),), max_range_m=65.0, object_points=64)
+    rig, surface = RIGS[-1], SurfaceReference(((X_M, Y_M),), max_range_m=65.0, points_per_object=64)
     frames = {
         name: simulate(steps, seed, surface, f"{name} frames", keep_clouds=True)
         for name, steps, seed in (("training", options.train, 0), ("validation", options.validate, 1))
@@ -458,7 +458,7 @@ def main():
         compare_labels(options, console)
         return
     unused = PaperReference(rows=1, columns=1)
-    surface = SurfaceReference(((X_M, Y_M),), max_range_m=65.0, object_points=64)
+    surface = SurfaceReference(((X_M, Y_M),), max_range_m=65.0, points_per_object=64)
     training_frames = simulate(options.train, options.seed, unused, "training frames", keep_clouds=False)
     validation_frames = simulate(options.validate, options.seed + 1, surface, "validation frames", keep_clouds=True)
     results = {}

@@ -43,7 +43,7 @@ def write_small_recording(folder):
     rig = Rig.model_validate({"name": "kitti", "sensors": [LIDAR]})
     unused = PaperReference(rows=1, columns=1)
     write_recording(
-        SimulatedFrames("urban", rig, steps=50, frame_interval_s=0.2, reference_sensor=unused, boxes=True),
+        SimulatedFrames("urban", rig, num_frames=50, frame_interval_s=0.2, reference_sensor=unused, boxes=True),
         folder,
         "folder",
     )

@@ -62,7 +62,7 @@ def stage(tmp_path, monkeypatch):
     write_calibrations(tmp_path)
     small = {"steps": 1, "workers": 0, "progress": False, "rays": 256, "cell_m": 8.0}
     monkeypatch.setattr(torchcover, "evaluate", partial(measured_less, torchcover.evaluate, small))
-    frames = SimulatedFrames("courtyard", "front_roof_32", steps=1, boxes=True)
+    frames = SimulatedFrames("courtyard", "front_roof_32", num_frames=1, boxes=True)
     grid = BevGrid(x_m=(0.0, 40.0), y_m=(-10.0, 10.0), cell_m=0.5, band_frame="ground")
     return {
         "torchcover": torchcover,

@@ -51,7 +51,7 @@ class Here(NamedTuple):
 def coverage():
     reference = PaperReference(rows=256, columns=256)
     rigs = (*RIGS, *FITTED)
-    frames = SimulatedFrames(ROAD, rigs={name: name for name in rigs}, steps=8, seed=0, reference_sensor=reference)
+    frames = SimulatedFrames(ROAD, rigs={name: name for name in rigs}, num_frames=8, seed=0, reference_sensor=reference)
     observers = {name: CoverageObserver(CoverageMetric(GRID, max_radius=GRID.diagonal_m), name) for name in rigs}
     observe(frames, observers.values())
     return {name: observer.compute() for name, observer in observers.items()}
@@ -66,7 +66,7 @@ def row(coverage, rig, x, y=(-8.0, 8.0), height="ground"):
 
 def test_the_hood_hides_the_ground_in_front_of_the_car_from_the_roof(coverage):
     lidar = Rig.load("front_roof_128").sensors[0]
-    seen = SimulatedFrames(ROAD, "front_roof_128", steps=1, reference_sensor=PaperReference(8, 8))[0]
+    seen = SimulatedFrames(ROAD, "front_roof_128", num_frames=1, reference_sensor=PaperReference(8, 8))[0]
     assert seen.counts["sensor_self_hits"] > 0.005 * seen.counts["sensor_rays"]
     # Without a body the lowest row would reach the ground here; with it, rows end on the hood.
     first_m = lidar.mount.x_m + lidar.mount.z_m / np.tan(np.deg2rad(25.0))

@@ -254,12 +254,12 @@ def test_scores_are_given_for_four_times_as_many_steps_each_time(paper, pieces, 
 
 
 def test_the_ego_gives_points_if_they_are_wanted_and_nothing_else_changes():
-    frames = SimulatedFrames("courtyard", "front_roof_32", steps=1, reference_sensor=PaperReference(32, 32))
-    without, with_ego = frames[0], frames.with_reference_sensor(PaperReference(32, 32, ego_points=True))[0]
+    frames = SimulatedFrames("courtyard", "front_roof_32", num_frames=1, reference_sensor=PaperReference(32, 32))
+    without, with_ego = frames[0], frames.replace_reference_sensor(PaperReference(32, 32, keep_ego_points=True))[0]
     assert len(with_ego.reference) == len(without.reference) + without.counts["reference_self_hits"]
     others = {tuple(point) for point in without.reference.tolist()}
     own = torch.tensor([point for point in with_ego.reference.tolist() if tuple(point) not in others])
-    box = Scenario.load("courtyard").ego_box()
+    box = Scenario.load("courtyard").compute_ego_box()
     assert len(own) == without.counts["reference_self_hits"] > 50
     assert (own >= torch.tensor(box.lower_m) - 1e-3).all()
     assert (own <= torch.tensor(box.upper_m) + 1e-3).all()
@@ -272,7 +272,7 @@ def test_both_references_have_the_range_that_is_asked_for(paper):
     asked = paper.measuring.Measurement(
         {"rig": "front_roof_32"}, BevGrid((0, 160), (-40, 40)), forward_regions(), options
     )
-    assert asked.frames.reference_sensor == PaperReference(10, 10, max_range_m=120.0, ego_points=True)
+    assert asked.frames.reference_sensor == PaperReference(10, 10, max_range_m=120.0, keep_ego_points=True)
     assert asked.surface_frames.reference_sensor.max_range_m == 120.0
     assert asked.surface_frames.reference_sensor.areas == tuple(
         (region.x_m, region.y_m) for region in forward_regions()

@@ -31,17 +31,17 @@ class Measurement:
         self.grid = grid
         side = math.isqrt(options.rays)
         reach_m = options.reference_range
-        rays = PaperReference(rows=side, columns=side, max_range_m=reach_m, ego_points=options.ego_points)
+        rays = PaperReference(rows=side, columns=side, max_range_m=reach_m, keep_ego_points=options.ego_points)
         areas = tuple(dict.fromkeys((region.x, region.y) for region in regions))
         self.frames = SimulatedFrames(
             options.scenario,
             rigs=rigs,
-            steps=options.steps,
+            num_frames=options.steps,
             seed=options.seed,
             frame_interval_s=options.every,
             reference_sensor=rays,
         )
-        self.surface_frames = self.frames.with_reference_sensor(SurfaceReference(areas, max_range_m=reach_m))
+        self.surface_frames = self.frames.replace_reference_sensor(SurfaceReference(areas, max_range_m=reach_m))
 
     def run(self, steps, *, blocks=1, also=()):
         """Measure.

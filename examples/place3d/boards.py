@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from torchcover.simulation import Draws, RayHits
+from torchcover.simulation import RayHits, SensorNoise
 
 DISTANCES_M = (10.0, 20.0, 30.0, 40.0, 50.0)
 HEIGHT_M = (0.0, 2.0)
@@ -32,7 +32,7 @@ def cells_hit(sensors, distance_m, *, height_m=HEIGHT_M, cell_m=CELL_M, width_m=
         origin_m = vehicle_T_sensor[:3, 3]
         range_m = ranges_m(origin_m, way, distance_m, flat=width_m is not None)
         measured = np.flatnonzero(range_m <= sensor.max_range_m)
-        gives, _ = sensor.measure(RayHits(measured, range_m[measured], pixel_of_ray), Draws(None))
+        gives, _ = sensor.measure(RayHits(measured, range_m[measured], pixel_of_ray), SensorNoise(None))
         measured = measured if gives is None else measured[gives]
         place_m = origin_m[:, None] + range_m[measured] * way[:, measured]
         along = place_m[1] / around_m + 0.5

@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 from torchcover.contrib import PlacementRatings, correlate_rankings, read_results, score_placements
-from torchcover.simulation import builtin_names, get_builtin_folder
+from torchcover.simulation import get_builtin_folder, list_builtin_names
 
 PAPER = "place3d2024"
 # Quantity and class in `datasets/published/place3d_2024.csv`, and what it is called here.
@@ -33,7 +33,7 @@ class Study(NamedTuple):
 
 def agree(scenario="urban", *, seed=0, **settings):
     """Measure the placements in a scenario; settings are those of `score_placements`."""
-    rigs = {name: name for name in builtin_names("rigs") if name.startswith(f"{PAPER}_")}
+    rigs = {name: name for name in list_builtin_names("rigs") if name.startswith(f"{PAPER}_")}
     scores = score_placements(rigs, scenario, seed=seed, **settings)
     return Study(agreements(scores), scores, scenario, seed)
 

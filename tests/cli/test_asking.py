@@ -138,7 +138,7 @@ def test_a_file_of_regions_that_makes_no_sense_is_refused(evaluate, worlds, chan
 
 
 def test_maps_without_room_are_refused_before_anything_runs(evaluate, monkeypatch):
-    monkeypatch.setattr("torchcover.simulation.memory.machine_bytes", lambda: 1e6)
+    monkeypatch.setattr("torchcover.simulation.memory.find_memory_limit_bytes", lambda: 1e6)
     code, _, complaints = evaluate()
     assert code == 2
     assert re.search(r"maps of [\d,]+ cells: .* of memory are needed", complaints)

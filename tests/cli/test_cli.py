@@ -15,7 +15,7 @@ from rich.console import Console
 
 from torchcover import Coverage, nearest
 from torchcover.coverage import CoverageSums
-from torchcover.simulation import REFERENCE_SENSORS, builtin_documents, builtin_names
+from torchcover.simulation import REFERENCE_SENSORS, list_builtin_names, load_builtin_documents
 
 SKIPPING = ("--set", "skip_bad_frames=true")
 CELL_1M = ("--set", "cell_m=1")
@@ -362,11 +362,11 @@ def test_list_names_everything_built_in_and_what_it_is_made_of(torchcover):
     assert max(map(len, printed.splitlines())) <= 100
     named, said = set(re.split(r"[\s,]+", printed)), {}
     for kind in ("rigs", "scenarios", "lidars", "vehicles", "requirements"):
-        assert set(builtin_names(kind)) <= named
-        assert f"{kind} ({len(builtin_names(kind))})" in printed.splitlines()
+        assert set(list_builtin_names(kind)) <= named
+        assert f"{kind} ({len(list_builtin_names(kind))})" in printed.splitlines()
         lines = [line.split(maxsplit=1) for line in torchcover("list", kind)[1].splitlines()]
         of_kind = {name: rest[0] for name, *rest in filter(None, lines) if rest}
-        assert set(builtin_names(kind)) <= set(of_kind)
+        assert set(list_builtin_names(kind)) <= set(of_kind)
         assert not said.keys() & of_kind.keys()
         said |= of_kind
     assert said["nuscenes_cameras"].startswith("6 cameras  The six cameras of the nuScenes cars (Renault Zoe)")
@@ -377,7 +377,7 @@ def test_list_names_everything_built_in_and_what_it_is_made_of(torchcover):
 def test_list_with_a_word_prints_what_has_it_and_all_that_is_said_of_it(torchcover):
     code, printed, _ = torchcover("list", "PANDAR64")
     assert (code, "hesai_pandar64" in printed, "velodyne_vlp16" in printed) == (0, True, False)
-    assert " ".join(builtin_documents("lidars")["hesai_pandar64"]["description"].split()) in printed
+    assert " ".join(load_builtin_documents("lidars")["hesai_pandar64"]["description"].split()) in printed
     code, _, said = torchcover("list", "no such thing")
     assert (code, said) == (
         2,
@@ -427,7 +427,7 @@ def test_out_of_memory_on_a_gpu_ends_in_one_line_and_keeps_what_was_measured(
         return nearest(*arguments, **options)
 
     calls = count()
-    monkeypatch.setattr("torchcover.coverage.sums.nearest", search)
+    monkeypatch.setattr("torchcover.coverage.sums.suggest_names", search)
     code, _, complaints = torchcover("evaluate", "--frames", recording, "--set", "cell_m=4", "--out", tmp_path / "out")
     assert code == 2
     assert complaints.splitlines()[-1].startswith("torchcover: there is not enough memory (")

@@ -87,8 +87,8 @@ def test_a_pipe_or_a_device_in_the_place_of_a_file_is_named(tmp_path, kind):
     scenario = Scenario.model_validate({"name": "s", "ego": ego, "bodies": [body]})
     for read in (
         lambda: Rig.load(paths[0]),
-        scenario.content,
-        lambda: scenario.world(0, 0),
+        scenario.collect_content,
+        lambda: scenario.build_scene(0, 0),
         lambda: open_recording(folder),
     ):
         with pytest.raises(BadFileError, match=NO_FILE):

@@ -21,7 +21,7 @@ def test_a_recorded_rig_is_found_again(torchcover, worlds, tmp_path):
         returned_deg = np.sort(of.rows_deg())[::-1][of.name == "rear" :]
         np.testing.assert_allclose(lidar.rows_deg(), returned_deg, atol=5e-4)
         assert (lidar.name, lidar.columns, lidar.horizontal_fov_deg) == (of.name, 30, 90.0)
-        np.testing.assert_allclose(lidar.mount.matrix(), of.mount.matrix(), atol=1e-6)
+        np.testing.assert_allclose(lidar.mount.to_matrix(), of.mount.to_matrix(), atol=1e-6)
         assert lidar.max_range_m <= 60.1
     assert torchcover("evaluate", found, *few, "--set", "cell_m=1", "--out", tmp_path / "out")[0] == 0
     code, printed, _ = torchcover("rig", "--frames", recording, "--sensors", "rear", "--lidar", "rear=velodyne_vlp16")

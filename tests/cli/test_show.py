@@ -11,7 +11,7 @@ from PIL import Image
 from torchcover.cli import show
 from torchcover.evaluation import build_sensor_views, scene_pictures
 from torchcover.evaluation.task import load_named_rig, make_rig_names
-from torchcover.simulation import Rig, Scenario, builtin_names
+from torchcover.simulation import Rig, Scenario, list_builtin_names
 
 
 @pytest.fixture
@@ -216,13 +216,13 @@ def test_the_depth_images_of_a_rig_are_those_of_its_cameras_in_the_frame(torchco
 @pytest.mark.parametrize("arguments", [["three_cameras", "--scenario"], []])
 def test_a_world_is_built_once(torchcover, worlds, monkeypatch, arguments):
     built = []
-    build = Scenario.world
+    build = Scenario.build_scene
     monkeypatch.setattr(Scenario, "world", lambda *args: built.append(args) or build(*args))
     assert torchcover("show", *arguments, worlds / "yard.yaml", "--out", worlds)[0] == 0
     assert len(built) == 1
 
 
-@pytest.mark.parametrize("name", builtin_names("rigs"))
+@pytest.mark.parametrize("name", list_builtin_names("rigs"))
 def test_every_built_in_rig_has_fields_of_view_within_bounds(name):
     for sensor in build_sensor_views(Rig.load(name).sensors):
         low, high = sensor.vertical_fov_deg
@@ -273,7 +273,7 @@ def test_a_file_that_is_neither_says_what_is_wrong(torchcover, tmp_path, content
 
 
 def test_a_name_of_both_kinds_asks_for_the_file(torchcover, monkeypatch):
-    monkeypatch.setattr(show, "builtin_names", lambda kind: ["twin", kind])
+    monkeypatch.setattr(show, "list_builtin_names", lambda kind: ["twin", kind])
     code, _, error = torchcover("show", "twin")
     assert code == 2
     assert "both a rig and a scenario and a vehicle: give the YAML file" in error
@@ -282,7 +282,7 @@ def test_a_name_of_both_kinds_asks_for_the_file(torchcover, monkeypatch):
 @pytest.mark.filterwarnings("default")
 def test_a_warning_is_one_line_on_stderr_and_said_once(torchcover, worlds):
     """Two actors of one open mesh in millimetres."""
-    mesh = Scenario.load(worlds / "yard.yaml").ego.shape.mesh()
+    mesh = Scenario.load(worlds / "yard.yaml").ego.shape.build_mesh()
     corners = "".join(f"v {x * 1000} {y * 1000} {z * 1000}\n" for x, y, z in mesh.vertices_m)
     (worlds / "car.obj").write_text(corners + "".join(f"f {a} {b} {c}\n" for a, b, c in mesh.faces[1:] + 1))
     shape = "shape: {type: mesh, path: car.obj}"
@@ -330,7 +330,7 @@ def test_a_film_shows_what_follows(torchcover, worlds, monkeypatch):
         pace_s = film.info["duration"] / 1000
     steps = show._steps_of_film(Scenario.load(worlds / "yard.yaml"), 1)
     assert len(seen) == len(steps) >= 2
-    assert pace_s == pytest.approx(steps.step * Scenario.load(worlds / "yard.yaml").step_s)
+    assert pace_s == pytest.approx(steps.step * Scenario.load(worlds / "yard.yaml").effective_time_step_s)
     assert all((one != other).any() for one, other in pairwise(seen))
 
 

@@ -150,8 +150,8 @@ def test_no_cell_that_a_ray_crosses_is_missed():
     around = lidar(mount=Pose(x_m=0.3, y_m=-0.2, z_m=1.7, pitch_deg=2.0), columns=90, horizontal_fov_deg=360,
                    channels=4, vertical_fov_deg=(-12, 3))  # fmt: skip
     seen = compute_field_of_view([around], grid).numpy()
-    origin_m, turn = around.mount.matrix()[:3, 3], around.mount.matrix()[:3, :3]
-    directions = (turn @ around.directions().reshape(3, -1)).T
+    origin_m, turn = around.mount.to_matrix()[:3, 3], around.mount.to_matrix()[:3, :3]
+    directions = (turn @ around.compute_directions().reshape(3, -1)).T
     ends_m = np.where(directions[:, 2] < 0, origin_m[2] / np.maximum(-directions[:, 2], 1e-9), 60.0).clip(max=50.0)
     along = np.linspace(0.0, 1.0, 4001)[1:-1]
     points = (origin_m + (directions * ends_m[:, None])[:, None] * along[None, :, None]).reshape(-1, 3)
@@ -163,7 +163,7 @@ def test_no_cell_that_a_ray_crosses_is_missed():
 
 def test_what_points_at_the_vehicle_sees_nothing_and_range_ends_a_ray():
     grid = BevGrid(x_m=(0.0, 8.0), y_m=(-1.0, 1.0), cell_m=0.5)
-    bonnet = Box(type="box", size_m=(1.0, 2.0, 0.8)).mesh()
+    bonnet = Box(type="box", size_m=(1.0, 2.0, 0.8)).build_mesh()
     assert not compute_field_of_view([lidar(mount=Pose(x_m=0.0, z_m=1.0))], grid, bonnet).any()
     flat = lidar(vertical_fov_deg=(0.0, 0.0), max_range_m=3.2)
     assert compute_field_of_view([flat], grid)[1].any(dim=0).nonzero().squeeze(1).tolist() == list(range(7))

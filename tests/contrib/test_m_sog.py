@@ -70,7 +70,7 @@ def test_it_is_that_of_a_slow_twin_and_its_error_the_jackknife_by_hand():
     crossed = np.zeros(grid.shape, dtype=bool)
     for sensor in sensors:
         origin = np.array([sensor.mount.x_m, 0.0, sensor.mount.z_m])
-        find_crossed_voxels(grid, origin, sensor.directions().reshape(3, -1).T, output=crossed)
+        find_crossed_voxels(grid, origin, sensor.compute_directions().reshape(3, -1).T, output=crossed)
     labels = np.zeros((16, 3, *grid.shape))
     for index, one in enumerate(frames):
         votes = np.zeros((2, *grid.shape))

@@ -231,7 +231,7 @@ def simulated(region, reference_sensor, steps):
     metric = CoverageMetric(
         BevGrid(x_m=region.x_m, y_m=region.y_m, cell_m=0.5), max_radius_m=50.0, num_blocks=16, has_area_weights=True
     )
-    for frame in SimulatedFrames("courtyard", "front_roof_32", steps=steps, reference_sensor=reference_sensor):
+    for frame in SimulatedFrames("courtyard", "front_roof_32", num_frames=steps, reference_sensor=reference_sensor):
         metric.update(frame.sensor, frame.reference, weights=frame.reference_weights, block_index=frame.index)
     coverage = metric.compute()
     estimates = {height: coverage.estimate(region, height, "area") for height in ("ground", "obstacle")}

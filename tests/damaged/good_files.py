@@ -201,7 +201,7 @@ def mesh(path):
     """Read a mesh; that a damaged one is not closed is no news."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", ".*the mesh is not closed")
-        return MeshFile(type="mesh", path=path).mesh()
+        return MeshFile(type="mesh", path=path).build_mesh()
 
 
 def scene_files():
@@ -328,7 +328,7 @@ def kinds(folder):
     }
 
     def depth(path):
-        return read_depth(path, metres_per_unit=0.001 if path.stem.startswith("whole") else None)
+        return read_depth(path, meters_per_unit=0.001 if path.stem.startswith("whole") else None)
 
     depths = {
         "rgb.png": png(rgb),

@@ -196,7 +196,9 @@ def test_bad_input_is_refused(changes, message):
 def test_in_a_simulated_frame_what_lies_behind_the_rig_is_blind_and_what_is_seen_holds_points():
     # Level, it sees all around.
     reference = PaperReference(rows=512, columns=512, max_tilt_deg=0.0)
-    frame = SimulatedFrames("highway", "front_roof_128", steps=1, seed=1, reference_sensor=reference, boxes=True)[0]
+    frame = SimulatedFrames("highway", "front_roof_128", num_frames=1, seed=1, reference_sensor=reference, boxes=True)[
+        0
+    ]
     seen = unweighted(frame.sensor, frame.reference, frame.boxes)
     known = seen.observed
     assert known.sum() >= 5

@@ -202,7 +202,9 @@ LIDAR = {
 @pytest.fixture(scope="module")
 def frames():
     rig = Rig.model_validate({"name": "r", "sensors": [LIDAR]})
-    return SimulatedFrames(Scenario.model_validate(TRAFFIC), rig, steps=8, seed=2, reference_sensor=SMALL, boxes=True)
+    return SimulatedFrames(
+        Scenario.model_validate(TRAFFIC), rig, num_frames=8, seed=2, reference_sensor=SMALL, boxes=True
+    )
 
 
 def same(a, b):
@@ -216,7 +218,7 @@ def test_boxes_do_not_depend_on_order_or_workers_and_leave_the_clouds_alone(fram
     there = [f for b in DataLoader(frames, batch_size=3, num_workers=2, collate_fn=collate_frames) for f in b.frames]
     assert all(same(frames[index].boxes, there[index].boxes) for index in range(8))
     assert same(late_first.boxes, frames[6].boxes)
-    without = SimulatedFrames(frames.scenario, frames.rigs["r"], steps=8, seed=2, reference_sensor=SMALL)[6]
+    without = SimulatedFrames(frames.scenario, frames.rigs["r"], num_frames=8, seed=2, reference_sensor=SMALL)[6]
     assert without.boxes is None
     assert torch.equal(without.sensor, late_first.sensor)
     assert torch.equal(without.reference, late_first.reference)
@@ -286,7 +288,7 @@ def test_frames_without_objects_pad_to_nothing_and_frames_without_boxes_say_what
 
 
 def test_a_world_without_objects_has_no_boxes_which_is_not_the_same_as_none():
-    frame = SimulatedFrames("courtyard", "front_roof_32", steps=1, reference_sensor=SMALL, boxes=True)[0]
+    frame = SimulatedFrames("courtyard", "front_roof_32", num_frames=1, reference_sensor=SMALL, boxes=True)[0]
     assert len(frame.boxes) == 0
     assert frame.boxes.points_in_box["front_roof_32"].shape == (0,)
 

@@ -14,9 +14,9 @@ from torchcover.encounters import Criterion, Encounter, EncounterSet, Staged, si
 from torchcover.encounters.sighting import NEVER, Looks, MountedRig, channels, first_run, look_steps
 from torchcover.evaluation import build_flat_ground, evaluate_encounters, plot_encounter_animation
 from torchcover.geometry import convert_rotation_to_euler, find_overlaps
-from torchcover.simulation import PaperReference, Rig, Scenario, Simulator, with_ego
-from torchcover.simulation.bodies import called
-from torchcover.simulation.moving import Solid
+from torchcover.simulation import PaperReference, Rig, Scenario, Simulator, set_ego
+from torchcover.simulation.bodies import get_shape_name
+from torchcover.simulation.moving import BodyGeometry
 from torchcover.targets import Target
 
 torch.set_num_threads(1)
@@ -24,7 +24,7 @@ torch.set_num_threads(1)
 BOX = {"type": "box", "size_m": [2.0, 1.0, 0.5]}
 WALKER = {"type": "box", "size_m": [0.02, 0.02, 1.0]}
 WALL = {"type": "box", "size_m": [3.0, 0.5, 3.0]}
-SOLID = Solid(Scenario.model_validate({"name": "s", "ego": EGO, "bodies": [FLOOR]}).ego_mesh())
+SOLID = BodyGeometry(Scenario.model_validate({"name": "s", "ego": EGO, "bodies": [FLOOR]}).build_ego_mesh())
 
 
 def crossing(speed_kmh=36.0, other=None, **keys):
@@ -39,7 +39,7 @@ def rig(*sensors):
 def mounted(*sensors):
     world = build_flat_ground().model_copy(update={"ego": Scenario.model_validate(
         {"name": "s", "ego": EGO, "bodies": [FLOOR]}).ego})  # fmt: skip
-    return MountedRig(rig(*sensors), with_ego(world, {}))
+    return MountedRig(rig(*sensors), set_ego(world, {}))
 
 
 def sighted(mounted_rig, case, criterion, **keys):
@@ -111,10 +111,12 @@ def test_a_touch_of_less_than_a_millisecond_is_one():
     staged = Staged(grazing(0.004), SOLID)
     assert staged.contact_s == pytest.approx(1.5 - 0.05045, abs=1e-9)
     whole_s = np.arange(2000) / 1000
-    assert not find_overlaps(staged.other.box, staged.vehicle_T_other(whole_s), SOLID.box.corners_m).any()
+    assert not find_overlaps(
+        staged.other.bounding_box, staged.vehicle_T_other(whole_s), SOLID.bounding_box.corners_m
+    ).any()
     bent = Staged(grazing(0.4, radius_m=8), SOLID)
     finely_s = np.linspace(bent.contact_s - 1e-3, bent.contact_s + 1e-3, 20_001)
-    touching = find_overlaps(bent.other.box, bent.vehicle_T_other(finely_s), SOLID.box.corners_m)
+    touching = find_overlaps(bent.other.bounding_box, bent.vehicle_T_other(finely_s), SOLID.bounding_box.corners_m)
     assert finely_s[touching.argmax()] == pytest.approx(bent.contact_s, abs=2e-7)
 
 
@@ -124,7 +126,7 @@ def test_rows_of_obstacles_lie_where_the_ego_comes_from_or_beyond(speed_kmh):
     beyond = {"body": BOX, "side": "left", "where": "beyond", "yaw_deg": 90, "gap_m": 0.3, "beside_m": 0.7}
     staged = Staged(crossing(speed_kmh, {"body": BOX}, obstacles=[*rows, beyond]), SOLID)
     back = -math.copysign(1.0, speed_kmh)
-    placed = {called(one.body) + one.side + str(one.gap_m): pose[:2, 3] for one, pose in staged.obstacles}
+    placed = {get_shape_name(one.body) + one.side + str(one.gap_m): pose[:2, 3] for one, pose in staged.obstacles}
     # The other is 1 m wide along x, the ego 2 m along y.
     assert placed["boxright0.5"] == pytest.approx([back * (0.5 + 0.5 + 1.0), -1.0 - 1.0 - 0.5])
     assert placed["boxright0.4"] == pytest.approx([back * (0.5 + 0.5 + 2.0 + 0.4 + 1.5), -1.0 - 2.0 - 0.25])
@@ -208,10 +210,10 @@ def test_points_are_those_of_a_simulation_with_the_other_in_the_world():
         actor = {"name": "c", "category": "child", "shape": {"type": "vehicle", "vehicle": "child_120cm"},
                  "pose": {"x_m": x_m, "y_m": y_m, "yaw_deg": yaw_deg}}  # fmt: skip
         world = Scenario.model_validate({"name": "s", "ego": EGO, "bodies": bodies, "actors": [actor]})
-        scans = Simulator(world, {"r": small.rig}, PaperReference(rows=2, columns=2)).step(0).scans["r"]
+        scans = Simulator(world, {"r": small.rig}, PaperReference(rows=2, columns=2)).simulate_frame(0).scans["r"]
         for k, (sensor, scan) in enumerate(zip(small.rig.sensors, scans, strict=True)):
             points = int(looks.points([k], np.array([step]))[0])
-            assert points == sensor.counts_as * on_target(scan.points, child, x_m, y_m, math.radians(yaw_deg))
+            assert points == sensor.pixels_per_sample * on_target(scan.points, child, x_m, y_m, math.radians(yaw_deg))
             seen[k] += points
     assert (seen > 0).all()
 

@@ -63,7 +63,7 @@ TOP = lidar(**AHEAD)
 @pytest.fixture(scope="module")
 def driven(scenario):
     simulator = Simulator(scenario, {"small": rig(*SENSORS)}, PaperReference(rows=2, columns=2), seed=3)
-    return simulator, Drive.of_world("w", simulator.scene_of(0)[0].world)
+    return simulator, Drive.of_world("w", simulator.get_scene_geometry(0)[0].scene)
 
 
 def test_who_is_met_and_how_near_in_time_is_geometry(driven):
@@ -84,7 +84,12 @@ def test_who_is_met_and_how_near_in_time_is_geometry(driven):
 def test_points_are_those_of_frames(scenario, driven):
     simulator, there = driven
     frames = SimulatedFrames(
-        scenario, rigs=simulator.rigs, steps=31, seed=3, boxes=True, reference_sensor=PaperReference(rows=2, columns=2)
+        scenario,
+        rigs=simulator.rigs,
+        num_frames=31,
+        seed=3,
+        boxes=True,
+        reference_sensor=PaperReference(rows=2, columns=2),
     )
     eyes, counted = Eyes.of_world(simulator, 0, Criterion()), 0
     for track in there.tracks:
@@ -250,7 +255,7 @@ def test_who_is_hidden_until_braking_is_needed_is_too_late(scenario):
 
 def test_a_recording_of_a_world_says_the_same(scenario, tmp_path):
     frames = SimulatedFrames(
-        scenario, rig(TOP), steps=31, boxes=True, reference_sensor=PaperReference(rows=2, columns=2)
+        scenario, rig(TOP), num_frames=31, boxes=True, reference_sensor=PaperReference(rows=2, columns=2)
     )
     write_recording(frames, tmp_path / "drive")
     found, expected = (

@@ -112,7 +112,7 @@ def test_who_does_not_is_told_nothing(nothing_said, said):
 def test_workers_are_as_many_as_have_something_to_do(monkeypatch, count, frames, worlds, expected):
     monkeypatch.setattr(module, "cores", lambda: count)
     monkeypatch.setattr(multiprocessing, "get_start_method", lambda allow_none: "fork")
-    monkeypatch.setattr(module, "machine_bytes", lambda: 1e12)
+    monkeypatch.setattr(module, "find_memory_limit_bytes", lambda: 1e12)
     assert compute_num_workers(frames, worlds, sends_frames=False) == expected
     monkeypatch.setattr(multiprocessing, "get_start_method", lambda allow_none: "spawn")
     assert compute_num_workers(frames, worlds, sends_frames=False) == 0
@@ -130,7 +130,7 @@ def test_workers_need_memory_and_room_for_frames_that_they_hand_over(monkeypatch
         (2e9, 1e12, True, 3),
         (1e9, 1e12, False, 0),
     ):
-        monkeypatch.setattr(module, "machine_bytes", lambda memory=memory: memory)
+        monkeypatch.setattr(module, "find_memory_limit_bytes", lambda memory=memory: memory)
         monkeypatch.setattr(os, "statvfs", lambda _, room=room: os.statvfs_result([1] * 4 + [int(room)] + [1] * 5))
         assert compute_num_workers(64, 64, sends_frames=whole) == expected
 
@@ -149,7 +149,7 @@ def test_a_simulation_has_the_usual_workers_and_frames_of_others_none(monkeypatc
     asked = []
     monkeypatch.setattr(measuring, "observe", observe)
     monkeypatch.setattr(measuring, "compute_num_workers", usual)
-    frames = SimulatedFrames("urban", "front_roof_32", steps=64)
+    frames = SimulatedFrames("urban", "front_roof_32", num_frames=64)
     for given, expected in (
         ({"scenario": "urban", "steps": 64}, 2),
         ({"scenario": "urban", "steps": 9999, "metrics": "k_cover"}, 2),

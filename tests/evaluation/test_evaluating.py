@@ -123,7 +123,7 @@ def test_rigs_and_scenarios_as_objects_and_the_others_against_the_first(tmp_path
 
 
 def test_no_world_is_built_after_the_run_to_draw_the_ego(monkeypatch):
-    built, build = [], Scenario.world
+    built, build = [], Scenario.build_scene
     monkeypatch.setattr(Scenario, "world", lambda *args: built.append(args) or build(*args))
     result = torchcover.evaluate("front_roof_32", **SMALL)
     next(iter(result.plot_maps()))

@@ -57,8 +57,8 @@ def rig(kind, name, **changes):
 
 def numbers_of(rigs, steps=1, world=WORLD):
     """Name of each rig -> all its numbers."""
-    reference = SurfaceReference(((AREA.x_m, AREA.y_m),), rays=1000, bands_m=((-0.5, 2.0),), object_points=32)
-    frames = SimulatedFrames(world, rigs=rigs, steps=steps, reference_sensor=reference, boxes=True)
+    reference = SurfaceReference(((AREA.x_m, AREA.y_m),), num_rays=1000, bands_m=((-0.5, 2.0),), points_per_object=32)
+    frames = SimulatedFrames(world, rigs=rigs, num_frames=steps, reference_sensor=reference, boxes=True)
     observers = {}
     for name, one in rigs.items():
         sensors = [sensor.name for sensor in one.sensors]
@@ -114,7 +114,7 @@ def test_no_weather_makes_a_rig_better():
 def test_what_s_mig_captures_falls_with_what_returns():
     """The number itself rises: by the published sign, less that is crossed is better."""
     rigs = {str(at): rig("lidar", str(at), **keys) for at, keys in enumerate(CHAINS["missing returns"])}
-    frame, captured = SimulatedFrames(WORLD, rigs=rigs, steps=1, boxes=True)[0], []
+    frame, captured = SimulatedFrames(WORLD, rigs=rigs, num_frames=1, boxes=True)[0], []
     for name, one in rigs.items():
         metric = SMig(one.sensors, 1.0, categories=("car",), ends_at_hits=True, rig=name)
         metric.update(

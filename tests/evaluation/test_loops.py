@@ -104,18 +104,20 @@ def test_nothing_is_said_of_errors_where_there_are_none(drive):
 def test_the_steps_of_a_city_are_never_in_two_blocks():
     city = {"name": "urban", "traffic": {"type": "urban", "duration_s": 2.0, "time_step_s": 0.5}}
     few = PaperReference(rows=2, columns=2)
-    frames = SimulatedFrames(Scenario.model_validate(city), RIG, steps=12, frame_interval_s=1.0, reference_sensor=few)
-    places = [frames.simulator.block_index(index) for index in range(12)]
+    frames = SimulatedFrames(
+        Scenario.model_validate(city), RIG, num_frames=12, frame_interval_s=1.0, reference_sensor=few
+    )
+    places = [frames.simulator.get_block_index(index) for index in range(12)]
     assert places == [0, 0, 0, 1, 1, 2, 2, 2, 3, 3, 4, 4]
     assert (frames[3].block_index, frames[3].counts["repeated_frames"]) == (1, 0)
 
 
 @pytest.mark.parametrize("every_steps", [1, 2, 3, 7, 12])
 def test_distinct_instants_are_those_that_were_seen(drive, every_steps):
-    frames = SimulatedFrames(drive(12), RIG, steps=30, frame_interval_s=every_steps * 1.0)
-    seen = [frames.simulator.block_index(index) for index in range(30)]
+    frames = SimulatedFrames(drive(12), RIG, num_frames=30, frame_interval_s=every_steps * 1.0)
+    seen = [frames.simulator.get_block_index(index) for index in range(30)]
     assert seen == [index * every_steps % 12 for index in range(30)]
-    assert frames.simulator.distinct_steps == len(set(seen)) == 12 // math.gcd(12, every_steps)
+    assert frames.simulator.num_distinct_frames == len(set(seen)) == 12 // math.gcd(12, every_steps)
 
 
 @pytest.mark.parametrize("instants", [1, 2, 3, 4, 5, 8, 13, 60, 64, 100, 301, 602, 3001])

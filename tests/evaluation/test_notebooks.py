@@ -105,7 +105,7 @@ def test_without_the_extra_it_is_told(results, monkeypatch):
 
 
 def test_what_holds_arrays_is_called_by_their_shapes(results):
-    frame = SimulatedFrames("courtyard", "front_roof_32", steps=1, boxes=True)[0]
+    frame = SimulatedFrames("courtyard", "front_roof_32", num_frames=1, boxes=True)[0]
     seen = measure_box_visibility(frame.sensor, frame.reference, frame.boxes, reference_weights=frame.reference_weights)
     assert repr(frame).startswith(f"Frame(clouds={{'front_roof_32': ({len(frame.sensor)}, 3) float32}}, reference=(")
     for one in (frame, frame.boxes, seen, *results.values()):

@@ -147,14 +147,14 @@ def test_what_cannot_be_measured_ends_the_run_with_what_was_seen_before(frames, 
 
 
 def test_of_several_workers_one_makes_the_frames_of_a_world_and_all_come_in_order():
-    spread = SimulatedFrames("urban", "front_roof_32", steps=15, frame_interval_s=10.0)
+    spread = SimulatedFrames("urban", "front_roof_32", num_frames=15, frame_interval_s=10.0)
     tasks = list(group_by_scene(range(15), spread.get_scene_id))
     assert tasks == [[*range(7)], [*range(7, 13)], [13, 14]]
-    assert [{spread.simulator.run_of(index) for index in task} for task in tasks] == [{0}, {1}, {2}]
-    dense = list(group_by_scene(range(700), SimulatedFrames("urban", "front_roof_32", steps=1000).get_scene_id))
+    assert [{spread.simulator.get_run_index(index) for index in task} for task in tasks] == [{0}, {1}, {2}]
+    dense = list(group_by_scene(range(700), SimulatedFrames("urban", "front_roof_32", num_frames=1000).get_scene_id))
     assert [index for task in dense for index in task] == [*range(700)]
     assert max(map(len, dense)) == MOST_TOGETHER
-    still = SimulatedFrames("courtyard", "front_roof_32", steps=3)  # of which every process has the whole
+    still = SimulatedFrames("courtyard", "front_roof_32", num_frames=3)  # of which every process has the whole
     for alone in (still, []):
         assert list(group_by_scene(range(3), build_scene_lookup(alone))) == [[0], [1], [2]]
 
@@ -180,7 +180,7 @@ class Told(Wrapped):
 
 
 def test_whoever_wraps_frames_keeps_their_worlds():
-    frames = SimulatedFrames("urban", "front_roof_32", steps=15, frame_interval_s=10.0)
+    frames = SimulatedFrames("urban", "front_roof_32", num_frames=15, frame_interval_s=10.0)
     chosen, told = RigSubset(frames, {"mine": "front_roof_32"}), Told(frames)
     part = Subset(Told(chosen), [14, 0, 6, 7])
     worlds = [frames.get_scene_id(index) for index in range(15)]
@@ -191,8 +191,8 @@ def test_whoever_wraps_frames_keeps_their_worlds():
 
 def test_each_world_is_built_by_one_worker_whoever_gives_the_frames(monkeypatch, tmp_path):
     few = PaperReference(rows=4, columns=4)
-    frames = SimulatedFrames("parking", "front_roof_32", steps=4, frame_interval_s=35.0, reference_sensor=few)
-    build = Scenario.world
+    frames = SimulatedFrames("parking", "front_roof_32", num_frames=4, frame_interval_s=35.0, reference_sensor=few)
+    build = Scenario.build_scene
 
     def world(self, seed, run, *rest):
         with (tmp_path / "built").open("a") as file:
@@ -214,7 +214,7 @@ def test_a_source_that_does_not_know_its_worlds_is_refused_where_it_matters(fram
 
 @pytest.mark.parametrize("scenario", ["urban", "courtyard"])
 def test_no_list_is_made_of_all_the_steps_there_may_be(scenario):
-    frames = SimulatedFrames(scenario, "front_roof_32", steps=20_000)
+    frames = SimulatedFrames(scenario, "front_roof_32", num_frames=20_000)
     tracemalloc.start()
     tasks = group_by_scene(range(20_000), frames.get_scene_id)
     assert sum(map(len, tasks)) == 20_000

@@ -337,8 +337,8 @@ def test_who_waits_for_a_rank_that_is_gone_can_be_ended(frame_of, tmp_path):
 
 @pytest.mark.parametrize("frame_interval_s", [0.1, 10.0, 120.0])
 def test_shares_are_whole_worlds_and_more_steps_only_add_to_them(frame_interval_s):
-    frames = SimulatedFrames("urban", "front_roof_32", steps=5000, frame_interval_s=frame_interval_s)
-    world_of, everybody = frames.simulator.run_of, [Ranks(None, rank, 3) for rank in range(3)]
+    frames = SimulatedFrames("urban", "front_roof_32", num_frames=5000, frame_interval_s=frame_interval_s)
+    world_of, everybody = frames.simulator.get_run_index, [Ranks(None, rank, 3) for rank in range(3)]
     shares = [list(ranks.iterate_share(range(5000), world_of)) for ranks in everybody]
     assert sorted(index for share in shares for index in share) == list(range(5000))
     worlds = [{world_of(index) for index in share} for share in shares]

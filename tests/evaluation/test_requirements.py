@@ -16,9 +16,9 @@ from torchcover.evaluation.requirements import TargetPositions, TargetRequiremen
 from torchcover.geometry import BoundingBox
 from torchcover.placement.selection_space import SelectionSpace
 from torchcover.placement.space import SearchSpace
-from torchcover.simulation import RegionsOfInterest, Rig, Scenario, builtin_names, documents
+from torchcover.simulation import RegionsOfInterest, Rig, Scenario, documents, list_builtin_names
 from torchcover.simulation.bodies import Vehicle
-from torchcover.simulation.documents import explain
+from torchcover.simulation.documents import format_validation_error
 from torchcover.targets import SIDES, Raster, Target, survey
 
 CAR = BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5))
@@ -168,7 +168,7 @@ def test_requirements_that_read_alike_are_told_apart_or_refused():
 def test_messages_are_about_keys_of_the_file_and_not_of_the_program(one):
     with pytest.raises(ValidationError) as told:
         asked(one)
-    words = explain(told.value)
+    words = format_validation_error(told.value)
     assert words.startswith("requirements.0.")
     assert not re.search(r"\(place\)|tuple|literal|function|instance|validation|\.str", words.partition(" (got")[0])
 
@@ -223,7 +223,7 @@ def test_what_is_judged_is_what_a_survey_sees():
     assert worst["share"] == seen.share.min()
     assert worst["pixels"] == seen.sensor_points[2].min()  # one step: least and mean are one
     away_m = np.hypot(*(raster.positions_m - (1.8, 0.0)).T)  # none is nearer than the camera
-    angle = np.rad2deg(np.arctan(1.3 / away_m) - np.arctan((1.3 - child.solid.box.size_m[2]) / away_m))
+    angle = np.rad2deg(np.arctan(1.3 / away_m) - np.arctan((1.3 - child.solid.bounding_box.size_m[2]) / away_m))
     assert worst["visual_angle_deg"] == pytest.approx(angle.min())
     assert {v.bound.key: v.value for v in lidars}["points"] == seen.sensor_points[:2].sum(axis=0).min()
     # The mast hides all of it from the LiDAR behind it: whether or not what stands on it has failed.
@@ -363,7 +363,7 @@ def test_a_camera_of_few_pixels_shows_nothing_even_if_they_were_points_enough(bo
     assert (pixels.state, as_points.state, pixels.value) == ("not kept", "kept", as_points.value)
 
 
-@pytest.mark.parametrize("name", builtin_names("requirements"))
+@pytest.mark.parametrize("name", list_builtin_names("requirements"))
 def test_built_in_sets_say_where_they_are_from_and_that_they_are_no_homologation(name):
     found = Requirements.load(name)
     assert found.name == name
@@ -411,4 +411,4 @@ def test_a_key_in_another_unit_names_the_right_one():
     for key, right in (("yaw_rad", "yaw_deg"), ("x_mm", "x_m"), ("pitch_rad", "pitch_deg"), ("max_range_km", None)):
         with pytest.raises(ValueError, match="x") as told:
             Rig.model_validate({"name": "x", "sensors": [{"name": "s", "type": "lidar", "mount": {key: 1.0}}]})
-        assert f"is {right} meant?" in explain(told.value) or right is None
+        assert f"is {right} meant?" in format_validation_error(told.value) or right is None

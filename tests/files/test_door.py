@@ -10,11 +10,11 @@ from torchcover.files import (
     BadFileError,
     TooLargeError,
     check_memory,
+    guard_reader,
     read_csv,
     read_json_table,
     read_npz,
     read_short_text,
-    guard_reader,
 )
 from torchcover.files.bad_file import MAX_SHORT_BYTES
 

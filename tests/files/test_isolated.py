@@ -12,7 +12,7 @@ import pytest
 
 from tests.files import apart_readers
 from torchcover.files import BadFileError, guard_reader, isolated
-from torchcover.simulation.mesh_files import mesh_arrays
+from torchcover.simulation.mesh_files import read_mesh_arrays
 
 
 @pytest.fixture
@@ -120,10 +120,10 @@ def test_parts_of_a_mesh_are_looked_at_as_the_mesh_is(tmp_path):
         }
         path.write_text(json.dumps(content))
         if words is None:
-            assert mesh_arrays(path)["vertices"].shape == (3, 3)
+            assert read_mesh_arrays(path)["vertices"].shape == (3, 3)
         else:
             with pytest.raises(ValueError, match=words):
-                mesh_arrays(path)
+                read_mesh_arrays(path)
 
 
 @pytest.mark.parametrize("module", ["cameras.isolated_images", "recordings.isolated_readers", "simulation.mesh_files"])

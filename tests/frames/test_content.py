@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from torchcover.data import RecordedFrames, RigSubset, SimulatedFrames
-from torchcover.simulation.simulated_frames import reference_called
+from torchcover.simulation.simulated_frames import create_reference_sensor
 
 RIG = (
     "name: low\nsensors:\n  - {name: front, mount: {x_m: 2.5, z_m: 0.8}, channels: 8, vertical_fov_deg: [-30, 0], "
@@ -49,7 +49,7 @@ def test_of_a_simulation_it_is_what_stands_in_the_files(tmp_path):
     for changed in (
         {"seed": 1},
         {"frame_interval_s": 0.2},
-        {"reference_sensor": reference_called(rays=999)},
+        {"reference_sensor": create_reference_sensor(num_rays=999)},
         {"boxes": True},
     ):
         assert content(tmp_path, **changed) != before
@@ -65,9 +65,9 @@ def test_where_the_files_are_and_what_they_say_of_themselves_does_not_matter(tmp
 
 
 def test_traffic_has_its_vehicles_in_it(monkeypatch):
-    frames = SimulatedFrames("urban", "front_roof_32", steps=1)
+    frames = SimulatedFrames("urban", "front_roof_32", num_frames=1)
     before = frames.content
-    monkeypatch.setattr("torchcover.simulation.traffic.kind.builtin_hashes", lambda _: {"van": "larger"})
+    monkeypatch.setattr("torchcover.simulation.traffic.kind.hash_builtin_documents", lambda _: {"van": "larger"})
     assert frames.content["scenario"]["traffic"].pop("vehicles") == {"van": "larger"}
     assert len(before["scenario"]["traffic"].pop("vehicles")) > 5
     assert before["scenario"]["traffic"]["type"] == "urban"

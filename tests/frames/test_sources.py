@@ -33,7 +33,7 @@ def folder_of(path, places):
 
 
 def simulated(_):
-    return SimulatedFrames("courtyard", "front_roof_32", steps=2, reference_sensor=PaperReference(16, 16))
+    return SimulatedFrames("courtyard", "front_roof_32", num_frames=2, reference_sensor=PaperReference(16, 16))
 
 
 def recorded(path):
@@ -49,8 +49,8 @@ def chosen(path):
 
 
 def by_area(_):
-    reference_sensor = SurfaceReference((((0.0, 20.0), (-5.0, 5.0)),), rays=256)
-    return SimulatedFrames("courtyard", "front_roof_32", steps=2, reference_sensor=reference_sensor)
+    reference_sensor = SurfaceReference((((0.0, 20.0), (-5.0, 5.0)),), num_rays=256)
+    return SimulatedFrames("courtyard", "front_roof_32", num_frames=2, reference_sensor=reference_sensor)
 
 
 @pytest.mark.parametrize("make", [simulated, by_area, recorded, recorded_rigs, chosen])
@@ -84,9 +84,9 @@ def test_a_source_is_a_map_style_dataset_that_knows_whose_frames_they_are(tmp_pa
 
 @pytest.mark.parametrize("scenario", ["courtyard", "parking"])
 def test_the_outline_of_a_simulation_is_that_of_its_ego_and_needs_no_world(monkeypatch, scenario):
-    expected = Scenario.load(scenario).world().ego.mesh.vertices_m[:, :2]
+    expected = Scenario.load(scenario).build_scene().ego.mesh.vertices_m[:, :2]
     monkeypatch.setattr(Scenario, "world", lambda *_: pytest.fail("a world was built"))
-    outline_m = SimulatedFrames(scenario, "front_roof_32", steps=1).ego_outline_m
+    outline_m = SimulatedFrames(scenario, "front_roof_32", num_frames=1).ego_outline_m
     np.testing.assert_allclose(outline_m.max(axis=0), expected.max(axis=0))
     np.testing.assert_allclose(outline_m.min(axis=0), expected.min(axis=0))
 
@@ -124,7 +124,7 @@ def test_another_format_is_a_class_and_a_line(tmp_path, monkeypatch):
 def test_rigs_are_chosen_in_any_order_under_any_name_with_what_belongs_to_them():
     rigs = {"a": "front_roof_32", "b": "front_grille_128"}
     reference_sensor = PaperReference(16, 16)
-    both = SimulatedFrames("parking", rigs=rigs, steps=1, boxes=True, reference_sensor=reference_sensor)
+    both = SimulatedFrames("parking", rigs=rigs, num_frames=1, boxes=True, reference_sensor=reference_sensor)
     turned = RigSubset(both, {"second": "b", "a": "a"})
     assert list(turned.rigs) == list(turned.sensors) == list(turned[0].clouds) == ["second", "a"]
     assert turned.sensors["second"] == both.sensors["b"]
@@ -155,7 +155,7 @@ def test_a_batch_has_weights_of_all_its_frames_or_of_none():
 
 def test_blocks_of_a_source_end_where_its_frames_show_something_else(tmp_path):
     traffic = SimulatedFrames(
-        "urban", "front_roof_32", steps=3, frame_interval_s=10.0, reference_sensor=PaperReference(4, 4)
+        "urban", "front_roof_32", num_frames=3, frame_interval_s=10.0, reference_sensor=PaperReference(4, 4)
     )
     ends = find_block_ends(traffic, max_blocks=4)
     places = [traffic.get_block_index(index) for index in range(ends[-1] + 1)]

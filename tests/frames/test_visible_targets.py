@@ -46,7 +46,7 @@ def test_shares_go_with_their_boxes_through_loaders_and_augmentation():
 
 
 def test_of_a_simulation_they_are_those_of_box_visibility():
-    frames = SimulatedFrames("urban", "front_roof_32", steps=2, frame_interval_s=15.0, boxes=True)
+    frames = SimulatedFrames("urban", "front_roof_32", num_frames=2, frame_interval_s=15.0, boxes=True)
     for frame, kept in zip(frames, VisibleBoxes(frames, 0.3), strict=True):
         seen = measure_box_visibility(
             frame.sensor, frame.reference, frame.boxes, reference_weights=frame.reference_weights

@@ -32,17 +32,17 @@ def same(a, b):
 
 @pytest.mark.parametrize("scenario", [LOT, yard(WALL)])
 def test_another_rig_sees_what_it_would_see_in_frames_of_its_own(scenario):
-    frames = SimulatedFrames(scenario, TWO, steps=8, frame_interval_s=0.4, seed=3)
+    frames = SimulatedFrames(scenario, TWO, num_frames=8, frame_interval_s=0.4, seed=3)
     other = Simulator(
-        scenario, {"first": rig()}, SurfaceReference((((0, 9), (-3, 3)),), rays=64), seed=3, frame_interval_s=0.4
+        scenario, {"first": rig()}, SurfaceReference((((0, 9), (-3, 3)),), num_rays=64), seed=3, frame_interval_s=0.4
     )
-    candidate = other.with_rigs({"candidate": TWO})
+    candidate = other.replace_rigs({"candidate": TWO})
     for index in (4, 0, 3, 0):
-        scans = candidate.scans(index)["candidate"]
+        scans = candidate.simulate_scans(index)["candidate"]
         np.testing.assert_array_equal(np.concatenate([scan.points for scan in scans]), frames[index].sensor.numpy())
     # And who was there first sees no more and no less for it.
-    alone = SimulatedFrames(scenario, rig(), steps=8, frame_interval_s=0.4, seed=3)
-    np.testing.assert_array_equal(other.step(3).clouds["first"], alone[3].sensor.numpy())
+    alone = SimulatedFrames(scenario, rig(), num_frames=8, frame_interval_s=0.4, seed=3)
+    np.testing.assert_array_equal(other.simulate_frame(3).clouds["first"], alone[3].sensor.numpy())
 
 
 def test_ideal_sensors_have_a_point_for_every_hit():
@@ -70,7 +70,7 @@ def test_numbers_are_those_of_evaluate_on_the_same_frames_to_the_last_bit():
     frames = SimulatedFrames(
         found._worlds[0],
         TWO,
-        steps=max(index.frame_index for index in found.indices) + 1,
+        num_frames=max(index.frame_index for index in found.indices) + 1,
         frame_interval_s=0.4,
         reference_sensor=found.queries.build_reference_sensor(1024),
     )
@@ -84,7 +84,7 @@ def test_numbers_are_those_of_evaluate_on_the_same_frames_to_the_last_bit():
             return frames[steps[index]]
 
     in_order = copy(frames)
-    in_order.__class__, in_order.steps = InOrder, len(steps)
+    in_order.__class__, in_order.num_frames = InOrder, len(steps)
     regions = {"20m": {"x_m": (0.0, 20.0), "y_m": (-5.0, 5.0)}, "80m": {"x_m": (0.0, 80.0), "y_m": (-20.0, 20.0)}}
     ask = RegionsOfInterest.model_validate({"regions": {**regions, **BAY}})
     result = evaluate(frames=in_order, ask=ask, cell_m=0.5, thresholds_m=(0.2, 0.3))

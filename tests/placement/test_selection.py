@@ -175,7 +175,7 @@ def test_places_all_over_a_region_lie_on_its_skin(tmp_path):
     assert len(set(names)) == len(names) > 10
     assert all(name.startswith(("wide_roof_", "wide_hood_")) for name in names)
     assert {round(sensor.mount.yaw_deg) for sensor in space.sensors} == {0, 90}
-    body = space.scenarios[0].ego_mesh()
+    body = space.scenarios[0].build_ego_mesh()
     top_m = body.vertices_m[:, 2].max()
     assert all(0.9 < sensor.mount.z_m <= top_m + 0.2 + 1e-6 for sensor in space.sensors)
 

@@ -108,7 +108,7 @@ def test_a_pair_is_symmetric_whatever_its_values():
         counts.add(len(pair))
         assert bool(pair) == values["left.present"]
         if pair:
-            left, right = (sensor.mount.matrix() for sensor in pair)
+            left, right = (sensor.mount.to_matrix() for sensor in pair)
             assert right == pytest.approx(MIRROR @ left @ MIRROR, abs=1e-7)
             assert [sensor.name for sensor in pair] == ["left", "right"]
             assert {sensor.model for sensor in pair} == {values["left.model"]}
@@ -118,7 +118,7 @@ def test_a_pair_is_symmetric_whatever_its_values():
 
 def test_a_height_above_the_body_is_that():
     searched = space({"left": {"x_m": (-2.0, 1.8), "y_m": (-0.8, 0.8), "z_above_body_m": (0.1, 0.3)}})
-    body = searched.scenarios[0].ego_mesh()
+    body = searched.scenarios[0].build_ego_mesh()
     triangles = body.vertices_m[body.faces]
     for values in drawn(searched):
         at = place(searched.build_rig(values, "found").sensors[0])
@@ -130,7 +130,10 @@ def test_a_height_above_the_body_is_that():
 def test_a_place_on_a_region_is_as_far_from_the_skin_as_its_height():
     regions = ("roof", "grille", "front_bumper", "rear_bumper", "fender_left", "mirror_right")
     searched = space({"left": {"region": regions, "height_m": (0.02, 0.06), "yaw_deg": (-30.0, 30.0)}})
-    body, faced = searched.scenarios[0].ego_mesh(), {"rear_bumper": 180.0, "fender_left": 90.0, "mirror_right": -90.0}
+    body, faced = (
+        searched.scenarios[0].build_ego_mesh(),
+        {"rear_bumper": 180.0, "fender_left": 90.0, "mirror_right": -90.0},
+    )
     triangles, seen = body.vertices_m[body.faces], set()
     for values in drawn(searched, 40):
         sensor = searched.build_rig(values, "found").sensors[0]
@@ -319,4 +322,4 @@ def test_a_rig_is_written_with_what_it_names_by_file(tmp_path):
     (tmp_path / "mine.yaml").unlink()
     again = Rig.load(tmp_path / "there" / "rig.yaml")
     assert again.vehicle == rig.vehicle
-    assert (again.sensors[0].directions() == rig.sensors[0].directions()).all()
+    assert (again.sensors[0].compute_directions() == rig.sensors[0].compute_directions()).all()

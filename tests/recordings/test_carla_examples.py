@@ -39,7 +39,7 @@ def photographed(tmp_path_factory):
     paths, clouds = [], {}
     for sensor in sensors:
         rig = Rig.model_validate({"name": sensor["name"], "sensors": [sensor]})
-        frames = SimulatedFrames("courtyard", rig, steps=1, reference_sensor=PaperReference(rows=4, columns=4))
+        frames = SimulatedFrames("courtyard", rig, num_frames=1, reference_sensor=PaperReference(rows=4, columns=4))
         points = frames[0].sensor
         camera: Camera = rig.sensors[0].camera()
         in_camera = camera.to_camera(points)

@@ -31,9 +31,9 @@ REAR = {"name": "a rear", "mount": {"x_m": -2.6, "z_m": 0.9, "yaw_deg": 170}, **
 
 def simulated(*sensors, scenario="parking", steps=2, **others):
     rig = Rig.model_validate({"name": "both", "sensors": sensors})
-    reference_sensor = SurfaceReference((((-20.0, 40.0), (-10.0, 10.0)),), rays=512)
+    reference_sensor = SurfaceReference((((-20.0, 40.0), (-10.0, 10.0)),), num_rays=512)
     others = {"boxes": True, "frame_interval_s": 45.0, "reference_sensor": reference_sensor, **others}
-    return SimulatedFrames(scenario, rig, steps=steps, seed=5, **others)
+    return SimulatedFrames(scenario, rig, num_frames=steps, seed=5, **others)
 
 
 @pytest.fixture(scope="module")
@@ -148,7 +148,7 @@ def test_labels_of_kitti_are_seen_from_its_camera(tmp_path):
 
 def test_a_step_without_objects_has_an_empty_list_of_them(tmp_path):
     frames = simulated(FRONT, steps=1)
-    frames.simulator.labels = lambda index: []
+    frames.simulator.compute_labels = lambda index: []
     for layout in ("folder", "kitti"):
         write_recording(frames, tmp_path / layout, layout)
         assert len(RecordedFrames(tmp_path / layout)[0].boxes) == 0
@@ -176,7 +176,7 @@ def test_what_cannot_be_written_is_refused_before_the_first_step(both, tmp_path,
     for name in ("a/b", "..", "", "reference"):
         with pytest.raises(ValueError, match=rf"sensor '{name}': a recording has a folder of this name"):
             write_recording(simulated({**FRONT, "name": name}), tmp_path / "new")
-    several = SimulatedFrames("courtyard", rigs={"a": "front_roof_32", "b": "front_roof_32"}, steps=1)
+    several = SimulatedFrames("courtyard", rigs={"a": "front_roof_32", "b": "front_roof_32"}, num_frames=1)
     with pytest.raises(ValueError, match=r"a recording is of one rig; got a, b"):
         write_recording(several, tmp_path / "new")
     assert not (tmp_path / "new").exists()

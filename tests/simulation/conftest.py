@@ -10,7 +10,8 @@ def at(monkeypatch):
 
     def put(place_m):
         monkeypatch.setattr(
-            "torchcover.simulation.surface_reference.position_in_shell", lambda *_: np.array(place_m, dtype=np.float64)
+            "torchcover.simulation.surface_reference.sample_position_in_shell",
+            lambda *_: np.array(place_m, dtype=np.float64),
         )
 
     return put

@@ -23,7 +23,7 @@ def scenario(*bodies, ego=EGO, **keys):
 def sums(made, sensor, value=lambda points: np.ones(len(points)), steps=40, first=0):
     """(steps,) sum over the points of weight times a value of them."""
     simulator = Simulator(made, {}, sensor)
-    seen = [simulator.step(index) for index in range(first, first + steps)]
+    seen = [simulator.simulate_frame(index) for index in range(first, first + steps)]
     return np.array([(step.reference_weights.astype(np.float64) * value(step.reference)).sum() for step in seen])
 
 

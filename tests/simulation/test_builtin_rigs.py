@@ -5,10 +5,10 @@ import pytest
 
 from torchcover import Rig
 from torchcover.geometry import transform_points
-from torchcover.simulation import builtin_names
+from torchcover.simulation import list_builtin_names
 from torchcover.simulation.bodies import Vehicle
 
-RIGS = builtin_names("rigs")
+RIGS = list_builtin_names("rigs")
 
 # Centre of the box in the frame of the source: metres before the rear axle, height of the source's origin.
 NUSCENES, KITTI, WAYMO, ARGOVERSE, EDGAR = (1.385, 0.0), (1.337, 0.0), (1.461, 0.0), (1.339, 0.30), (1.5915, 0.338)
@@ -91,7 +91,7 @@ IN_DEGREES = [name for name in ROLLS if name.startswith("place3d2024")]
 
 def mounted(rig, sensor):
     (found,) = [each for each in Rig.load(rig).sensors if each.name == sensor]
-    return found.mount.matrix()
+    return found.mount.to_matrix()
 
 
 def looks(matrix, direction=(1.0, 0.0, 0.0)):
@@ -111,12 +111,12 @@ def test_a_rig_says_where_its_numbers_come_from_and_names_its_sensors(name):
 def test_no_sensor_lies_inside_its_vehicle_or_below_the_ground(name):
     rig = Rig.load(name)
     sensors = rig.sensors
-    positions = np.array([sensor.mount.matrix()[:3, 3] for sensor in sensors])
+    positions = np.array([sensor.mount.to_matrix()[:3, 3] for sensor in sensors])
     # A camera is smaller than a LiDAR, and may sit right on the body.
     room_m = np.array([0.03 if sensor.type == "lidar" else 0.0 for sensor in sensors])
     assert (positions[:, 2] > 0.3).all()
     for part in Vehicle.load(rig.vehicle or "suv").parts:
-        for mesh in part.meshes():
+        for mesh in part.build_meshes():
             # Parts are convex: a point inside lies behind every face.
             a, b, c = (mesh.vertices_m[mesh.faces[:, corner]] for corner in range(3))
             normals = np.cross(b - a, c - a)
@@ -133,7 +133,7 @@ def test_positions_are_those_of_the_source(rig, sensor, frame, published):
 
 @pytest.mark.parametrize("rig", CARLA)
 def test_positions_are_those_of_carla_with_left_and_right_exchanged(rig):
-    positions = np.array([sensor.mount.matrix()[:3, 3] for sensor in Rig.load(rig).sensors])
+    positions = np.array([sensor.mount.to_matrix()[:3, 3] for sensor in Rig.load(rig).sensors])
     np.testing.assert_allclose((positions * [1, -1, 1]).T, CARLA[rig], atol=1e-9)
 
 
@@ -141,7 +141,7 @@ def test_positions_are_those_of_carla_with_left_and_right_exchanged(rig):
 def test_the_right_axis_drops_by_the_sine_of_carlas_roll(rig):
     rolls = ROLLS.get(rig, (0,) * len(CARLA[rig][0]))
     for sensor, roll in zip(Rig.load(rig).sensors, rolls, strict=True):
-        right = sensor.mount.matrix()[:3, :3] @ [0, -1, 0]
+        right = sensor.mount.to_matrix()[:3, :3] @ [0, -1, 0]
         assert right[2] == pytest.approx(-np.sin(roll), abs=1e-5)
 
 
@@ -170,7 +170,7 @@ def test_the_placements_of_place3ds_tables_have_the_lidar_of_its_tables():
 
 
 def test_the_pitched_placement_looks_down():
-    front = Rig.load("hu2022_pyramid_pitch").sensors[1].mount.matrix()
+    front = Rig.load("hu2022_pyramid_pitch").sensors[1].mount.to_matrix()
     assert looks(front)[1] == pytest.approx(np.rad2deg(-0.09), abs=1e-3)
 
 
@@ -233,7 +233,7 @@ def test_kittis_cameras_have_their_baselines():
 @pytest.mark.parametrize("rig", [name for name in RIGS if name.endswith("_cameras")])
 def test_published_cameras_have_a_ray_for_every_pixel_and_come_beside_a_rig_of_lidars(rig):
     for sensor in Rig.load(rig).sensors:
-        assert np.isfinite(sensor.directions()).all()
+        assert np.isfinite(sensor.compute_directions()).all()
     if rig != "three_cameras":
         lidars = Rig.load(rig.removesuffix("_cameras"))
         assert {sensor.type for sensor in lidars.sensors} == {"lidar"}
@@ -269,7 +269,7 @@ def test_rays_reach_the_ground_in_front(rig):
     """A gross error of a mount, such as a roll of 180 degrees, leaves no ray for the road ahead."""
     reached = 0
     for sensor in Rig.load(rig).sensors:
-        matrix, directions = sensor.mount.matrix(), sensor.directions().reshape(3, -1)
+        matrix, directions = sensor.mount.to_matrix(), sensor.compute_directions().reshape(3, -1)
         ends = transform_points(matrix, directions.T)
         origin = matrix[:3, 3]
         fall = origin[2] - ends[:, 2]

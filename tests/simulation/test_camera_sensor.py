@@ -7,9 +7,9 @@ import torch
 from tests.simulation.small_worlds import AHEAD, FLOOR, scenario
 from torchcover import Rig
 from torchcover.data import SimulatedFrames
-from torchcover.simulation import CameraSensor, Draws, PaperReference, RayHits, Scenario, SurfaceReference
-from torchcover.simulation.rays import into_tiles
-from torchcover.simulation.scene import Scene
+from torchcover.simulation import CameraSensor, PaperReference, RayHits, Scenario, SensorNoise, SurfaceReference
+from torchcover.simulation.rays import split_into_tiles
+from torchcover.simulation.scene import SceneGeometry
 
 LENSES = {
     "pinhole": {"fov_deg": 100.0},
@@ -37,12 +37,12 @@ def camera(kind="pinhole", /, **changes):
 @pytest.mark.parametrize("lens", LENSES)
 def test_a_depth_image_that_is_cast_unprojects_to_the_hits(lens):
     sensor = camera(lens)
-    instant = Scene(Scenario.load("courtyard").world()).at(0)
-    vehicle_T_mount = sensor.mount.matrix()
-    image = instant.range_image(vehicle_T_mount, sensor.directions(), max_range_m=60.0)
-    model = sensor.camera()
+    instant = SceneGeometry(Scenario.load("courtyard").build_scene()).get_snapshot(0)
+    vehicle_T_mount = sensor.mount.to_matrix()
+    image = instant.render_range_image(vehicle_T_mount, sensor.compute_directions(), max_range_m=60.0)
+    model = sensor.build_camera()
     cloud = model.to_vehicle(model.unproject(torch.from_numpy(image), depth_kind="distance")).numpy()
-    tiles = into_tiles(sensor.directions())
+    tiles = split_into_tiles(sensor.compute_directions())
     scan = instant.scan(vehicle_T_mount, tiles, max_range_m=60.0)
     # The image shows the ego's hood, the scan leaves it out.
     assert len(cloud) == len(scan.points) + scan.self_hits
@@ -64,19 +64,23 @@ def test_the_field_of_view_is_that_of_the_outermost_pixels():
 def test_pixels_without_a_ray_give_no_point_and_are_no_rays():
     # A fold within the image: beyond it there is nothing.
     folded = camera("brown_conrady", coefficients=[-0.35, 0.0, 0.0, 0.0])
-    missing = int(np.isnan(folded.directions()[0]).sum())
+    missing = int(np.isnan(folded.compute_directions()[0]).sum())
     assert 0 < missing < 160 * 120
     frames = SimulatedFrames(
-        "courtyard", Rig(name="r", sensors=(folded,)), steps=1, reference_sensor=PaperReference(8, 8)
+        "courtyard", Rig(name="r", sensors=(folded,)), num_frames=1, reference_sensor=PaperReference(8, 8)
     )
     assert frames[0].counts["sensor_rays"] == 160 * 120 - missing
     assert frames[0].sensor.isfinite().all()
-    image = frames.simulator.scene_of(0)[0].at(0).range_image(np.eye(4) @ folded.mount.matrix(), folded.directions())
+    image = (
+        frames.simulator.get_scene_geometry(0)[0]
+        .get_snapshot(0)
+        .render_range_image(np.eye(4) @ folded.mount.to_matrix(), folded.compute_directions())
+    )
     assert np.isnan(image).sum() == missing
 
 
 def test_stride_takes_every_nth_row_and_column():
-    np.testing.assert_array_equal(camera(stride=3).directions(), camera().directions()[:, ::3, ::3])
+    np.testing.assert_array_equal(camera(stride=3).compute_directions(), camera().compute_directions()[:, ::3, ::3])
 
 
 @pytest.mark.parametrize(
@@ -105,13 +109,15 @@ def test_depth_errs_as_that_of_a_pair_of_cameras_and_no_range_is_below_zero():
     sensor = camera(stereo=pair, range_noise_share=0.03, range_noise_m=0.04, width=500, fov_deg=90.0)  # f is 250 px
     range_m = np.array([1.0, 10.0, 59.0])
     stereo_m = range_m**2 * 0.25 / (250 * 0.3)
-    np.testing.assert_allclose(sensor.noise_m(range_m), np.sqrt(stereo_m**2 + (0.03 * range_m) ** 2 + 0.04**2))
+    np.testing.assert_allclose(
+        sensor.compute_noise_std_m(range_m), np.sqrt(stereo_m**2 + (0.03 * range_m) ** 2 + 0.04**2)
+    )
     ray = np.arange(5000)
     hits = RayHits(ray, np.full(5000, 50.0), ray)
-    _, error_m = sensor.measure(hits, Draws(np.random.default_rng(0)))
-    assert error_m[error_m > -50].std() == pytest.approx(float(sensor.noise_m(np.array(50.0))), rel=0.05)
-    wild = camera(stereo={**pair, "subpixel_px": 20.0}).measure(hits, Draws(np.random.default_rng(0)))
-    assert wild.error_m.min() == -50.0
+    _, error_m = sensor.measure(hits, SensorNoise(np.random.default_rng(0)))
+    assert error_m[error_m > -50].std() == pytest.approx(float(sensor.compute_noise_std_m(np.array(50.0))), rel=0.05)
+    wild = camera(stereo={**pair, "subpixel_px": 20.0}).measure(hits, SensorNoise(np.random.default_rng(0)))
+    assert wild.range_error_m.min() == -50.0
     assert camera(stereo=None).is_exact
     assert not camera(range_noise_share=0.1).is_exact
 
@@ -125,8 +131,8 @@ def test_points_on_an_object_are_counted_as_pixels_of_the_full_image():
         )
         for stride in (1, 2, 5)
     }
-    few = SurfaceReference((AHEAD,), rays=50)
-    (frame,) = SimulatedFrames(made, rigs=rigs, steps=1, reference_sensor=few, boxes=True)
+    few = SurfaceReference((AHEAD,), num_rays=50)
+    (frame,) = SimulatedFrames(made, rigs=rigs, num_frames=1, reference_sensor=few, boxes=True)
     full, *strided = (int(hits) for hits in frame.boxes.points_in_box.values())
     assert full > 5000
     assert strided == pytest.approx([full, full], rel=0.05)

@@ -6,29 +6,29 @@ import pytest
 from torchcover.geometry import BoundingBox, build_transform, convert_euler_to_rotation
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation import PaperReference, Pose, Scenario
-from torchcover.simulation.raycaster import cast_from
+from torchcover.simulation.raycaster import cast_from_vehicle
 from torchcover.simulation.rays import (
-    blocks_towards,
-    boxes_in_cone,
-    into_tiles,
-    outlines,
-    rays_towards,
+    compute_outlines,
+    compute_unit_directions,
+    find_blocks_towards_boxes,
+    find_boxes_in_cone,
+    find_rays_towards_boxes,
     rotate,
     rotate_each,
-    unit_directions,
+    split_into_tiles,
 )
-from torchcover.simulation.scene import Scene
+from torchcover.simulation.scene import SceneGeometry
 from torchcover.simulation.shapes import Box, Plane
-from torchcover.simulation.world import Actor, World
+from torchcover.simulation.world import Actor, Scene
 
 EGO = BoundingBox((-2.45, -0.97, 0.0), (2.45, 0.97, 1.63))
-SPHERE = into_tiles(unit_directions(np.linspace(-89, 89, 60)[:, None], np.linspace(-180, 179, 120)[None]))
-ROOF = Pose(x_m=0.45, z_m=1.73).matrix()
+SPHERE = split_into_tiles(compute_unit_directions(np.linspace(-89, 89, 60)[:, None], np.linspace(-180, 179, 120)[None]))
+ROOF = Pose(x_m=0.45, z_m=1.73).to_matrix()
 
 
 @pytest.fixture(scope="module", params=["urban", "highway", "parking"])
 def scene(request):
-    return Scene(Scenario.load(request.param).world(seed=3))
+    return SceneGeometry(Scenario.load(request.param).build_scene(seed=3))
 
 
 def at_every_body(instant, vehicle_T_sensor, tiles, max_range_m):
@@ -37,15 +37,15 @@ def at_every_body(instant, vehicle_T_sensor, tiles, max_range_m):
     for tile in tiles:
         directions = rotate(vehicle_T_sensor[:3, :3], tile.directions)
         limit_m = np.full(directions.shape[1], max_range_m, dtype=np.float32)
-        hits = cast_from(instant.static, instant.static_T_vehicle, origin_m, directions, limit_m)
+        hits = cast_from_vehicle(instant.static, instant.static_T_vehicle, origin_m, directions, limit_m)
         moving = instant.moving
         for caster, part_T_vehicle, body in zip(moving.casters, moving.part_T_vehicle, moving.body, strict=True):
-            nearer = cast_from(caster, part_T_vehicle, origin_m, directions, hits.range_m)
+            nearer = cast_from_vehicle(caster, part_T_vehicle, origin_m, directions, hits.range_m)
             hits.range_m[:] = nearer.range_m
-            hits.body[nearer.body >= 0] = body
-        seen = (hits.body >= 0) & (hits.body != instant.ego)
+            hits.body_indices[nearer.body_indices >= 0] = body
+        seen = (hits.body_indices >= 0) & (hits.body_indices != instant.ego)
         points = (directions * hits.range_m + origin_m.astype(np.float32)[:, None])[:, seen]
-        answers.append((points.T, np.count_nonzero(hits.body == instant.ego)))
+        answers.append((points.T, np.count_nonzero(hits.body_indices == instant.ego)))
     points, self_hits = zip(*answers, strict=True)
     return np.concatenate(points), sum(self_hits)
 
@@ -62,9 +62,9 @@ def test_a_scan_is_that_of_every_ray_cast_at_every_body(scene, step, sensor):
     instant, generator = scene.at(step, within_m=150.0), np.random.default_rng(step)
     if sensor == "paper":
         reference = PaperReference(rows=60, columns=90)
-        pose, tiles = reference.vehicle_T_reference(EGO, generator), into_tiles(reference.directions())
+        pose, tiles = reference.sample_pose(EGO, generator), split_into_tiles(reference.compute_directions())
     else:
-        pose, tiles = ROOF if sensor == "roof" else Pose(x_m=2.6, z_m=0.4, pitch_deg=3).matrix(), SPHERE
+        pose, tiles = ROOF if sensor == "roof" else Pose(x_m=2.6, z_m=0.4, pitch_deg=3).to_matrix(), SPHERE
     seen = instant.scan(pose, tiles, max_range_m=150.0)
     assert_same_bits(seen, at_every_body(instant, pose, tiles, 150.0))
     assert seen.body_casts < 0.5 * seen.rays * len(instant.moving)
@@ -72,26 +72,26 @@ def test_a_scan_is_that_of_every_ray_cast_at_every_body(scene, step, sensor):
 
 def test_bodies_of_one_kind_are_cast_at_together_from_a_place_on_one_of_them_too():
     """Two coincide: what a ray hits then is the last of them, as it is when they are cast at in turn."""
-    car, away = Box(type="box", size_m=(4, 2, 1.5)).mesh(), np.array([0.0, 3.0])
+    car, away = Box(type="box", size_m=(4, 2, 1.5)).build_mesh(), np.array([0.0, 3.0])
     places = [(0, 0, 0), (8, 1, 0), (8, 1, 0), (9, -4, 0), (-7, 2, 0)]
     ways = [
         Trajectory.from_arrays(away, [at, np.add(at, (9, 0, 0))], [[15.0 * k, 0, 0]] * 2) for k, at in enumerate(places)
     ]
     ways[2] = ways[1]
     actors = [Actor(f"car {k}", "car", car, way) for k, way in enumerate(ways)]
-    ground = Plane(type="plane", size_m=(60, 60)).mesh().moved(build_transform(np.eye(3), [0, 0, -2]))
-    instant = Scene(World((ground,), actors[0], tuple(actors[1:]), duration_s=3.0)).at(0)
+    ground = Plane(type="plane", size_m=(60, 60)).build_mesh().transform(build_transform(np.eye(3), [0, 0, -2]))
+    instant = SceneGeometry(Scene((ground,), actors[0], tuple(actors[1:]), duration_s=3.0)).get_snapshot(0)
     roof_m = np.array([9.0, -4.0, car.vertices_m[:, 2].max()])
-    touched = instant.moving.touched_by(roof_m, instant.moving.from_there_m(roof_m))
+    touched = instant.moving_bodies.find_touched_bodies(roof_m, instant.moving_bodies.transform_to_parts_m(roof_m))
     assert touched.tolist() == [False, False, False, True, False]
     for place_m in (roof_m, np.array([4.0, 0.0, 1.0])):
         pose = build_transform(np.eye(3), place_m)
         assert_same_bits(instant.scan(pose, SPHERE, max_range_m=90.0), at_every_body(instant, pose, SPHERE, 90.0))
-    (tile,) = into_tiles(unit_directions(np.zeros((1, 1)), np.array([[14.0]])))
+    (tile,) = split_into_tiles(compute_unit_directions(np.zeros((1, 1)), np.array([[14.0]])))
     _, hits, _ = instant.cast(
-        build_transform(np.eye(3), place_m), tile, np.full(1, 90, np.float32), instant.outlines(place_m)
+        build_transform(np.eye(3), place_m), tile, np.full(1, 90, np.float32), instant.compute_outlines(place_m)
     )
-    assert hits.body == instant.moving.body[2]
+    assert hits.body_indices == instant.moving_bodies.body_indices[2]
 
 
 def boxes_around(generator, count):
@@ -104,10 +104,10 @@ def boxes_around(generator, count):
 
 
 def test_a_tile_of_which_no_ray_is_cast_meets_no_box_around_the_sensor():
-    none = SPHERE[0].some(np.zeros(SPHERE[0].directions.shape[1], dtype=bool))
-    around = outlines(EGO.corners_m[None], ROOF[:3, 3] / 2)
-    assert boxes_in_cone(around, none.axis, none.half_angle, 0.0).tolist() == [0]
-    assert blocks_towards(around, none, np.eye(3), np.empty(0, dtype=np.float32)).shape == (1, 0)
+    none = SPHERE[0].select(np.zeros(SPHERE[0].directions.shape[1], dtype=bool))
+    around = compute_outlines(EGO.corners_m[None], ROOF[:3, 3] / 2)
+    assert find_boxes_in_cone(around, none.axis, none.half_angle_rad, 0.0).tolist() == [0]
+    assert find_blocks_towards_boxes(around, none, np.eye(3), np.empty(0, dtype=np.float32)).shape == (1, 0)
 
 
 def test_no_ray_that_meets_a_box_is_left_out():
@@ -115,7 +115,7 @@ def test_no_ray_that_meets_a_box_is_left_out():
     generator = np.random.default_rng(0)
     corners_m, sizes, poses = boxes_around(generator, 300)
     origin_m = np.array([0.3, -0.2, 0.1])
-    seen = outlines(corners_m, origin_m)
+    seen = compute_outlines(corners_m, origin_m)
     turned = convert_euler_to_rotation(30, 20, 10)
     close = 0
     for k, (size, pose) in enumerate(zip(sizes, poses, strict=True)):
@@ -126,14 +126,14 @@ def test_no_ray_that_meets_a_box_is_left_out():
         way_m = inside @ pose[:3, :3].T + pose[:3, 3] - origin_m
         range_m = np.linalg.norm(way_m, axis=1)
         directions = (way_m / range_m[:, None]).T
-        (tile,) = into_tiles((turned.T @ directions).reshape(3, 10, 10))
+        (tile,) = split_into_tiles((turned.T @ directions).reshape(3, 10, 10))
         ends_m = range_m.astype(np.float32)
-        assert seen.nearest_m[k] < range_m.min()
-        assert k in boxes_in_cone(seen, turned @ tile.axis, tile.half_angle, float(ends_m.max()))
-        blocks = blocks_towards(seen.kept(np.array([k])), tile, turned, ends_m)
+        assert seen.min_distance_m[k] < range_m.min()
+        assert k in find_boxes_in_cone(seen, turned @ tile.axis, tile.half_angle_rad, float(ends_m.max()))
+        blocks = find_blocks_towards_boxes(seen.select(np.array([k])), tile, turned, ends_m)
         assert blocks.all()
-        rays = tile.blocks[blocks[0]]
-        box, kept = rays_towards(seen, np.full(len(rays), k), rays, directions.astype(np.float32), ends_m)
+        rays = tile.block_rays[blocks[0]]
+        box, kept = find_rays_towards_boxes(seen, np.full(len(rays), k), rays, directions.astype(np.float32), ends_m)
         assert (box == k).all()
         np.testing.assert_array_equal(np.unique(kept), np.arange(100))
         close += bool((seen.normals[k] == 0).all())

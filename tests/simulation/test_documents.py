@@ -10,7 +10,7 @@ from torchcover.cameras.calibration import read_opencv, read_ros
 from torchcover.recordings.formats import read_objects
 from torchcover.recordings.formats.folder import read_folder_settings
 from torchcover.recordings.settings import Mount
-from torchcover.simulation import Lidar, LidarModel, Pose, builtin_names
+from torchcover.simulation import Lidar, LidarModel, Pose, list_builtin_names
 from torchcover.simulation.bodies import Vehicle
 from torchcover.simulation.camera_sensor import CameraSensor
 
@@ -83,7 +83,7 @@ def test_a_scenario_is_read_and_mesh_paths_are_relative_to_it(tmp_path):
 @pytest.mark.parametrize("kind", ["rigs", "scenarios", "vehicles"])
 def test_every_built_in_document_is_valid_and_carries_its_file_name(kind):
     model = {"rigs": Rig, "scenarios": Scenario, "vehicles": Vehicle}[kind]
-    names = builtin_names(kind)
+    names = list_builtin_names(kind)
     assert names
     for name in names:
         document = model.load(name)
@@ -256,13 +256,13 @@ def test_a_file_of_another_format_is_refused_with_the_conversion_that_helps(tmp_
 def test_a_network_of_another_format_is_refused_with_the_conversion_that_helps(tmp_path, name):
     scenario = f"{{name: s, traffic: {{type: sumo, net: {name}, fcd: fcd.xml}}}}"
     with pytest.raises(ValueError, match=r"a network is a \.net\.xml or \.xodr file; Open"):
-        Scenario.load(write(tmp_path, scenario)).world()
+        Scenario.load(write(tmp_path, scenario)).build_scene()
 
 
 def test_a_quaternion_and_angles_describe_the_same_pose():
     half = np.deg2rad(30.0) / 2
     by_quaternion = Pose(quaternion_wxyz=(2 * np.cos(half), 0.0, 0.0, 2 * np.sin(half)))
-    np.testing.assert_allclose(by_quaternion.matrix(), Pose(yaw_deg=30.0).matrix(), atol=1e-15)
+    np.testing.assert_allclose(by_quaternion.to_matrix(), Pose(yaw_deg=30.0).to_matrix(), atol=1e-15)
 
 
 @pytest.mark.parametrize(

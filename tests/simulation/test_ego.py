@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from torchcover.data import SimulatedFrames
-from torchcover.simulation import PaperReference, Rig, Scenario, Simulator, with_ego
+from torchcover.simulation import PaperReference, Rig, Scenario, Simulator, set_ego
 
 SENSOR = {"name": "top", "mount": {"z_m": 3.5}, "channels": 4, "columns": 8, "vertical_fov_deg": [-30, 0]}
 PATTERN = {"horizontal_fov_deg": 360.0, "max_range_m": 50.0}
@@ -29,10 +29,10 @@ def procedural(**ego):
 def length_m(scenario, *rigs, vehicle=None):
     carried = {str(k): each for k, each in enumerate(rigs)}
     if vehicle is not None:
-        scenario = with_ego(scenario, carried, vehicle)
+        scenario = set_ego(scenario, carried, vehicle)
     simulator = Simulator(scenario, carried, SMALL)
-    box = simulator.scenario.ego_box()
-    assert scenario.traffic is not None or simulator.scene_of(0)[0].ego_box == box
+    box = simulator.scenario.compute_ego_box()
+    assert scenario.traffic is not None or simulator.get_scene_geometry(0)[0].ego_box == box
     return box.size_m[0]
 
 
@@ -47,9 +47,9 @@ def test_the_first_that_is_given_carries_the_rig(world):
 
 @pytest.mark.parametrize("name", ["courtyard", "urban", "highway", "parking"])
 def test_built_in_scenarios_leave_it_to_the_rig(name):
-    zoe = with_ego(Scenario.load(name), {"nuscenes": Rig.load("nuscenes")})
-    assert (zoe.ego_name, zoe.ego_box().size_m[0]) == ("renault_zoe", pytest.approx(4.084))
-    assert with_ego(Scenario.load(name), {"a": rig()}).ego_name == Scenario.load(name).ego_name == "suv"
+    zoe = set_ego(Scenario.load(name), {"nuscenes": Rig.load("nuscenes")})
+    assert (zoe.ego_name, zoe.compute_ego_box().size_m[0]) == ("renault_zoe", pytest.approx(4.084))
+    assert set_ego(Scenario.load(name), {"a": rig()}).ego_name == Scenario.load(name).ego_name == "suv"
 
 
 def test_rigs_that_name_different_vehicles_need_one_that_is_for_all():
@@ -76,26 +76,26 @@ def test_a_vehicles_file_lies_beside_the_document_that_names_it(tmp_path, monkey
         "bodies: [{name: ground, shape: {type: plane, size_m: [9, 9]}}]\n"
     )
     monkeypatch.chdir(tmp_path / "elsewhere")
-    of_rig = with_ego(given(), {"r": Rig.load("../own/rig.yaml")})
-    assert (of_rig.ego_name, of_rig.ego_box().size_m) == ("cart.yaml", (3.0, 1.5, 1.0))
-    assert Scenario.load("../own/scene.yaml").ego_box().size_m == (3.0, 1.5, 1.0)
+    of_rig = set_ego(given(), {"r": Rig.load("../own/rig.yaml")})
+    assert (of_rig.ego_name, of_rig.compute_ego_box().size_m) == ("cart.yaml", (3.0, 1.5, 1.0))
+    assert Scenario.load("../own/scene.yaml").compute_ego_box().size_m == (3.0, 1.5, 1.0)
     # An option is meant from where the user is.
     with pytest.raises(FileNotFoundError, match=r"vehicle: cart\.yaml: no such file"):
-        with_ego(given(), {"r": rig()}, "cart.yaml")
-    assert with_ego(given(), {"r": rig()}, "../own/cart.yaml").ego_name == "cart.yaml"
+        set_ego(given(), {"r": rig()}, "cart.yaml")
+    assert set_ego(given(), {"r": rig()}, "../own/cart.yaml").ego_name == "cart.yaml"
 
 
 def test_an_unknown_vehicle_is_told_with_whose_it_is_and_the_known_ones():
     with pytest.raises(FileNotFoundError, match=r"rig 'top': vehicle: 'tank' is neither .* built-in vehicles; is "):
-        with_ego(given(), {"top": rig("tank")})
+        set_ego(given(), {"top": rig("tank")})
 
 
 def test_frames_say_which_vehicle_it_was_and_are_others_on_another():
     scenario = given()
-    frames = [SimulatedFrames(scenario, rig(), steps=1, reference_sensor=SMALL, vehicle=v) for v in (None, "van")]
+    frames = [SimulatedFrames(scenario, rig(), num_frames=1, reference_sensor=SMALL, vehicle=v) for v in (None, "van")]
     assert [each.description["vehicle"] for each in frames] == ["suv", "van"]
     assert frames[0].content["scenario"] != frames[1].content["scenario"]
     np.testing.assert_allclose(np.ptp(frames[1].ego_outline_m, axis=0), [5.93, 2.02])
     # What a rig names and what does not carry it change no frame, nor what a checkpoint is of.
-    named = SimulatedFrames(scenario, rig("sedan"), steps=1, reference_sensor=SMALL, vehicle="van")
+    named = SimulatedFrames(scenario, rig("sedan"), num_frames=1, reference_sensor=SMALL, vehicle="van")
     assert named.content == frames[1].content

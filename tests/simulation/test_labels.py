@@ -5,9 +5,9 @@ import pytest
 
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation.shapes import Box
-from torchcover.simulation.world import Actor, World, labels
+from torchcover.simulation.world import Actor, Scene, compute_labels
 
-CAR = Box(type="box", size_m=(4.0, 2.0, 1.5)).mesh()
+CAR = Box(type="box", size_m=(4.0, 2.0, 1.5)).build_mesh()
 UTM_M = np.array([5.6e5, 5.9e6, 80.0])
 
 
@@ -18,16 +18,16 @@ def driving(speed_mps, yaw_deg, start_m, seconds=10.0):
 
 
 def world(ego, actors, parked=()):
-    return World((CAR,), Actor("ego", "car", CAR, ego), tuple(actors), 0.5, 10.0, tuple(parked))
+    return Scene((CAR,), Actor("ego", "car", CAR, ego), tuple(actors), 0.5, 10.0, tuple(parked))
 
 
 def test_a_label_is_where_the_body_is_in_the_frame_of_the_ego():
     """The ego drives north, 10 m/s; the truck drives east, 5 m/s, 20 m ahead of it after a second."""
     ego = driving(10.0, 90.0, UTM_M)
     truck = Actor("truck 1", "truck", CAR, driving(5.0, 0.0, UTM_M + np.array([-5.0, 30.0, 0.0])))
-    (label,) = labels(world(ego, [truck]), step=2, within_m=100.0)
+    (label,) = compute_labels(world(ego, [truck]), time_step_index=2, max_distance_m=100.0)
     assert (label.name, label.category, label.size_m) == ("truck 1", "truck", (4.0, 2.0, 1.5))
-    np.testing.assert_allclose(label.centre_m, [20.0, 0.0, 0.75], atol=1e-6)
+    np.testing.assert_allclose(label.center_m, [20.0, 0.0, 0.75], atol=1e-6)
     assert label.yaw_rad == pytest.approx(-np.pi / 2)
     # Over ground along the vehicle's axes: the ego's own speed is not subtracted.
     np.testing.assert_allclose(label.velocity_mps, [0.0, -5.0], atol=1e-6)
@@ -39,13 +39,13 @@ def test_the_range_is_measured_over_ground_and_who_is_not_there_has_no_label():
     far = Actor("far", "car", CAR, Trajectory.create_static([30.0, 40.1, 0.0]))
     brief = Trajectory(np.array([0.0, 1.0]), np.array([[9.0, 0, 0], [9.0, 1, 0]]), np.zeros((2, 3)), is_transient=True)
     made = world(ego, [near, far, Actor("brief", "car", CAR, brief)])
-    assert [label.name for label in labels(made, 0, 50.0)] == ["near", "brief"]
-    assert [label.name for label in labels(made, 4, 50.0)] == ["near"]
+    assert [label.name for label in compute_labels(made, 0, 50.0)] == ["near", "brief"]
+    assert [label.name for label in compute_labels(made, 4, 50.0)] == ["near"]
 
 
 def test_parked_objects_have_labels_too():
     parked = Actor("parked van 0", "car", CAR, Trajectory.create_static([7.0, 3.0, 0.0], [180.0, 0.0, 0.0]))
-    (label,) = labels(world(Trajectory.create_static([0, 0, 0]), [], [parked]), 3, 50.0)
+    (label,) = compute_labels(world(Trajectory.create_static([0, 0, 0]), [], [parked]), 3, 50.0)
     assert label.name == "parked van 0"
     np.testing.assert_array_equal(label.velocity_mps, 0.0)
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from torchcover import Rig
-from torchcover.simulation import Lidar, builtin_names
+from torchcover.simulation import Lidar, list_builtin_names
 from torchcover.simulation.lidar import LidarModel
 
 # Rows, lowest and highest elevation (degrees), columns, range (m): published figures, not read from our files.
@@ -42,14 +42,14 @@ def read(folder, keys):
 
 
 def test_these_are_all():
-    assert builtin_names("lidars") == sorted(PUBLISHED)
+    assert list_builtin_names("lidars") == sorted(PUBLISHED)
 
 
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_a_model_has_its_published_figures_and_says_where_they_come_from(name):
     model = LidarModel.load(name)
     rows, lowest, highest, columns, range_m = PUBLISHED[name]
-    elevations = model.rows_deg()
+    elevations = model.compute_elevations_deg()
     assert model.name == name
     assert len(elevations) == rows
     assert elevations.min() == pytest.approx(lowest, abs=0.006)
@@ -60,36 +60,36 @@ def test_a_model_has_its_published_figures_and_says_where_they_come_from(name):
 
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_rows_are_sorted_and_different(name):
-    steps = np.diff(LidarModel.load(name).rows_deg())
+    steps = np.diff(LidarModel.load(name).compute_elevations_deg())
     assert (steps < 0).all() or (steps > 0).all()
 
 
 def test_hesai_rows_turn_left_where_its_table_says_right():
     # Channel 8 of a Pandar64: elevation 1.676, offset 3.125 degrees clockwise.
     model = LidarModel.load("hesai_pandar64")
-    row = int(np.argmin(np.abs(model.rows_deg() - 1.676)))
+    row = int(np.argmin(np.abs(model.compute_elevations_deg() - 1.676)))
     assert model.azimuth_offsets_deg[row] == -3.125
-    x, y, _ = model.directions()[:, row, 900]
+    x, y, _ = model.compute_directions()[:, row, 900]
     assert np.rad2deg(np.arctan2(y, x)) == pytest.approx(-3.125 + 0.1, abs=1e-6)
 
 
 def test_velodyne_rows_turn_as_in_the_manual():
     # VLP-32C, laser 0: elevation -25, azimuth offset +1.4 degrees clockwise.
     model = LidarModel.load("velodyne_vlp32c")
-    assert model.azimuth_offsets_deg[int(np.argmin(model.rows_deg()))] == -1.4
+    assert model.azimuth_offsets_deg[int(np.argmin(model.compute_elevations_deg()))] == -1.4
 
 
 def test_a_sensor_has_the_pattern_of_its_model():
     model = LidarModel.load("ouster_os1_64")
     lidar = sensor(model="ouster_os1_64", mount={"z_m": 2.0})
-    np.testing.assert_array_equal(lidar.directions(), model.directions())
+    np.testing.assert_array_equal(lidar.compute_directions(), model.compute_directions())
     assert (lidar.name, lidar.mount.z_m, lidar.min_range_m, lidar.max_range_m) == ("s", 2.0, 0.3, 120.0)
 
 
 def test_what_a_sensor_says_itself_wins():
     lidar = sensor(model="velodyne_vlp16", columns=900, max_range_m=30, range_noise_m=0.03, dropout=0.1)
     assert (lidar.columns, lidar.max_range_m, lidar.range_noise_m, lidar.dropout) == (900, 30.0, 0.03, 0.1)
-    assert len(lidar.rows_deg()) == 16
+    assert len(lidar.compute_elevations_deg()) == 16
 
 
 @pytest.mark.parametrize(
@@ -103,13 +103,13 @@ def test_what_a_sensor_says_itself_wins():
 )
 def test_rows_of_a_sensor_replace_those_of_its_model_and_their_offsets(model, keys, rows_deg):
     lidar = sensor(model=model, **keys)
-    assert (lidar.rows_deg().tolist(), lidar.azimuth_offsets_deg) == (rows_deg, None)
+    assert (lidar.compute_elevations_deg().tolist(), lidar.azimuth_offsets_deg) == (rows_deg, None)
 
 
 def test_offsets_can_be_left_out():
     lidar = sensor(model="hesai_pandar64", azimuth_offsets_deg=None)
     assert lidar.azimuth_offsets_deg is None
-    assert len(lidar.rows_deg()) == 64
+    assert len(lidar.compute_elevations_deg()) == 64
 
 
 def test_a_sensor_written_out_is_the_same_sensor_again():

@@ -14,16 +14,16 @@ from torchcover.geometry import build_transform, convert_euler_to_rotation
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation import Scenario, Simulator, SurfaceReference
 from torchcover.simulation.bodies import Vehicle
-from torchcover.simulation.local_ground import LocalGround, ground_under, level_faces
-from torchcover.simulation.reference_sensor import Surroundings
-from torchcover.simulation.scene import Scene
+from torchcover.simulation.local_ground import LocalGround, find_ground_faces, find_level_faces
+from torchcover.simulation.reference_sensor import ReferenceContext
+from torchcover.simulation.scene import SceneGeometry
 from torchcover.simulation.shapes import Box, Cylinder, Mesh
-from torchcover.simulation.world import Actor, World
+from torchcover.simulation.world import Actor, Scene
 from torchcover.simulation.writing import write_recording
 
 from .small_worlds import EGO, FLOOR, agrees, box, scenario, sums
 
-EGO_MESH = Box(type="box", size_m=(4, 2, 1.5)).mesh()
+EGO_MESH = Box(type="box", size_m=(4, 2, 1.5)).build_mesh()
 
 
 def sheet(heights, half=60.0, every=5.0, down=False):
@@ -38,7 +38,11 @@ def sheet(heights, half=60.0, every=5.0, down=False):
 
 
 def solid(size, x=0.0, y=0.0, z=0.0, yaw=0.0):
-    return Box(type="box", size_m=size).mesh().moved(build_transform(convert_euler_to_rotation(yaw, 0, 0), [x, y, z]))
+    return (
+        Box(type="box", size_m=size)
+        .build_mesh()
+        .transform(build_transform(convert_euler_to_rotation(yaw, 0, 0), [x, y, z]))
+    )
 
 
 def wedge(x, y, z):
@@ -51,7 +55,7 @@ def wedge(x, y, z):
 
 
 def ground_of(static, places=((0.0, 0.0, 0.0),)):
-    masks = ground_under(static, np.array(places))
+    masks = find_ground_faces(static, np.array(places))
     return LocalGround([Mesh(m.vertices_m, m.faces[k]) for m, k in zip(static, masks, strict=True)], np.zeros(3))
 
 
@@ -73,7 +77,7 @@ def test_roofs_are_no_ground_and_pavements_are():
 def test_a_ramp_a_bridge_and_the_road_below_it():
     up = wedge((10, 30), (-3, 3), (0, 5))
     deck = solid((20, 6, 0.8), 40, 0, 4.2)
-    down = wedge((10, 30), (-3, 3), (0, 5)).moved(build_transform(convert_euler_to_rotation(180, 0, 0), [80, 0, 0]))
+    down = wedge((10, 30), (-3, 3), (0, 5)).transform(build_transform(convert_euler_to_rotation(180, 0, 0), [80, 0, 0]))
     ground = ground_of([PLANE, up, deck, down])
     found = heights(ground, [20, 0, 2.5], [20, 0, 3.5], [40, 0, 6], [40, 0, 2], [40, 0, 4.6], [40, 10, 6], [55, 0, 6])
     # On the ramp, above it, above the deck, below it, in it (where the road is the ground), beside, on the way down.
@@ -86,7 +90,9 @@ def test_the_decks_of_a_car_park_and_the_stairs_between_them():
     stairs = [solid((0.3, 2, 0.18 * (k + 1)), 5 + 0.3 * k, 12) for k in range(16)]
     deck = solid((30, 20, 0.3), 24.65, 12, 0.18 * 17 - 0.3)
     pillar = (
-        Cylinder(type="cylinder", radius_m=0.3, height_m=2.76).mesh().moved(build_transform(np.eye(3), [24, 14, 0]))
+        Cylinder(type="cylinder", radius_m=0.3, height_m=2.76)
+        .build_mesh()
+        .transform(build_transform(np.eye(3), [24, 14, 0]))
     )
     ground = ground_of([PLANE, *stairs, deck, pillar])
     top = 0.18 * 17
@@ -101,10 +107,10 @@ def test_a_terrain_whichever_way_its_faces_look(down):
     rng = np.random.default_rng(1)
     points = np.column_stack([rng.uniform(-59, 59, (300, 2)), np.full(300, 30.0)])
     expected = 30 - 0.1 * points[:, 0] + 0.05 * points[:, 1]
-    np.testing.assert_allclose(ground.heights_m(points), expected, atol=1e-4)
-    assert np.isnan(ground.heights_m(points - [0, 0, 60])).all()
-    assert ground.is_above(np.array([0.0, 0.0, -0.5]))
-    assert not ground.is_above(np.array([0.0, 0.0, 0.5]))
+    np.testing.assert_allclose(ground.compute_heights_m(points), expected, atol=1e-4)
+    assert np.isnan(ground.compute_heights_m(points - [0, 0, 60])).all()
+    assert ground.is_below_ground(np.array([0.0, 0.0, -0.5]))
+    assert not ground.is_below_ground(np.array([0.0, 0.0, 0.5]))
 
 
 def test_heights_are_those_along_the_vertical_of_the_world_in_any_frame():
@@ -113,15 +119,15 @@ def test_heights_are_those_along_the_vertical_of_the_world_in_any_frame():
     world = np.column_stack([rng.uniform(-50, 50, (200, 2)), rng.uniform(-0.03, 9, 200)])
     pose = build_transform(convert_euler_to_rotation(70, 3, -2), [4, -7, 1.0])
     inside = (world - pose[:3, 3]) @ pose[:3, :3]
-    np.testing.assert_allclose(ground.heights_m(inside, pose), ground.heights_m(world), atol=1e-4)
+    np.testing.assert_allclose(ground.compute_heights_m(inside, pose), ground.compute_heights_m(world), atol=1e-4)
 
 
 def test_steep_faces_and_what_is_far_above_are_nobodys_ground():
-    assert level_faces(wedge((0, 1), (0, 1), (0, 0.9))).sum() == 2
-    assert level_faces(wedge((0, 1), (0, 1), (0, 1.1))).sum() == 0
+    assert find_level_faces(wedge((0, 1), (0, 1), (0, 0.9))).sum() == 2
+    assert find_level_faces(wedge((0, 1), (0, 1), (0, 1.1))).sum() == 0
     for seed in range(50):  # 45 degrees, whatever rounding makes of that
         turn, side = build_transform(convert_euler_to_rotation(seed, 0, 0), [seed, 7.3, -0.1]), 1 / (1 + seed)
-        assert level_faces(wedge((0, side), (0, 1), (0, side)).moved(turn)).sum() == 2
+        assert find_level_faces(wedge((0, side), (0, 1), (0, side)).transform(turn)).sum() == 2
     walls = [solid((0.2, 40, 5), 5), solid((0.2, 40, 5), -5)]
     assert np.isnan(heights(ground_of(walls), [0, 0, 1])).all()
     roof = solid((9, 9, 0.2), 0, 0, 3)
@@ -144,18 +150,18 @@ def test_bounds_of_heights_hold_every_point_of_a_triangle():
     rng = np.random.default_rng(3)
     middle = np.column_stack([rng.uniform(-110, 110, (4000, 2)), rng.uniform(-4, 9, 4000)])
     triangles = (middle + rng.normal(0, 1, (3, 4000, 3)) * rng.choice([0.1, 1, 6], 4000)[:, None]).swapaxes(1, 2)
-    low, high = ground.squares.heights_m(triangles)
+    low, high = ground.height_pyramid.compute_height_bounds_m(triangles)
     for _ in range(20):
         share = rng.dirichlet([0.5] * 3)
-        found = ground.heights_m(np.einsum("c,cin->ni", share, triangles))
+        found = ground.compute_heights_m(np.einsum("c,cin->ni", share, triangles))
         known = np.isfinite(found)
         assert (found[known] >= low[known]).all()
         assert (found[known] <= high[known]).all()
 
 
 def scan(world, sensor, seed, step=0):
-    scene = Scene(world)
-    return sensor.scan(Surroundings(scene, scene.at(step), np.random.default_rng(seed), "a test"))
+    scene = SceneGeometry(world)
+    return sensor.scan(ReferenceContext(scene, scene.get_snapshot(step), np.random.default_rng(seed), "a test"))
 
 
 def resting(static, **pose):
@@ -163,11 +169,11 @@ def resting(static, **pose):
     matrix = build_transform(
         convert_euler_to_rotation(*(pose.get(key, 0.0) for key in ("yaw", "pitch", "roll"))), place
     )
-    return World(tuple(static), Actor("ego", "ego", EGO_MESH, Trajectory.from_poses([0.0], matrix[None])))
+    return Scene(tuple(static), Actor("ego", "ego", EGO_MESH, Trajectory.from_poses([0.0], matrix[None])))
 
 
 AREA = (((5.0, 45.0), (-10.0, 10.0)),)
-OBSTACLE = SurfaceReference(AREA, rays=600, places=2, bands_m=((0.5, 2.0),), band_frame="ground")
+OBSTACLE = SurfaceReference(AREA, num_rays=600, num_poses=2, bands_m=((0.5, 2.0),), band_frame="ground")
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.06, -0.06])
@@ -184,7 +190,7 @@ def test_the_wall_on_a_slope_is_cut_at_heights_above_the_slope(at, slope):
 
 def test_drawing_by_height_is_unbiased_for_any_number_of_rays_and_bands_that_overlap():
     waves = sheet(lambda x, y: np.sin(x / 11), every=2)
-    scene = Scene(resting([waves, solid((4, 4, 3), 20, 0, -1), solid((2, 9, 2), 30, 3, -1)]))
+    scene = SceneGeometry(resting([waves, solid((4, 4, 3), 20, 0, -1), solid((2, 9, 2), 30, 3, -1)]))
     areas = (((5.0, 45.0), (-10.0, 10.0)), ((15.0, 25.0), (-5.0, 5.0)))
     bands = ((0.5, 2.0), (-0.5, 0.5), (0.2, 1.0))
 
@@ -192,7 +198,7 @@ def test_drawing_by_height_is_unbiased_for_any_number_of_rays_and_bands_that_ove
         sensor = SurfaceReference(areas, rays, places, bands, band_frame="ground")
         sums = []
         for seed in range(count):
-            one = sensor.scan(Surroundings(scene, scene.at(0), np.random.default_rng(seed), "a test"))
+            one = sensor.scan(ReferenceContext(scene, scene.get_snapshot(0), np.random.default_rng(seed), "a test"))
             low = (one.heights_m < 0.5) & (one.points[:, 0] > 6)
             sums.append([one.weights[low].sum(), one.weights[one.heights_m >= 0.5].sum()])
         return np.array(sums, dtype=np.float64)
@@ -235,7 +241,7 @@ def test_bodies_that_move_are_cut_at_heights_above_the_ground_below_them(at):
     lane = np.array([[20.0, -4, 1.6], [21, -4, 1.68]])
     truck = Actor("t", "truck", solid((6, 2, 3)), Trajectory(times, lane, np.zeros((2, 3))))
     drive = Trajectory(times, np.array([[0.0, 0, 0], [1, 0, 0.08]]), np.zeros((2, 3)))
-    world = World((hill,), Actor("ego", "ego", EGO_MESH, drive), (truck,), 1.0, 1.0)
+    world = Scene((hill,), Actor("ego", "ego", EGO_MESH, drive), (truck,), 1.0, 1.0)
     only = [scan(world, OBSTACLE, seed) for seed in range(60)]
     for one in only:
         assert ((one.heights_m >= 0.5) & (one.heights_m < 2)).all()
@@ -256,9 +262,9 @@ def test_heights_and_bands_do_not_know_the_attitude_of_the_ego():
     found = []
     for pose in attitudes():
         world = resting(static, z=0.1, **pose)
-        instant = Scene(world).at(0)
+        instant = SceneGeometry(world).get_snapshot(0)
         inside = (places - instant.world_T_vehicle[:3, 3]) @ instant.world_T_vehicle[:3, :3]
-        found.append(instant.heights_m(inside.astype(np.float32)))
+        found.append(instant.compute_heights_m(inside.astype(np.float32)))
     for other in found[1:]:
         np.testing.assert_allclose(other, found[0], atol=2e-4)
 
@@ -266,18 +272,18 @@ def test_heights_and_bands_do_not_know_the_attitude_of_the_ego():
 def test_who_stands_below_the_ground_is_refused_and_a_sheet_buries_nobody():
     flat = {True: sheet(lambda x, y: 0 * x, down=True), False: PLANE}
     for mesh in flat.values():
-        instant = Scene(resting([mesh])).at(0)
-        assert not instant.buried(np.array([3.0, 0.0, 0.3]))
-        assert instant.buried(np.array([3.0, 0.0, -0.3]))
+        instant = SceneGeometry(resting([mesh])).get_snapshot(0)
+        assert not instant.is_occupied(np.array([3.0, 0.0, 0.3]))
+        assert instant.is_occupied(np.array([3.0, 0.0, -0.3]))
     roof = sheet(lambda x, y: 0 * x + 3, half=5)
     inside = solid((4, 4, 2), 8)
-    instant = Scene(resting([PLANE, roof, inside])).at(0)
-    assert not instant.buried(np.array([3.0, 0.0, 0.5]))  # under an open roof whose faces look up
-    assert instant.buried(np.array([8.0, 0.0, 1.0]))
+    instant = SceneGeometry(resting([PLANE, roof, inside])).get_snapshot(0)
+    assert not instant.is_occupied(np.array([3.0, 0.0, 0.5]))  # under an open roof whose faces look up
+    assert instant.is_occupied(np.array([8.0, 0.0, 1.0]))
 
 
 def test_frames_carry_heights_everywhere_they_go(tmp_path):
-    frames = SimulatedFrames("courtyard", "front_roof_32", steps=2, boxes=True)
+    frames = SimulatedFrames("courtyard", "front_roof_32", num_frames=2, boxes=True)
     frame = frames[0]
     assert frame.reference_heights_m.shape == frame.reference_weights.shape
     assert torch.equal(pickle.loads(pickle.dumps(frame)).reference_heights_m, frame.reference_heights_m)
@@ -298,7 +304,7 @@ def test_frames_carry_heights_everywhere_they_go(tmp_path):
 
 
 def test_boxes_know_how_high_their_bottoms_are():
-    frames = SimulatedFrames("urban", "front_roof_32", steps=1, seed=2, boxes=True)
+    frames = SimulatedFrames("urban", "front_roof_32", num_frames=1, seed=2, boxes=True)
     boxes = frames[0].boxes
     assert len(boxes) > 20
     assert boxes.bottom_heights_m.abs().max() < 0.3
@@ -309,13 +315,13 @@ def test_a_scenario_says_its_ground_or_is_told_what_was_taken():
     wall = box([0.2, 10, 3], x_m=20)
     deck = {"name": "deck", "shape": {"type": "box", "size_m": [9, 9, 4]}, "poses": [{"x_m": -30}]}
     guessed = Simulator(scenario(FLOOR, wall, deck), {}, OBSTACLE)
-    assert "of 'floor'; bodies with" in guessed.ground_words
+    assert "of 'floor'; bodies with" in guessed.ground_note
     said = Simulator(scenario(FLOOR, wall, {**deck, "ground": True}), {}, OBSTACLE)
-    assert said.ground_words == ""
-    assert [bool(mask.any()) for mask in said.scene_of(0)[0].is_ground] == [False, False, True]
+    assert said.ground_note == ""
+    assert [bool(mask.any()) for mask in said.get_scene_geometry(0)[0].ground_masks] == [False, False, True]
     nothing = Simulator(scenario(wall, ego={**EGO, "pose": {"z_m": 30}}), {}, OBSTACLE)
-    assert "none was found" in nothing.ground_words
-    assert np.isnan(nothing.step(0).reference_heights_m).all()
+    assert "none was found" in nothing.ground_note
+    assert np.isnan(nothing.simulate_frame(0).reference_heights_m).all()
 
 
 def test_what_cannot_be_ground_is_refused():
@@ -329,7 +335,7 @@ def test_what_cannot_be_ground_is_refused():
         "poses": [{"roll_deg": 90}],
     }
     with pytest.raises(ValueError, match="body 'wall' is ground, but none of its faces"):
-        scenario(FLOOR, upright).world()
+        scenario(FLOOR, upright).build_scene()
     with pytest.raises(ValueError, match="band_frame: ground or vehicle is needed; got 'world'"):
         SurfaceReference(AREA, band_frame="world")
     with pytest.raises(ValueError, match=r"bands_m: nothing is seen below the ground, and \(-3.0, -1.0\) m lies there"):
@@ -338,6 +344,9 @@ def test_what_cannot_be_ground_is_refused():
 
 
 def test_the_courtyard_says_what_would_have_been_found():
-    world = Scenario.load("courtyard").world()
-    said, found = (Scene(dataclasses.replace(world, ground=known)).is_ground for known in (world.ground, None))
+    world = Scenario.load("courtyard").build_scene()
+    said, found = (
+        SceneGeometry(dataclasses.replace(world, ground=known)).ground_masks
+        for known in (world.ground_mesh_indices, None)
+    )
     assert [mask.tolist() for mask in said] == [mask.tolist() for mask in found]

@@ -84,7 +84,7 @@ def areas(mesh):
 def test_polygons_that_are_not_convex_keep_their_area(tmp_path, name, write, points):
     content, copies = write(points)
     (tmp_path / name).write_bytes(content)
-    mesh = MeshFile(type="mesh", path=tmp_path / name).mesh()
+    mesh = MeshFile(type="mesh", path=tmp_path / name).build_mesh()
     assert areas(mesh).sum() == pytest.approx(copies * shoelace(points), rel=1e-6)
     assert len(mesh.faces) == copies * (len(points) - 2)
 
@@ -137,15 +137,15 @@ def test_objects_and_materials_that_are_named_let_rays_pass(tmp_path):
     def read(*names):
         return MeshFile(type="mesh", path=tmp_path / "car.glb", transparent=names)
 
-    assert sorted(areas(read().mesh())) == [0.5, 2.0, 8.0, 32.0]
-    assert sorted(areas(read("glass").mesh())) == [0.5, 2.0]
-    assert sorted(areas(read("rear", "body").mesh())) == [2.0, 8.0]
-    assert np.ptp(read("glass").mesh().vertices_m, axis=0)[0] == 8.0  # its frame stays
-    assert (read().clear_materials(), read("glass").clear_materials()) == (["glass"], [])
+    assert sorted(areas(read().build_mesh())) == [0.5, 2.0, 8.0, 32.0]
+    assert sorted(areas(read("glass").build_mesh())) == [0.5, 2.0]
+    assert sorted(areas(read("rear", "body").build_mesh())) == [2.0, 8.0]
+    assert np.ptp(read("glass").build_mesh().vertices_m, axis=0)[0] == 8.0  # its frame stays
+    assert (read().list_transparent_materials(), read("glass").list_transparent_materials()) == (["glass"], [])
     with pytest.raises(ValueError, match="no object or material is called 'window'; it has 'body', 'door', 'glass'"):
-        read("window").mesh()
+        read("window").build_mesh()
     with pytest.raises(ValueError, match="all 4 faces are; name the windows only"):
-        read("glass", "paint").mesh()
+        read("glass", "paint").build_mesh()
 
 
 @pytest.mark.parametrize("opacity", ["d 0.3", "Tr 0.7"])
@@ -154,13 +154,13 @@ def test_materials_of_mtl_files_have_names_and_an_opacity(tmp_path, opacity):
     vertices = "".join(f"v {x} {y} 0\n" for x, y in [(0, 0), (1, 0), (1, 1), (0, 1)])
     (tmp_path / "a.obj").write_text(f"mtllib a.mtl\n{vertices}usemtl paint\nf 1 2 3\nusemtl glass\nf 1 3 4\n")
     mesh = MeshFile(type="mesh", path=tmp_path / "a.obj")
-    assert (len(mesh.mesh().faces), mesh.clear_materials()) == (2, ["glass"])
-    assert len(mesh.model_copy(update={"transparent": ("glass",)}).mesh().faces) == 1
+    assert (len(mesh.build_mesh().faces), mesh.list_transparent_materials()) == (2, ["glass"])
+    assert len(mesh.model_copy(update={"transparent": ("glass",)}).build_mesh().faces) == 1
 
 
 def test_a_camera_behind_glass_is_told_how_to_look_through_it(tmp_path):
     """A closed car of glass sides: the message names the material and the key, and with the key it looks out."""
-    box = Box(type="box", size_m=(4.0, 2.0, 1.5)).mesh()
+    box = Box(type="box", size_m=(4.0, 2.0, 1.5)).build_mesh()
     sides = {f"side {k}": (box.vertices_m[face], 0 if k < 2 else 1) for k, face in enumerate(box.faces)}
     (tmp_path / "car.glb").write_bytes(as_glb(sides))
     camera = CameraSensor(name="cam", mount=Pose(z_m=1.0), width=64, height=48, fov_deg=90.0, max_range_m=50.0)
@@ -171,7 +171,7 @@ def test_a_camera_behind_glass_is_told_how_to_look_through_it(tmp_path):
     ):
         shape = f"{{type: mesh, path: car.glb{key}}}"
         (tmp_path / "car.yaml").write_text(f"name: car\nparts: [{{name: body, shape: {shape}}}]\n")
-        frames = SimulatedFrames(courtyard, rig, steps=1, vehicle=tmp_path / "car.yaml")
+        frames = SimulatedFrames(courtyard, rig, num_frames=1, vehicle=tmp_path / "car.yaml")
         with warnings.catch_warnings(), pytest.raises(ValueError, match=told) if told else nullcontext():
             warnings.simplefilter("ignore")  # its windows are holes
             assert len(frames[0].sensor) > 100
@@ -181,13 +181,13 @@ def test_a_camera_behind_glass_is_told_how_to_look_through_it(tmp_path):
 def test_a_format_that_is_not_read_is_refused_with_the_conversion_that_helps(tmp_path, name, told):
     (tmp_path / name).write_bytes(b"Kaydara FBX Binary")
     with pytest.raises(BadFileError, match=f"is no mesh that can be read; {told}"):
-        MeshFile(type="mesh", path=tmp_path / name).mesh()
+        MeshFile(type="mesh", path=tmp_path / name).build_mesh()
 
 
 def test_an_index_that_no_vertex_has_is_refused(tmp_path):
     (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3 5\n")
     with pytest.raises(BadFileError, match="cannot read it as a mesh"):
-        MeshFile(type="mesh", path=tmp_path / "a.obj").mesh()
+        MeshFile(type="mesh", path=tmp_path / "a.obj").build_mesh()
 
 
 def test_text_in_latin_1_is_read_as_it_is_in_utf_8(tmp_path):
@@ -196,7 +196,7 @@ def test_text_in_latin_1_is_read_as_it_is_in_utf_8(tmp_path):
     ascii_stl = "solid \u00e9\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\n"
     (tmp_path / "a.stl").write_bytes(f"{ascii_stl}endloop\nendfacet\nendsolid\n".encode("latin-1"))
     for name in ("a.obj", "a.stl"):
-        mesh = MeshFile(type="mesh", path=tmp_path / name).mesh()
+        mesh = MeshFile(type="mesh", path=tmp_path / name).build_mesh()
         np.testing.assert_array_equal(mesh.vertices_m[mesh.faces[0]], [[0, 0, 0], [1, 0, 0], [0, 1, 0]])
 
 
@@ -213,7 +213,7 @@ def test_a_package_that_is_missing_is_no_damage(tmp_path, name, content, error, 
     text = f'{{"asset": {{}}, "extensionsRequired": ["{content}"]}}' if name == "a.gltf" else content
     (tmp_path / name).write_text(text)
     with pytest.raises(error, match=rf"{name}: .*{told}"):
-        MeshFile(type="mesh", path=tmp_path / name).mesh()
+        MeshFile(type="mesh", path=tmp_path / name).build_mesh()
 
 
 @pytest.mark.parametrize(("stated", "side_m"), [("", 2.0), ("<unit name='centimeter' meter='0.01'/>", 0.02)])
@@ -222,5 +222,5 @@ def test_the_unit_of_a_collada_file_is_applied(tmp_path, stated, side_m):
     text = text if isinstance(text, str) else text.decode()
     path = tmp_path / "m.dae"
     path.write_text(text.replace("<library_geometries>", f"<asset>{stated}</asset><library_geometries>", 1))
-    size_m = np.ptp(MeshFile(type="mesh", path=path).mesh().vertices_m, axis=0)
+    size_m = np.ptp(MeshFile(type="mesh", path=path).build_mesh().vertices_m, axis=0)
     np.testing.assert_allclose(size_m, [side_m, side_m, 0.0], atol=1e-12)

@@ -7,22 +7,22 @@ import numpy as np
 import pytest
 import trimesh
 
-from torchcover.simulation import builtin_names
-from torchcover.simulation.bodies import Vehicle, VehicleShape, mount_regions_of
+from torchcover.simulation import list_builtin_names
+from torchcover.simulation.bodies import Vehicle, VehicleShape, get_mount_regions
 from torchcover.simulation.mount_regions import SEEN_FROM, MountRegion, Skin
 from torchcover.simulation.shapes import Box, Mesh
 
 ROBOT = Path(__file__).parents[2] / "examples" / "robot" / "robot.yaml"
 SMALL = ("adult", "child_110cm", "child_120cm", "cyclist", "cylinder_80cm", "dog_57cm", "motorcycle", "pole_100cm")
-VEHICLES = [*(name for name in builtin_names("vehicles") if name not in SMALL), str(ROBOT)]
-BOX = Skin(Box(type="box", size_m=(4.0, 2.0, 1.5)).mesh())
+VEHICLES = [*(name for name in list_builtin_names("vehicles") if name not in SMALL), str(ROBOT)]
+BOX = Skin(Box(type="box", size_m=(4.0, 2.0, 1.5)).build_mesh())
 
 
 @cache
 def loaded(name):
     """A vehicle and its skin."""
     vehicle = Vehicle.load(name)
-    return vehicle, Skin(vehicle.mesh())
+    return vehicle, Skin(vehicle.build_mesh())
 
 
 def distance_m(mesh, place_m):
@@ -38,11 +38,11 @@ def test_places_lie_on_the_skin_and_heights_are_distances_from_it(name):
     assert vehicle.mount_regions
     for region in vehicle.mount_regions.values():
         u, v = generator.random(2)
-        point, height_m = region.on(skin, u, v), 0.02
-        assert distance_m(skin.mesh, point.place_m) < 1e-12
-        assert distance_m(skin.mesh, point.place_m + height_m * point.outward) == pytest.approx(height_m, abs=1e-9)
-        assert not skin.encloses(point.place_m + height_m * point.outward)
-        assert skin.encloses(point.place_m - 1e-3 * point.outward)
+        point, height_m = region.find_mount_point(skin, u, v), 0.02
+        assert distance_m(skin.mesh, point.position_m) < 1e-12
+        assert distance_m(skin.mesh, point.position_m + height_m * point.normal) == pytest.approx(height_m, abs=1e-9)
+        assert not skin.is_inside(point.position_m + height_m * point.normal)
+        assert skin.is_inside(point.position_m - 1e-3 * point.normal)
 
 
 @pytest.mark.parametrize("name", VEHICLES)
@@ -50,10 +50,10 @@ def test_a_region_is_one_patch_that_looks_to_its_side(name):
     """No place beside another lies on another part, nor on a wall that only seems to be seen from there."""
     (vehicle, skin), shares = loaded(name), np.linspace(0.0, 1.0, 5)
     for region in vehicle.mount_regions.values():
-        axis, sign = SEEN_FROM[region.seen_from]
-        points = [[region.on(skin, u, v) for v in shares] for u in shares]
-        places_m = np.array([[point.place_m for point in row] for row in points])
-        assert min(sign * point.outward[axis] for row in points for point in row) > 0.5
+        axis, sign = SEEN_FROM[region.side]
+        points = [[region.find_mount_point(skin, u, v) for v in shares] for u in shares]
+        places_m = np.array([[point.position_m for point in row] for row in points])
+        assert min(sign * point.normal[axis] for row in points for point in row) > 0.5
         for along in (0, 1):
             steps_m = np.diff(places_m, axis=along)
             assert (np.abs(steps_m[..., axis]) < np.linalg.norm(np.delete(steps_m, axis, axis=2), axis=2) + 1e-9).all()
@@ -67,20 +67,20 @@ def test_left_and_right_are_mirror_images(name):
     assert pairs
     for left, right in pairs:
         v = 0.8 if left.y_m is None else 0.4
-        one = left.on(skin, 0.2, v).place_m
-        other = right.on(skin, *((0.2, v) if left.y_m is None else (0.8, v))).place_m
+        one = left.find_mount_point(skin, 0.2, v).position_m
+        other = right.find_mount_point(skin, *((0.2, v) if left.y_m is None else (0.8, v))).position_m
         assert other == pytest.approx(one * [1, -1, 1], abs=1e-9)
         assert right.heading_deg == -left.heading_deg
 
 
 @pytest.mark.parametrize("name", SMALL)
 def test_people_animals_bikes_and_poles_have_none(name):
-    assert mount_regions_of(VehicleShape(type="vehicle", vehicle=name)) == {}
+    assert get_mount_regions(VehicleShape(type="vehicle", vehicle=name)) == {}
 
 
 def test_regions_are_nothing_to_a_simulation():
     suv = Vehicle.load("suv")
-    assert suv.content() == suv.model_copy(update={"mount_regions": {}}).content()
+    assert suv.collect_content() == suv.model_copy(update={"mount_regions": {}}).collect_content()
 
 
 @pytest.mark.parametrize("side", SEEN_FROM)
@@ -89,23 +89,23 @@ def test_outwards_is_where_one_looks_from_whichever_way_faces_turn(side):
     across_m = (0.1, 0.2)
     axis, sign = SEEN_FROM[side]
     for skin in (BOX, turned):
-        point = skin.seen_from(side, across_m)
-        assert point.outward == pytest.approx(sign * np.eye(3)[axis])
-        assert point.place_m[axis] == {"x": sign * 2.0, "y": sign * 1.0, "z": 1.5}["xyz"[axis]]
+        point = skin.find_surface_point(side, across_m)
+        assert point.normal == pytest.approx(sign * np.eye(3)[axis])
+        assert point.position_m[axis] == {"x": sign * 2.0, "y": sign * 1.0, "z": 1.5}["xyz"[axis]]
 
 
 def test_a_line_through_an_edge_that_two_faces_share_meets_one_of_them():
-    assert BOX.seen_from("above", (0.0, 0.0)).place_m.tolist() == [0.0, 0.0, 1.5]
-    assert BOX.seen_from("above", (2.0, 1.0)).place_m.tolist() == [2.0, 1.0, 1.5]
-    assert BOX.seen_from("above", (2.001, 0.0)) is None
+    assert BOX.find_surface_point("above", (0.0, 0.0)).position_m.tolist() == [0.0, 0.0, 1.5]
+    assert BOX.find_surface_point("above", (2.0, 1.0)).position_m.tolist() == [2.0, 1.0, 1.5]
+    assert BOX.find_surface_point("above", (2.001, 0.0)) is None
 
 
 @pytest.mark.parametrize(("side", "facing_deg"), [("above", 0), ("front", 0), ("rear", 180), ("left", 90)])
 def test_a_sensor_faces_outwards_unless_the_region_says_where_to(side, facing_deg):
     axis = SEEN_FROM[side][0]
     window = {f"{other}_m": (0.1, 0.5) for other in "xyz" if other != "xyz"[axis]}
-    assert MountRegion(seen_from=side, **window).heading_deg == facing_deg
-    assert MountRegion(seen_from=side, facing_deg=45.0, **window).heading_deg == 45.0
+    assert MountRegion(side=side, **window).heading_deg == facing_deg
+    assert MountRegion(side=side, facing_deg=45.0, **window).heading_deg == 45.0
 
 
 @pytest.mark.parametrize(
@@ -124,6 +124,6 @@ def test_a_region_that_is_none_is_refused(keys, message):
 
 
 def test_a_place_beside_the_body_is_refused():
-    beyond = MountRegion(seen_from="above", x_m=(1.0, 3.0), y_m=(-0.5, 0.5))
+    beyond = MountRegion(side="above", x_m=(1.0, 3.0), y_m=(-0.5, 0.5))
     with pytest.raises(ValueError, match=r"x = 3\.000 m, y = 0\.000 m \(u = 1, v = 0\.5\) nothing of the body"):
-        beyond.on(BOX, 1.0, 0.5)
+        beyond.find_mount_point(BOX, 1.0, 0.5)

@@ -8,19 +8,21 @@ from torchcover.data import SimulatedFrames
 from torchcover.detection import measure_box_visibility
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation import Rig, SurfaceReference
-from torchcover.simulation.patches import Bounds, Patches
-from torchcover.simulation.reference_sensor import Surroundings
-from torchcover.simulation.scene import Scene
+from torchcover.simulation.patches import Patches, UprightBoxes
+from torchcover.simulation.reference_sensor import ReferenceContext
+from torchcover.simulation.scene import SceneGeometry
 from torchcover.simulation.shapes import Box, Plane
-from torchcover.simulation.sight import sight
+from torchcover.simulation.sight import compute_visibility
 from torchcover.simulation.surface_reference import SurfaceStrata
-from torchcover.simulation.world import Actor, World
+from torchcover.simulation.world import Actor, Scene
 
 from .small_worlds import AHEAD, FLOOR, agrees, box, scenario
 
 BEHIND = (((-20.0, -10.0), (-5.0, 5.0)),)
-GROUND = Plane(type="plane", size_m=(400.0, 400.0)).mesh()
-EGO = Actor("ego", "ego", Box(type="box", size_m=(4.0, 2.0, 1.5)).mesh(), Trajectory.create_static([0.0, 0.0, 0.0]))
+GROUND = Plane(type="plane", size_m=(400.0, 400.0)).build_mesh()
+EGO = Actor(
+    "ego", "ego", Box(type="box", size_m=(4.0, 2.0, 1.5)).build_mesh(), Trajectory.create_static([0.0, 0.0, 0.0])
+)
 
 
 def there(x_m, y_m=0.0, z_m=0.0, *, size_m=(2.0, 2.0, 1.5), moves=False, until_s=None):
@@ -30,18 +32,19 @@ def there(x_m, y_m=0.0, z_m=0.0, *, size_m=(2.0, 2.0, 1.5), moves=False, until_s
     if until_s is not None:
         track = Trajectory(np.array([0.0, until_s]), np.array([place, place]), np.zeros((2, 3)), is_transient=True)
     return Actor(
-        "box", "car", Box(type="box", size_m=size_m).mesh(), track if moves else Trajectory.create_static(place)
+        "box", "car", Box(type="box", size_m=size_m).build_mesh(), track if moves else Trajectory.create_static(place)
     )
 
 
 def world(actors=(), parked=(), static=()):
-    return World((GROUND, *static), EGO, tuple(actors), 1.0, 3.0, tuple(parked))
+    return Scene((GROUND, *static), EGO, tuple(actors), 1.0, 3.0, tuple(parked))
 
 
 def scans(made, sensor, steps=40, step=1):
-    scene = Scene(made)
+    scene = SceneGeometry(made)
     surroundings = (
-        Surroundings(scene, scene.at(step), np.random.default_rng([3, index]), "test") for index in range(steps)
+        ReferenceContext(scene, scene.get_snapshot(step), np.random.default_rng([3, index]), "test")
+        for index in range(steps)
     )
     return [sensor.scan(some) for some in surroundings]
 
@@ -59,8 +62,8 @@ def worlds_with(actor_of):
 @pytest.mark.parametrize("made", worlds_with(lambda moves: there(10.0, moves=moves)), ids=["rests", "moves", "parked"])
 def test_all_of_an_object_that_is_seen_is_found_wherever_the_areas_are(at, made):
     at([2.5, 3.0, 2.5])
-    found = scans(made, SurfaceReference(BEHIND, rays=100, places=1, object_points=64))
-    assert all(scan.drawn.tolist() == [64] for scan in found)
+    found = scans(made, SurfaceReference(BEHIND, num_rays=100, num_poses=1, points_per_object=64))
+    assert all(scan.sampled_point_counts.tolist() == [64] for scan in found)
     # One in each of 64 equal parts of the three faces, none of which is hidden: no scan is off by more than a part.
     np.testing.assert_allclose(m2(found), 3.0 + 3.0 + 4.0, rtol=1e-5)
     agrees(m2(found, lambda x, y, z: (x > 5.0) & (z > 1.49999)), 4.0)
@@ -73,7 +76,7 @@ def test_in_the_areas_and_bands_the_square_metres_are_those_without_them(at, mad
     # The area holds a quarter of the box in x, and the upper band half of it.
     areas, bands = (((4.0, 9.5), (-5.0, 5.0)),), ((-0.5, 0.5), (0.75, 2.0))
     found = [
-        scans(made, SurfaceReference(areas, rays=1200, places=2, bands_m=bands, object_points=points))
+        scans(made, SurfaceReference(areas, num_rays=1200, num_poses=2, bands_m=bands, points_per_object=points))
         for points in (0, 40)
     ]
     parts = {
@@ -91,48 +94,52 @@ def test_in_the_areas_and_bands_the_square_metres_are_those_without_them(at, mad
 def test_each_object_gets_at_least_the_number_of_points_that_was_asked_for(at):
     at([2.5, 3.0, 2.5])
     made = world([there(10.0), there(30.0, moves=True)], parked=[there(90.0)])
-    (scan,) = scans(made, SurfaceReference(BEHIND, rays=100, places=4, object_points=10), steps=1)
-    assert scan.drawn.tolist() == [12, 12, 12]
+    (scan,) = scans(made, SurfaceReference(BEHIND, num_rays=100, num_poses=4, points_per_object=10), steps=1)
+    assert scan.sampled_point_counts.tolist() == [12, 12, 12]
     # In addition to the others, half of which had no surface to be on.
-    assert 36 + 40 < scan.rays < 36 + 60
-    (scan,) = scans(made, SurfaceReference((AHEAD,), rays=400, places=4), steps=1)
+    assert 36 + 40 < scan.num_rays < 36 + 60
+    (scan,) = scans(made, SurfaceReference((AHEAD,), num_rays=400, num_poses=4), steps=1)
     # Without points of their own, objects have their share of those of the areas.
-    assert scan.drawn[0] > 0
-    assert scan.drawn[1:].tolist() == [0, 0]
+    assert scan.sampled_point_counts[0] > 0
+    assert scan.sampled_point_counts[1:].tolist() == [0, 0]
 
 
 def test_of_two_objects_that_overlap_the_inside_is_not_seen(at):
     at([2.5, 0.0, 1.0])
     made = world([there(10.0), there(12.0, size_m=(4.0, 1.0, 3.0))])
-    found = scans(made, SurfaceReference(BEHIND, rays=10, places=1, object_points=128))
+    found = scans(made, SurfaceReference(BEHIND, num_rays=10, num_poses=1, points_per_object=128))
     agrees(m2(found, lambda x, y, z: np.abs(x - 9.0) < 1e-3), 3.0)
     agrees(m2(found, lambda x, y, z: np.abs(x - 10.0) < 1e-3), 3.0 - (1.0 + 0.5 * 7.5 / 6.5))
     agrees(m2(found), 6.0 - (1.0 + 0.5 * 7.5 / 6.5))
-    assert all(scan.drawn.tolist() == [128, 128] for scan in found)
+    assert all(scan.sampled_point_counts.tolist() == [128, 128] for scan in found)
 
 
 def test_what_is_below_the_ground_is_drawn_and_not_seen(at):
     at([2.5, 0.0, 0.9])
     made = world(parked=[there(10.0, z_m=-0.5)])
-    agrees(m2(scans(made, SurfaceReference(BEHIND, rays=10, places=1, object_points=128))), 2.0)
+    agrees(m2(scans(made, SurfaceReference(BEHIND, num_rays=10, num_poses=1, points_per_object=128))), 2.0)
 
 
 def test_one_place_and_one_point_have_the_right_mean():
-    found = scans(world([there(10.0)]), SurfaceReference(BEHIND, rays=1, places=1, object_points=1), steps=150)
-    many = scans(world([there(10.0)]), SurfaceReference(BEHIND, rays=1, places=8, object_points=512), steps=30)
-    assert all(scan.drawn.tolist() == [1] for scan in found)
+    found = scans(
+        world([there(10.0)]), SurfaceReference(BEHIND, num_rays=1, num_poses=1, points_per_object=1), steps=150
+    )
+    many = scans(
+        world([there(10.0)]), SurfaceReference(BEHIND, num_rays=1, num_poses=8, points_per_object=512), steps=30
+    )
+    assert all(scan.sampled_point_counts.tolist() == [1] for scan in found)
     agrees(m2(found), m2(many).mean(), within=0.1)
 
 
 def test_without_an_object_nothing_changes():
-    scene = Scene(world())
+    scene = SceneGeometry(world())
     with_, without = (
-        SurfaceReference((AHEAD,), rays=200, object_points=points).scan(
-            Surroundings(scene, scene.at(0), np.random.default_rng(0), "test")
+        SurfaceReference((AHEAD,), num_rays=200, points_per_object=points).scan(
+            ReferenceContext(scene, scene.get_snapshot(0), np.random.default_rng(0), "test")
         )
         for points in (64, 0)
     )
-    assert with_.drawn.shape == (0,)
+    assert with_.sampled_point_counts.shape == (0,)
     np.testing.assert_array_equal(with_.points, without.points)
     np.testing.assert_array_equal(with_.weights, without.weights)
 
@@ -140,33 +147,33 @@ def test_without_an_object_nothing_changes():
 def test_nothing_is_drawn_on_who_is_not_there_or_out_of_range(at):
     at([-2.5, 0.0, 1.0])
     made = world([there(10.0, moves=True, until_s=1.5), there(37.0), there(40.0)])
-    sensor = SurfaceReference(BEHIND, rays=100, places=2, object_points=20, max_range_m=39.0)
+    sensor = SurfaceReference(BEHIND, num_rays=100, num_poses=2, points_per_object=20, max_range_m=39.0)
     (while_there,) = scans(made, sensor, steps=1, step=1)
     (afterwards,) = scans(made, sensor, steps=1, step=2)
-    assert while_there.drawn.tolist() == [20, 20, 0]
-    assert afterwards.drawn.tolist() == [0, 20, 0]
+    assert while_there.sampled_point_counts.tolist() == [20, 20, 0]
+    assert afterwards.sampled_point_counts.tolist() == [0, 20, 0]
 
 
 def test_an_object_that_turns_only_its_inner_side_to_a_place_hides_itself():
-    mesh = Box(type="box", size_m=(20.0, 20.0, 20.0)).mesh()
+    mesh = Box(type="box", size_m=(20.0, 20.0, 20.0)).build_mesh()
     place_m = np.array([1.0, 2.0, 3.0])
-    away = Bounds(np.full((1, 3), 90.0), np.full((1, 3), 99.0))
-    patches = Patches.cut(mesh)
-    strata = SurfaceStrata(patches._replace(of_object=np.zeros_like(patches.of_object)), away)
-    drawn = strata.draw(place_m, 5.0, np.random.default_rng(0), on_objects=50)
-    assert drawn.of_object.tolist() == [0] * 50
-    instant = Scene(World((mesh,), EGO)).at(0)
-    assert not sight(instant, place_m, drawn.points_m + np.float32(1e-3) * drawn.normals).seen.any()
-    assert sight(instant, place_m, drawn.points_m - np.float32(1e-3) * drawn.normals).seen.all()
+    away = UprightBoxes(np.full((1, 3), 90.0), np.full((1, 3), 99.0))
+    patches = Patches.from_mesh(mesh)
+    strata = SurfaceStrata(patches._replace(of_object=np.zeros_like(patches.object_indices)), away)
+    drawn = strata.sample_points(place_m, 5.0, np.random.default_rng(0), points_per_object=50)
+    assert drawn.object_indices.tolist() == [0] * 50
+    instant = SceneGeometry(Scene((mesh,), EGO)).get_snapshot(0)
+    assert not compute_visibility(instant, place_m, drawn.points_m + np.float32(1e-3) * drawn.normals).is_visible.any()
+    assert compute_visibility(instant, place_m, drawn.points_m - np.float32(1e-3) * drawn.normals).is_visible.all()
 
 
 def test_an_object_of_any_size_is_cut_whole():
-    huge = Patches.cut(Plane(type="plane", size_m=(1e6, 10.0)).mesh())
-    assert len(huge.outward) < 10_000
+    huge = Patches.from_mesh(Plane(type="plane", size_m=(1e6, 10.0)).build_mesh())
+    assert len(huge.is_outward) < 10_000
     assert np.linalg.norm(huge.normals_m2.astype(np.float64), axis=0).sum() / 2 == pytest.approx(1e7, rel=1e-5)
-    assert max(np.abs(huge.first_m).max(), np.abs(huge.second_m).max()) <= 1e6 / 64
-    car = Patches.cut(Box(type="box", size_m=(18.0, 2.5, 4.0)).mesh())
-    assert max(np.linalg.norm(edges, axis=0).max() for edges in (car.first_m, car.second_m)) <= 4.0
+    assert max(np.abs(huge.first_edge_m).max(), np.abs(huge.second_edge_m).max()) <= 1e6 / 64
+    car = Patches.from_mesh(Box(type="box", size_m=(18.0, 2.5, 4.0)).build_mesh())
+    assert max(np.linalg.norm(edges, axis=0).max() for edges in (car.first_edge_m, car.second_edge_m)) <= 4.0
 
 
 LIDAR = {
@@ -186,8 +193,8 @@ def test_a_frame_tells_what_is_hidden_from_the_places_too_from_what_nobody_asked
     ]  # fmt: skip
     made = scenario(FLOOR, box([0.2, 20, 6], x_m=30), actors=cars)
     rig = Rig.model_validate({"name": "r", "sensors": [LIDAR]})
-    sensor = SurfaceReference((AHEAD,), rays=100, object_points=64, max_range_m=60.0)
-    (frame,) = SimulatedFrames(made, rig, steps=1, reference_sensor=sensor, boxes=True)
+    sensor = SurfaceReference((AHEAD,), num_rays=100, points_per_object=64, max_range_m=60.0)
+    (frame,) = SimulatedFrames(made, rig, num_frames=1, reference_sensor=sensor, boxes=True)
     seen = measure_box_visibility(frame.sensor, frame.reference, frame.boxes, reference_weights=frame.reference_weights)
     assert frame.boxes.ids == ("ahead", "behind a wall", "at the edge", "behind")
     assert seen.observed.tolist() == [True, False, False, True]
@@ -200,6 +207,6 @@ def test_a_frame_tells_what_is_hidden_from_the_places_too_from_what_nobody_asked
 
 
 def test_frames_with_boxes_ask_about_every_object_unless_they_are_given_a_reference():
-    frames = [SimulatedFrames("courtyard", "front_roof_32", steps=1, boxes=boxes) for boxes in (False, True)]
+    frames = [SimulatedFrames("courtyard", "front_roof_32", num_frames=1, boxes=boxes) for boxes in (False, True)]
     assert [some.reference_sensor.object_points for some in frames] == [0, 64]
     assert frames[0].reference_sensor.areas == frames[1].reference_sensor.areas

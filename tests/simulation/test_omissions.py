@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from torchcover.simulation import PaperReference, Rig, Scenario, Simulator
-from torchcover.simulation.scene import Scene
+from torchcover.simulation.scene import SceneGeometry
 
 
 def rig(max_range_m=60.0, **keys):
@@ -24,7 +24,7 @@ def same_points(a, b):
 
 
 def test_counts_say_what_was_left_out_in_traffic():
-    near, far = (simulator("urban", max_range_m=metres).step(5).counts for metres in (30.0, 200.0))
+    near, far = (simulator("urban", max_range_m=metres).simulate_frame(5).counts for metres in (30.0, 200.0))
     assert near["moving_bodies"] == far["moving_bodies"]
     assert near["moving_bodies_out_of_range"] > far["moving_bodies_out_of_range"]
     for counts in (near, far):
@@ -37,7 +37,7 @@ def test_counts_say_what_was_left_out_in_traffic():
 
 
 def test_counts_say_what_was_left_out_where_nothing_moves():
-    counts = simulator("courtyard").step(5).counts
+    counts = simulator("courtyard").simulate_frame(5).counts
     assert counts["sensor_rays_reused"] == counts["sensor_rays"] == 16 * 90
     assert counts["sensor_self_hits_reused"] == counts["sensor_self_hits"] > 0
     assert counts["moving_bodies"] == counts["ray_body_pairs"] == counts["ray_body_pairs_omitted"] == 0
@@ -47,30 +47,30 @@ def test_counts_say_what_was_left_out_where_nothing_moves():
 def test_a_reused_scan_gives_what_a_fresh_one_does(keys):
     used = simulator("courtyard", keys)
     for index in (4, 2, 3):
-        reused, fresh = used.step(index), simulator("courtyard", keys).step(index)
+        reused, fresh = used.simulate_frame(index), simulator("courtyard", keys).simulate_frame(index)
         assert same_points(reused, fresh)
         assert reused.counts == fresh.counts
-    assert np.array_equal(used.step(2).clouds["r"], used.step(3).clouds["r"]) == (not keys)
+    assert np.array_equal(used.simulate_frame(2).clouds["r"], used.simulate_frame(3).clouds["r"]) == (not keys)
 
 
 def test_a_change_of_one_step_does_not_reach_the_next():
     used = simulator("courtyard")
-    first = used.step(0).clouds["r"]
+    first = used.simulate_frame(0).clouds["r"]
     kept = first.copy()
     first[:] = 0.0
-    np.testing.assert_array_equal(used.step(1).clouds["r"], kept)
+    np.testing.assert_array_equal(used.simulate_frame(1).clouds["r"], kept)
 
 
 def test_bodies_out_of_range_change_nothing(monkeypatch):
-    limited = simulator("urban", max_range_m=40.0).step(7)
-    original = Scene.at
-    monkeypatch.setattr(Scene, "at", lambda self, step, within_m: original(self, step, np.inf))
+    limited = simulator("urban", max_range_m=40.0).simulate_frame(7)
+    original = SceneGeometry.get_snapshot
+    monkeypatch.setattr(SceneGeometry, "at", lambda self, step, within_m: original(self, step, np.inf))
     everywhere = simulator("urban", max_range_m=40.0)
-    unlimited = everywhere.step(7)
-    scene, step = everywhere.scene_of(7)
-    time_s = np.array([step * scene.world.time_step_s])
+    unlimited = everywhere.simulate_frame(7)
+    scene, step = everywhere.get_scene_geometry(7)
+    time_s = np.array([step * scene.scene.time_step_s])
     moves = [
-        actor.trajectory for actor in scene.world.actors if actor.trajectory.is_moving or actor.trajectory.is_transient
+        actor.trajectory for actor in scene.scene.actors if actor.trajectory.is_moving or actor.trajectory.is_transient
     ]
     absent = sum(not np.isfinite(one.interpolate_positions_m(time_s)).all() for one in moves)
     assert unlimited.counts["moving_bodies_out_of_range"] == absent < limited.counts["moving_bodies_out_of_range"]
@@ -86,5 +86,5 @@ def test_a_range_starts_at_the_sensor_not_at_the_vehicle(tmp_path):
     scenario = Scenario.model_validate({"name": "s", "ego": {"shape": box}, "bodies": [ground], "actors": [mover]})
     reference = PaperReference(rows=8, columns=8, max_range_m=30.0)
     lidar = rig(30.0, mount={"x_m": 3.0, "z_m": 1.0}, vertical_fov_deg=[-1, 1], columns=720)
-    seen = Simulator(scenario, {"r": lidar}, reference).step(0)
+    seen = Simulator(scenario, {"r": lidar}, reference).simulate_frame(0)
     assert seen.clouds["r"][:, 0].max() == pytest.approx(32.0, abs=1e-3)

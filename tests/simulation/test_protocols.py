@@ -14,37 +14,37 @@ from torchcover.geometry import BoundingBox, build_transform
 from torchcover.simulation import (
     REFERENCE_SENSORS,
     SENSORS,
-    Draws,
     PaperReference,
     Pose,
     RayHits,
     ReferenceScan,
     RegionsOfInterest,
     Scenario,
+    SensorNoise,
     Simulator,
-    into_tiles,
-    position_in_shell,
-    vertical_fov_deg,
+    compute_vertical_fov_deg,
+    sample_position_in_shell,
+    split_into_tiles,
 )
-from torchcover.simulation.sensor import Ranging
+from torchcover.simulation.sensor import RangeSensor
 from torchcover.targets import Raster, Target, survey
 
 EGO = BoundingBox((-2.4, -1.0, 0.0), (2.4, 1.0, 1.6))
-ASKED = RegionsOfInterest(regions={"20m": {"x_m": (0.0, 20.0), "y_m": (-5.0, 5.0)}}).around()
+ASKED = RegionsOfInterest(regions={"20m": {"x_m": (0.0, 20.0), "y_m": (-5.0, 5.0)}}).build_query_plan()
 MOUNT = {"x_m": 2.6, "z_m": 1.0, "yaw_deg": 30.0}
 RANGES = {"min_range_m": 1.0, "max_range_m": 60.0, "range_noise_m": 0.02, "dropout": 0.1}
 
 
-class Altimeter(Ranging):
+class Altimeter(RangeSensor):
     """Looks down ahead: the smallest sensor there is."""
 
     type: Literal["altimeter"] = "altimeter"
     name: str
     mount: Pose = Pose()
     horizontal_fov_deg: float = 20.0
-    rays: int = 5
+    num_rays: int = 5
 
-    def directions(self):
+    def compute_directions(self):
         across = np.deg2rad(np.linspace(-10.0, 10.0, 5))
         down = np.full(5, np.sqrt(0.5))
         return np.stack([np.sqrt(0.5) * np.cos(across), np.sqrt(0.5) * np.sin(across), -down])[:, None]
@@ -58,26 +58,26 @@ class DownReference:
     has_area_weights: ClassVar[bool] = True
     band_frame: ClassVar[str] = "vehicle"
 
-    rays: int
+    num_rays: int
     shell_m: float = 0.5
     max_range_m: float = 30.0
 
     @classmethod
-    def from_rays(cls, asked, rays):
-        if rays is not None and rays < 1:
-            raise ValueError(f"rays: at least 1 is needed; got {rays}")
-        return cls(8 if rays is None else rays)
+    def from_query_plan(cls, query_plan, num_rays):
+        if num_rays is not None and num_rays < 1:
+            raise ValueError(f"rays: at least 1 is needed; got {num_rays}")
+        return cls(8 if num_rays is None else num_rays)
 
-    def scan(self, surroundings):
-        pose, redrawn = surroundings.free_pose(self.vehicle_T_reference)
-        x, y = surroundings.generator.uniform(-0.1, 0.1, size=(2, 1, self.rays))
-        tiles = into_tiles(np.stack([x, y, -np.sqrt(1 - x**2 - y**2)]))
-        seen = surroundings.instant.scan(pose, tiles, max_range_m=self.max_range_m)
+    def scan(self, context):
+        pose, redrawn = context.free_pose(self.sample_pose)
+        x, y = context.generator.uniform(-0.1, 0.1, size=(2, 1, self.num_rays))
+        tiles = split_into_tiles(np.stack([x, y, -np.sqrt(1 - x**2 - y**2)]))
+        seen = context.instant.scan(pose, tiles, max_range_m=self.max_range_m)
         weights = np.full(len(seen.points), 2.0, dtype=np.float32)
         return ReferenceScan(seen.points, weights, seen.rays, seen.self_hits, seen.body_casts, redrawn)
 
-    def vehicle_T_reference(self, ego, generator):
-        return build_transform(np.eye(3), position_in_shell(ego, self.shell_m, generator))
+    def sample_pose(self, ego_box, rng):
+        return build_transform(np.eye(3), sample_position_in_shell(ego_box, self.shell_m, rng))
 
 
 # Keys of one sensor of each kind, beside name, type, mount and ranges.
@@ -109,7 +109,7 @@ def sensor(request, monkeypatch):
 def reference_sensor(request, monkeypatch):
     """A reference sensor of each pattern, from areas and a number of rays."""
     monkeypatch.setitem(REFERENCE_SENSORS, "down", DownReference)
-    made = REFERENCE_SENSORS[request.param].from_rays(ASKED, 900)
+    made = REFERENCE_SENSORS[request.param].from_query_plan(ASKED, 900)
     assert made.name == request.param
     return made
 
@@ -129,7 +129,7 @@ def test_a_sensors_directions_are_of_length_one_or_none(sensor):
 
 def test_a_sensors_fields_of_view_hold_its_rays(sensor):
     x, y, z = sensor.directions()
-    low, high = vertical_fov_deg(sensor)
+    low, high = compute_vertical_fov_deg(sensor)
     middle = np.rad2deg(np.arcsin(z))[:, x.shape[1] // 2]
     assert (low, high) == pytest.approx((np.nanmin(middle), np.nanmax(middle)))
     azimuth_deg = np.rad2deg(np.arctan2(y, x))[len(x) // 2]
@@ -153,37 +153,42 @@ def test_a_sensor_makes_points_of_hits_that_are_far_enough_and_of_no_others(sens
     assert exact.is_exact
     assert not sensor.is_exact
     near, far = hits_of(exact, 0.99), hits_of(exact, 1.0)
-    assert len(hit_by(exact.measure(near, Draws(None)), len(near.ray))) == 0
-    hit = hit_by(exact.measure(far, Draws(None)), len(far.ray))
+    assert len(hit_by(exact.measure(near, SensorNoise(None)), len(near.ray_indices))) == 0
+    hit = hit_by(exact.measure(far, SensorNoise(None)), len(far.ray_indices))
     assert len(hit) > 0
     assert (np.diff(hit) > 0).all()
     none = hits_of(exact, 5.0, np.empty(0, dtype=np.int64))
-    assert len(hit_by(exact.measure(none, Draws(None)), 0)) == 0
+    assert len(hit_by(exact.measure(none, SensorNoise(None)), 0)) == 0
 
 
 def test_what_a_sensor_makes_of_a_beam_does_not_depend_on_other_beams(sensor):
     """Hits that are taken away change nothing about those of beams that keep theirs, in any number of places."""
     beams, random = sensor.beams(), np.random.default_rng(5)
-    whole = hits_of(sensor, random.uniform(0.5, 9.0, len(hits_of(sensor, 1.0).ray)))
-    of_ray = whole.ray if beams is None else beams.ravel()[whole.pixel]
-    measured = sensor.measure(whole, Draws(np.random.default_rng(0), rays=len(whole.ray)))
+    whole = hits_of(sensor, random.uniform(0.5, 9.0, len(hits_of(sensor, 1.0).ray_indices)))
+    of_ray = whole.ray_indices if beams is None else beams.ravel()[whole.pixel_indices]
+    measured = sensor.measure(whole, SensorNoise(np.random.default_rng(0), num_rays=len(whole.ray_indices)))
     kept = np.flatnonzero(of_ray % 3 != 1)
-    part = RayHits(whole.ray[kept], whole.range_m[kept], whole.pixel_of_ray, np.zeros(len(kept), dtype=np.int64))
-    of_part = sensor.measure(part, Draws(np.random.default_rng(0), rays=len(whole.ray)))
+    part = RayHits(
+        whole.ray_indices[kept], whole.range_m[kept], whole.ray_pixel_indices, np.zeros(len(kept), dtype=np.int64)
+    )
+    of_part = sensor.measure(part, SensorNoise(np.random.default_rng(0), num_rays=len(whole.ray_indices)))
     left = np.isin(measured.hit, kept)
     np.testing.assert_array_equal(kept[of_part.hit], measured.hit[left])
     np.testing.assert_array_equal(of_part.error_m, measured.error_m[left])
     twice = RayHits(
-        np.tile(whole.ray, 2), np.tile(whole.range_m, 2), whole.pixel_of_ray, np.repeat([0, 1], len(whole.ray))
+        np.tile(whole.ray_indices, 2),
+        np.tile(whole.range_m, 2),
+        whole.ray_pixel_indices,
+        np.repeat([0, 1], len(whole.ray_indices)),
     )
-    both = sensor.measure(twice, Draws(np.random.default_rng(0), rays=len(whole.ray)))
-    np.testing.assert_array_equal(both.hit, np.concatenate([measured.hit, measured.hit + len(whole.ray)]))
+    both = sensor.measure(twice, SensorNoise(np.random.default_rng(0), num_rays=len(whole.ray_indices)))
+    np.testing.assert_array_equal(both.hit, np.concatenate([measured.hit, measured.hit + len(whole.ray_indices)]))
 
 
 def test_a_sensor_asks_for_the_same_numbers_whatever_is_hit(sensor):
     """Else what one thread meets would decide what another draws."""
-    rays = len(hits_of(sensor, 1.0).ray)
-    used, fresh = (Draws(np.random.default_rng(2), rays=rays) for _ in range(2))
+    rays = len(hits_of(sensor, 1.0).ray_indices)
+    used, fresh = (SensorNoise(np.random.default_rng(2), num_rays=rays) for _ in range(2))
     sensor.measure(hits_of(sensor, 1.0, np.empty(0, dtype=np.int64)), used)
     one, other = (sensor.measure(hits_of(sensor, 5.0), draws) for draws in (used, fresh))
     np.testing.assert_array_equal(one.hit, other.hit)
@@ -205,7 +210,7 @@ def test_a_sensors_wrong_key_is_named_as_it_stands_in_the_file(sensor):
 def test_a_sensor_is_simulated(sensor):
     exact = sensor.model_copy(update={"range_noise_m": 0.0, "dropout": 0.0, "min_range_m": 0.0})
     frames = SimulatedFrames(
-        "courtyard", Rig(name="r", sensors=(exact,)), steps=1, reference_sensor=PaperReference(8, 8)
+        "courtyard", Rig(name="r", sensors=(exact,)), num_frames=1, reference_sensor=PaperReference(8, 8)
     )
     frame = frames[0]
     assert frame.counts["sensor_rays"] == (~np.isnan(exact.directions()[0])).sum()
@@ -219,7 +224,7 @@ def test_how_far_a_sensor_reaches_is_decided_by_the_scenario(sensor, monkeypatch
     rig = Rig(name="r", sensors=(sensor.model_copy(update={"range_noise_m": 0.0, "dropout": 0.0}),))
 
     def seen():
-        frames = SimulatedFrames("courtyard", rig, steps=1, reference_sensor=PaperReference(8, 8))
+        frames = SimulatedFrames("courtyard", rig, num_frames=1, reference_sensor=PaperReference(8, 8))
         return frames[0].reference, (frames[0].sensor.double() - torch.tensor([2.6, 0.0, 1.0])).norm(dim=1)
 
     def targets():
@@ -272,25 +277,27 @@ def test_a_reference_sensor_without_rays_is_refused(reference_sensor, rays):
 
 def test_a_reference_sensor_survives_pickling(reference_sensor):
     simulator = Simulator(Scenario.load("courtyard"), {}, reference_sensor)
-    used = simulator.step(1)
+    used = simulator.simulate_frame(1)
     travelled = pickle.loads(pickle.dumps(reference_sensor))
     assert travelled == reference_sensor
     assert hash(travelled) == hash(reference_sensor)
-    np.testing.assert_array_equal(simulator.with_reference_sensor(travelled).step(1).reference, used.reference)
+    np.testing.assert_array_equal(
+        simulator.replace_reference_sensor(travelled).simulate_frame(1).reference, used.reference
+    )
 
 
 def test_a_reference_sensor_draws_from_the_generator_of_the_step_and_from_nothing_else(reference_sensor):
     np.random.seed(1)  # noqa: NPY002  (the random numbers that it must not draw)
     state = np.random.get_state()[1].copy()  # noqa: NPY002
     simulator = Simulator(Scenario.load("courtyard"), {}, reference_sensor, seed=3)
-    one, again, other = simulator.step(4), simulator.step(4), simulator.step(5)
+    one, again, other = simulator.simulate_frame(4), simulator.simulate_frame(4), simulator.simulate_frame(5)
     np.testing.assert_array_equal(one.reference, again.reference)
     assert not np.array_equal(one.reference, other.reference)
     np.testing.assert_array_equal(np.random.get_state()[1], state)  # noqa: NPY002
 
 
 def test_a_reference_sensors_points_are_near_enough_and_have_the_weights_that_it_promises(reference_sensor):
-    seen = Simulator(Scenario.load("courtyard"), {}, reference_sensor).step(0)
+    seen = Simulator(Scenario.load("courtyard"), {}, reference_sensor).simulate_frame(0)
     assert seen.reference.dtype == np.float32
     assert seen.reference.shape == (len(seen.reference), 3)
     farthest_m = np.linalg.norm(EGO.corners_m, axis=1).max() + 2 * reference_sensor.shell_m
@@ -304,7 +311,7 @@ def test_a_reference_sensors_points_are_near_enough_and_have_the_weights_that_it
 
 
 def test_a_reference_sensor_is_simulated(reference_sensor):
-    frames = SimulatedFrames("courtyard", "front_roof_32", steps=2, seed=4, reference_sensor=reference_sensor)
+    frames = SimulatedFrames("courtyard", "front_roof_32", num_frames=2, seed=4, reference_sensor=reference_sensor)
     frame, again = frames[1], pickle.loads(pickle.dumps(frames))[1]
     assert frame.counts["reference_rays"] == pytest.approx(900, rel=0.15)
     assert 0 < len(frame.reference) <= frame.counts["reference_rays"]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from torchcover import Rig
-from torchcover.simulation import Draws, PaperReference, Radar, RayHits, Scenario, Simulator
+from torchcover.simulation import PaperReference, Radar, RayHits, Scenario, SensorNoise, Simulator
 
 KEYS = {
     "name": "front", "mount": {"x_m": 2.1, "z_m": 1.0}, "horizontal_fov_deg": 60, "vertical_fov_deg": [-10, 10],
@@ -23,8 +23,8 @@ def points_of(sensor, *bodies):
     """What it sees, with the radar as the origin."""
     scenario = Scenario.model_validate({"name": "s", "ego": EGO, "bodies": [WALL, *bodies]})
     rig = Rig(name="r", sensors=(sensor,))
-    [scan] = Simulator(scenario, {"r": rig}, PaperReference(2, 2)).scans(0)["r"]
-    return (scan.points if scan.landed is None else scan.landed).astype(np.float64) - [2.1, 0.0, 1.0]
+    [scan] = Simulator(scenario, {"r": rig}, PaperReference(2, 2)).simulate_scans(0)["r"]
+    return (scan.points if scan.measured_points is None else scan.measured_points).astype(np.float64) - [2.1, 0.0, 1.0]
 
 
 def cells_of(sensor, points_m):
@@ -56,17 +56,19 @@ def test_a_flat_wall_fills_the_cells_that_it_passes_through():
 def test_a_point_is_the_hit_in_the_middle_of_its_cell():
     """Against a slow twin, at random ranges in several places."""
     sensor, random = radar(min_range_m=3.0, range_cell_m=2.0), np.random.default_rng(3)
-    rays = sensor.rays
-    beams = sensor.beams().ravel()
+    rays = sensor.num_rays
+    beams = sensor.compute_beam_indices().ravel()
     ray, place = np.tile(np.arange(rays), 2), np.repeat([0, 1], rays)
     there = random.random(2 * rays) < 0.4
     hits = RayHits(ray[there], random.uniform(2, 12, there.sum()).astype(np.float32), np.arange(rays), place[there])
     cells = {}
-    for number, (one, range_m, where) in enumerate(zip(hits.ray, hits.range_m, hits.place, strict=True)):
+    for number, (one, range_m, where) in enumerate(
+        zip(hits.ray_indices, hits.range_m, hits.position_indices, strict=True)
+    ):
         if range_m >= 3.0:
             cells.setdefault((where, beams[one], int(range_m / 2.0)), []).append((range_m, number))
     expected = sorted(sorted(cell)[(len(cell) - 1) // 2][1] for cell in cells.values())
-    assert sensor.measure(hits, Draws(None)).hit.tolist() == expected
+    assert sensor.measure(hits, SensorNoise(None)).hit_indices.tolist() == expected
     assert max(map(len, cells.values())) > 5
 
 
@@ -111,9 +113,9 @@ def test_points_drop_out_and_err_a_cell_at_a_time():
 
 def test_rays_fill_the_opening_and_are_as_close_as_asked_for():
     sensor = radar(azimuth_cell_deg=7.0)
-    assert sensor.azimuth_cells == 9  # of 6.67 degrees: none is wider
-    x, y, z = sensor.directions()
-    assert sensor.rays == x.size == sensor.beams().size
+    assert sensor.num_azimuth_cells == 9  # of 6.67 degrees: none is wider
+    x, y, z = sensor.compute_directions()
+    assert sensor.num_rays == x.size == sensor.compute_beam_indices().size
     azimuth_deg, elevation_deg = np.rad2deg(np.arctan2(y, x)), np.rad2deg(np.arcsin(z))
     for angle_deg, axis, opening_deg in ((azimuth_deg, 1, 60), (elevation_deg, 0, 20)):
         step_deg = np.diff(angle_deg, axis=axis)
@@ -121,7 +123,7 @@ def test_rays_fill_the_opening_and_are_as_close_as_asked_for():
         assert step_deg.max() <= np.rad2deg(0.5 / 40) + 1e-9
         np.testing.assert_allclose(angle_deg.max() - angle_deg.min() + step_deg.mean(), opening_deg, rtol=1e-6)
     across = np.floor((azimuth_deg + 30) / 60 * 9).astype(int)
-    np.testing.assert_array_equal(across, sensor.beams())
+    np.testing.assert_array_equal(across, sensor.compute_beam_indices())
 
 
 @pytest.mark.parametrize(

@@ -48,7 +48,9 @@ def random_mesh(faces, seed=0):
 
 
 def box_at(x, y=0.0, size=1.0):
-    return Box(type="box", size_m=(size, size, size)).mesh().moved(build_transform(np.eye(3), [x, y, -size / 2]))
+    return (
+        Box(type="box", size_m=(size, size, size)).build_mesh().transform(build_transform(np.eye(3), [x, y, -size / 2]))
+    )
 
 
 def slow_hits(mesh, origin, directions):
@@ -75,7 +77,7 @@ def test_agrees_with_a_slow_intersection_in_float64():
     expected = slow_hits(mesh, HERE, directions)
     # A ray through the very border of a face may go either way in float32.
     assert (np.isfinite(hits.range_m) == np.isfinite(expected)).mean() > 0.995
-    assert ((hits.body >= 0) == np.isfinite(hits.range_m)).all()
+    assert ((hits.body_indices >= 0) == np.isfinite(hits.range_m)).all()
     both = np.isfinite(hits.range_m) & np.isfinite(expected)
     assert (np.abs(hits.range_m[both] - expected[both]) < 1e-4).mean() > 0.995
     assert 0.2 < both.mean() < 1.0
@@ -85,9 +87,9 @@ def test_what_is_struck_knows_how_steeply():
     mesh, directions = random_mesh(200), random_directions(600)
     caster = RayCaster([mesh])
     hits = caster.cast(HERE, directions, endless(directions))
-    met = hits.body >= 0
-    struck = caster.struck(hits.body[met], hits.triangle[met], directions[:, met])
-    first, second, third = mesh.vertices_m[mesh.faces[hits.triangle[met]]].swapaxes(0, 1)
+    met = hits.body_indices >= 0
+    struck = caster.compute_hit_attributes(hits.body_indices[met], hits.triangle_indices[met], directions[:, met])
+    first, second, third = mesh.vertices_m[mesh.faces[hits.triangle_indices[met]]].swapaxes(0, 1)
     normals = np.cross(second - first, third - first)
     expected = np.abs((normals * directions[:, met].T).sum(axis=1)) / np.linalg.norm(normals, axis=1)
     np.testing.assert_allclose(struck.cos_incidence, expected, atol=1e-4)
@@ -95,7 +97,7 @@ def test_what_is_struck_knows_how_steeply():
 
 
 def test_no_ray_slips_out_of_a_closed_box_through_its_edges():
-    box = Box(type="box", size_m=(4.0, 6.0, 3.0)).mesh()
+    box = Box(type="box", size_m=(4.0, 6.0, 3.0)).build_mesh()
     corners = box.vertices_m[box.faces]
     weights = np.linspace(0, 1, 101)[:, None, None, None]
     on_edges = (weights * corners + (1 - weights) * corners[:, [1, 2, 0]]).reshape(-1, 3)
@@ -103,7 +105,7 @@ def test_no_ray_slips_out_of_a_closed_box_through_its_edges():
     range_m = np.linalg.norm(on_edges - origin, axis=1)
     directions = ((on_edges - origin).T / range_m).astype(np.float32)
     hits = RayCaster([box]).cast(origin, directions, endless(directions))
-    assert (hits.body == 0).all()
+    assert (hits.body_indices == 0).all()
     np.testing.assert_allclose(hits.range_m, range_m, atol=1e-5)
 
 
@@ -111,7 +113,7 @@ def test_no_ray_slips_out_of_a_closed_box_through_its_edges():
 def test_a_mountain_far_away_does_not_blur_the_wall_in_front(gap_m):
     ahead = np.array([[1], [0], [0]], np.float32)
     hits = RayCaster([MOUNTAIN, box_at(0.5 + gap_m)]).cast(HERE, ahead, endless(ahead))
-    assert hits.body == [1]
+    assert hits.body_indices == [1]
     np.testing.assert_allclose(hits.range_m, gap_m, rtol=1e-4)
 
 
@@ -124,7 +126,7 @@ def test_a_narrow_face_in_front_is_hit(width_m):
     sliver = Mesh(np.array([*corners, 0.01 * ahead + 2 * width_m * across]), np.array([[0, 1, 2]]))
     rays = ahead[:, None].astype(np.float32)
     hits = RayCaster([sliver, MOUNTAIN]).cast(HERE, rays, endless(rays))
-    assert hits.body == [0]
+    assert hits.body_indices == [0]
     np.testing.assert_allclose(hits.range_m, 0.01, atol=0.002)
 
 
@@ -166,14 +168,17 @@ def test_rays_leave_all_faces_that_meet_where_they_start(shape):
             expected = np.divide(gap, steep, out=np.full_like(steep, np.inf), where=(steep > 0) & (gap > 1e-9)).min(
                 axis=0
             )
-            assert (hits.body[some] == body).all()
+            assert (hits.body_indices[some] == body).all()
             np.testing.assert_allclose(hits.range_m[some], expected, atol=2e-3)
 
 
 @pytest.mark.parametrize("limit_m", [1e-6, 0.3, 1.0, 7.0, np.inf])
 def test_a_ray_that_leaves_a_face_ends_at_its_limit(limit_m):
     turned = build_transform(convert_euler_to_rotation(37.0, 21.0, -13.0), [1.0, 2.0, 3.0])
-    floor, place = Plane(type="plane", size_m=(200, 200)).mesh().moved(turned), (turned @ [5.1, 7.2, 0.0, 1.0])[:3]
+    floor, place = (
+        Plane(type="plane", size_m=(200, 200)).build_mesh().transform(turned),
+        (turned @ [5.1, 7.2, 0.0, 1.0])[:3],
+    )
     away = turned[:3, 2]
     wall = Mesh(place + 5.0 * away + floor.vertices_m - turned[:3, 3], floor.faces)
     upwards = random_directions(500)
@@ -181,7 +186,7 @@ def test_a_ray_that_leaves_a_face_ends_at_its_limit(limit_m):
     hits = RayCaster([floor, wall]).cast(place, upwards, np.full(upwards.shape[1], limit_m, np.float32))
     expected = 5.0 / (away @ upwards)
     assert (hits.range_m <= np.float32(limit_m)).all()
-    np.testing.assert_array_equal(hits.body, np.where(expected <= limit_m, 1, -1))
+    np.testing.assert_array_equal(hits.body_indices, np.where(expected <= limit_m, 1, -1))
     np.testing.assert_allclose(hits.range_m, np.minimum(expected, limit_m), rtol=1e-4)
 
 
@@ -193,29 +198,32 @@ def test_rays_leave_a_sliver_that_they_start_on():
         caster = RayCaster([Mesh(corners, np.array([[0, 1, 2]]))])
         directions = random_directions(100, seed=generator.integers(1000))
         hits = caster.cast(generator.dirichlet(np.ones(3)) @ corners, directions, endless(directions))
-        assert (hits.body == -1).all()
+        assert (hits.body_indices == -1).all()
 
 
 def test_one_caster_answers_for_one_place_after_the_other():
     caster, outwards = RayCaster([box_at(9.0), box_at(0.0)]), np.array([[1.0], [0.0], [0.0]], dtype=np.float32)
     for _ in range(2):
         inside = caster.cast(HERE, outwards, endless(outwards))
-        assert (inside.body, inside.range_m) == ([1], [pytest.approx(0.5, rel=1e-6)])
+        assert (inside.body_indices, inside.range_m) == ([1], [pytest.approx(0.5, rel=1e-6)])
         on_the_wall = caster.cast(np.array([0.5, 0.1, 0.1]), outwards, endless(outwards))
-        assert (on_the_wall.body, on_the_wall.range_m) == ([0], [pytest.approx(8.0, rel=1e-6)])
+        assert (on_the_wall.body_indices, on_the_wall.range_m) == ([0], [pytest.approx(8.0, rel=1e-6)])
 
 
 def test_a_place_on_a_face_up_to_the_rounding_of_doubles_is_on_it():
-    ground, down = Plane(type="plane", size_m=(100, 100)).mesh(), np.array([[0.0], [0.0], [-1.0]], dtype=np.float32)
+    ground, down = (
+        Plane(type="plane", size_m=(100, 100)).build_mesh(),
+        np.array([[0.0], [0.0], [-1.0]], dtype=np.float32),
+    )
     hits = RayCaster([ground]).cast(np.array([1.0, 2.0, 1e-15]), down, endless(down))
-    assert hits.body == [-1]
+    assert hits.body_indices == [-1]
 
 
 @pytest.mark.parametrize(("limit", "body", "range_m"), [(4.4, -1, 4.4), (4.6, 0, 4.5), (np.inf, 0, 4.5)])
 def test_a_ray_ends_at_its_limit(limit, body, range_m):
     ray = np.array([[1.0], [0.0], [0.0]], dtype=np.float32)
     hits = RayCaster([box_at(5.0)]).cast(HERE, ray, np.array([limit], dtype=np.float32))
-    assert hits.body.tolist() == [body]
+    assert hits.body_indices.tolist() == [body]
     np.testing.assert_allclose(hits.range_m, [range_m], rtol=1e-6)
 
 
@@ -233,10 +241,10 @@ def test_bodies_without_faces_keep_their_numbers():
     caster = RayCaster([nothing, box_at(0.0, size=4.0), nothing, box_at(9.0), nothing])
     starts = np.array([[0.0, 0.0, -5.0], [9.0, 0.0, -5.0], [30.0, 0.0, -5.0]])
     hits = caster.cast_from_each(starts.astype(np.float32), up.T, np.full(3, 9.0, np.float32))
-    assert hits.body.tolist() == [1, 3, -1]
-    bodies = np.searchsorted([0, 12, 24], caster.faces_met(starts, up, 9.0), side="right")
+    assert hits.body_indices.tolist() == [1, 3, -1]
+    bodies = np.searchsorted([0, 12, 24], caster.find_first_faces(starts, up, 9.0), side="right")
     assert bodies.tolist() == [1, 2, 0]
-    assert (RayCaster([nothing]).cast(HERE, up.T, endless(up.T)).body == -1).all()
+    assert (RayCaster([nothing]).cast(HERE, up.T, endless(up.T)).body_indices == -1).all()
 
 
 def test_no_rays_are_an_empty_result():
@@ -261,7 +269,7 @@ def test_scenes_are_built_without_threads_that_a_forked_process_would_miss():
 def stacked(sizes):
     """Slabs upon each other, and the places of their middles."""
     tops = np.cumsum([size[2] for size in sizes])
-    boxes = [Box(type="box", size_m=size).mesh() for size in sizes]
+    boxes = [Box(type="box", size_m=size).build_mesh() for size in sizes]
     starts = [np.array([0.0, 0.0, top - size[2]]) for top, size in zip(tops, sizes, strict=True)]
     return [Mesh(mesh.vertices_m + start, mesh.faces) for mesh, start in zip(boxes, starts, strict=True)]
 
@@ -279,25 +287,25 @@ def test_a_place_between_bodies_that_touch_is_inside_one_however_they_are_turned
     for height_m, expected in ((0.5, [0]), (2.0, [1]), (3.5, [2]), (4.5, []), (-0.5, [])):
         for beside_m in ((0.0, 0.0), (0.3, -4.2), (7.0, 7.0)):
             place_m = turn[:3, :3] @ [*beside_m, height_m] + turn[:3, 3]
-            assert order[caster.inside(place_m)].tolist() == expected
+            assert order[caster.find_enclosing_bodies(place_m)].tolist() == expected
 
 
 def test_a_place_is_inside_of_what_encloses_it_and_of_no_sheet():
     """Convex bodies against their half spaces; bodies within bodies, and one of two parts that touch."""
-    ball, cube = Ellipsoid(type="ellipsoid", size_m=(4, 3, 2)).mesh(), box_at(0.0, size=2.0)
-    caster = RayCaster([ball, Plane(type="plane", size_m=(9, 9)).mesh(), cube])
+    ball, cube = Ellipsoid(type="ellipsoid", size_m=(4, 3, 2)).build_mesh(), box_at(0.0, size=2.0)
+    caster = RayCaster([ball, Plane(type="plane", size_m=(9, 9)).build_mesh(), cube])
     places = NUMBERS(0).uniform(-2.2, 2.2, (2000, 3))
     places[:100, :2] = 0.0  # above and below vertices, edges and the middles of faces
     for place in places:
         within = [number for number, body in ((0, ball), (2, cube)) if behind_all(body, place)]
-        assert caster.inside(place).tolist() == within
-    ahead = cube.moved(build_transform(np.eye(3), [2, 0, 0]))
+        assert caster.find_enclosing_bodies(place).tolist() == within
+    ahead = cube.transform(build_transform(np.eye(3), [2, 0, 0]))
     vertices_m, faces = (
         np.concatenate([cube.vertices_m, ahead.vertices_m]),
         np.concatenate([cube.faces, cube.faces + 8]),
     )
     both = RayCaster([Mesh(vertices_m, faces)])
-    found = [len(both.inside(np.array([x, 0.2, 0.1]))) for x in (-1.5, 0.0, 1.0, 2.0, 3.5)]
+    found = [len(both.find_enclosing_bodies(np.array([x, 0.2, 0.1]))) for x in (-1.5, 0.0, 1.0, 2.0, 3.5)]
     assert found == [0, 1, 1, 1, 0]
 
 
@@ -314,4 +322,4 @@ def test_who_stands_on_top_of_a_body_is_not_inside_and_who_lies_below_its_bottom
         caster = RayCaster([Mesh(slab.vertices_m + shift, slab.faces)])
         heights = {-1e-3: [], 1e-3: [0], 0.3 - 1e-3: [0], 0.3: [], 0.3 + 1e-3: []}
         for height, expected in heights.items():
-            assert caster.inside(shift + np.array([0.1, 0.7, height])).tolist() == expected
+            assert caster.find_enclosing_bodies(shift + np.array([0.1, 0.7, height])).tolist() == expected

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from torchcover.simulation import PaperReference
-from torchcover.simulation.rays import into_tiles, unit_directions
+from torchcover.simulation.rays import compute_unit_directions, split_into_tiles
 
 
 @pytest.mark.parametrize(("rows", "columns"), [(1, 1), (5, 7), (128, 128), (129, 300), (300, 2)])
 def test_every_ray_is_in_one_tile(rows, columns):
-    directions = unit_directions(np.linspace(-30, 10, rows)[:, None], np.linspace(-60, 60, columns)[None])
-    tiled = np.concatenate([tile.directions for tile in into_tiles(directions)], axis=1)
+    directions = compute_unit_directions(np.linspace(-30, 10, rows)[:, None], np.linspace(-60, 60, columns)[None])
+    tiled = np.concatenate([tile.directions for tile in split_into_tiles(directions)], axis=1)
     expected = directions.reshape(3, -1).astype(np.float32)
     assert tiled.shape == expected.shape
     np.testing.assert_array_equal(np.sort(tiled.view("i4")), np.sort(expected.view("i4")))
@@ -18,13 +18,13 @@ def test_every_ray_is_in_one_tile(rows, columns):
 
 @pytest.mark.parametrize("rows", [2, 64, 300])
 def test_every_ray_lies_in_the_cone_of_its_tile(rows):
-    for tile in into_tiles(PaperReference(rows=rows, columns=400).directions()):
+    for tile in split_into_tiles(PaperReference(rows=rows, columns=400).compute_directions()):
         assert np.linalg.norm(tile.axis) == pytest.approx(1.0)
         angles = np.arccos(np.clip(tile.axis @ tile.directions.astype(np.float64), -1, 1))
-        assert angles.max() <= tile.half_angle + 1e-6
+        assert angles.max() <= tile.half_angle_rad + 1e-6
 
 
 def test_directions_that_cancel_make_a_cone_that_is_the_whole_sphere():
     both_ways = np.array([[1.0, -1.0], [0.0, 0.0], [0.0, 0.0]]).reshape(3, 1, 2)
-    (tile,) = into_tiles(both_ways)
-    assert tile.half_angle == pytest.approx(np.pi)
+    (tile,) = split_into_tiles(both_ways)
+    assert tile.half_angle_rad == pytest.approx(np.pi)

@@ -5,8 +5,14 @@ import pytest
 
 from torchcover.recordings import open_recording
 from torchcover.simulation import Rig, calibrate
-from torchcover.simulation.recorded_returns import HALF_LANES_M, NEAREST_M, fit_returns, ground_rays, road_profile
-from torchcover.simulation.returns import Material, log_excess, return_probability
+from torchcover.simulation.recorded_returns import (
+    HALF_LANES_M,
+    NEAREST_M,
+    count_ground_rays,
+    fit_returns,
+    fit_road_profile,
+)
+from torchcover.simulation.returns import Material, compute_log_excess, compute_return_probability
 
 RANGE_M, SPREAD, NOISE_M, HEIGHT_M = 60.0, 0.25, 0.02, 1.9
 RIG = Rig.model_validate(
@@ -29,14 +35,16 @@ ROAD = Material.load("road")
 
 def sweep(generator, wall_m=np.inf, top_m=np.inf):
     """What returns from a plain, with a wall across the road ahead, as high as said."""
-    directions = RIG.sensors[0].directions().reshape(3, -1)
+    directions = RIG.sensors[0].compute_directions().reshape(3, -1)
     range_m = HEIGHT_M / -directions[2]
     with np.errstate(divide="ignore"):
         at_wall_m = HEIGHT_M + directions[2] * wall_m / directions[0]
     cosine, on_wall = -directions[2], (directions[0] * range_m > wall_m) & (at_wall_m < top_m)
     range_m = np.where(on_wall, wall_m / directions[0], range_m)
-    excess = log_excess(range_m, cosine, ROAD.share, ROAD.incidence_exponent, RANGE_M)
-    returned = on_wall | (generator.random(len(range_m)) < return_probability(excess, SPREAD, ROAD.spread))
+    excess = compute_log_excess(range_m, cosine, ROAD.numeric_reflectivity, ROAD.incidence_exponent, RANGE_M)
+    returned = on_wall | (
+        generator.random(len(range_m)) < compute_return_probability(excess, SPREAD, ROAD.log_reflectivity_std)
+    )
     measured_m = range_m + NOISE_M * generator.standard_normal(len(range_m))
     return (directions * measured_m).T[returned] + [0.0, 0.0, HEIGHT_M]
 
@@ -60,58 +68,66 @@ def sweeps():
 
 def test_a_plain_gives_back_what_it_was_made_with(sweeps, tmp_path):
     rig, [found] = calibrate(written(tmp_path, sweeps), RIG)
-    assert abs(np.log(found.fit.range_at_10_percent_m / RANGE_M)) < 3 * found.fit.range_error < 0.15
-    assert abs(np.log(found.fit.spread / SPREAD)) < 3 * found.fit.spread_error < 0.6
-    assert found.noise_m == pytest.approx(NOISE_M, rel=0.1)
+    assert abs(np.log(found.fit.range_at_10_percent_m / RANGE_M)) < 3 * found.fit.log_range_error < 0.15
+    assert abs(np.log(found.fit.log_range_std / SPREAD)) < 3 * found.fit.log_std_error < 0.6
+    assert found.range_noise_m == pytest.approx(NOISE_M, rel=0.1)
     assert rig.sensors[0].range_at_10_percent_m == round(found.fit.range_at_10_percent_m, 1)
 
 
 def test_errors_are_those_of_the_curvature_of_what_is_likely(sweeps):
-    rays = ground_rays(sweeps, RIG.sensors[0])
-    fit, returned = fit_returns(rays, ROAD), rays.returned / rays.rays
+    rays = count_ground_rays(sweeps, RIG.sensors[0])
+    fit, returned = fit_returns(rays, ROAD), rays.return_counts / rays.ray_counts
 
     def surprise(log_range, log_spread):
-        excess = log_excess(
-            rays.range_m, rays.cos_incidence, ROAD.share, ROAD.incidence_exponent, float(np.exp(log_range))
+        excess = compute_log_excess(
+            rays.range_m,
+            rays.cos_incidence,
+            ROAD.numeric_reflectivity,
+            ROAD.incidence_exponent,
+            float(np.exp(log_range)),
         )
-        seen = return_probability(excess, float(np.exp(log_spread)), ROAD.spread)
+        seen = compute_return_probability(excess, float(np.exp(log_spread)), ROAD.log_reflectivity_std)
         prior = ((log_spread - np.log(0.3)) / 0.7) ** 2 / 2
         return prior - (returned * np.log(seen) + (1 - returned) * np.log1p(-seen)).sum()
 
-    x, y, step = np.log(fit.range_at_10_percent_m), np.log(fit.spread), 0.02
+    x, y, step = np.log(fit.range_at_10_percent_m), np.log(fit.log_range_std), 0.02
     grid = np.array([[surprise(x + i * step, y + j * step) for j in (-1, 0, 1)] for i in (-1, 0, 1)])
     mixed = (grid[2, 2] - grid[0, 2] - grid[2, 0] + grid[0, 0]) / 4
     curvature = np.array([[np.diff(grid[:, 1], 2)[0], mixed], [mixed, np.diff(grid[1], 2)[0]]]) / step**2
     expected = np.sqrt(np.diag(np.linalg.inv(curvature)))
-    assert [fit.range_error, fit.spread_error] == pytest.approx(expected, rel=0.1)
+    assert [fit.log_range_error, fit.log_std_error] == pytest.approx(expected, rel=0.1)
 
 
 def test_half_of_the_turn_predicts_the_other_half(sweeps):
-    rays = ground_rays(sweeps, RIG.sensors[0])
+    rays = count_ground_rays(sweeps, RIG.sensors[0])
     ahead = np.abs(rays.azimuth_deg) < 90
-    fit, judged = fit_returns(rays.some(ahead), ROAD), rays.some(~ahead)
-    excess = log_excess(
-        judged.range_m, judged.cos_incidence, ROAD.share, ROAD.incidence_exponent, fit.range_at_10_percent_m
+    fit, judged = fit_returns(rays.select(ahead), ROAD), rays.select(~ahead)
+    excess = compute_log_excess(
+        judged.range_m,
+        judged.cos_incidence,
+        ROAD.numeric_reflectivity,
+        ROAD.incidence_exponent,
+        fit.range_at_10_percent_m,
     )
-    probability = return_probability(excess, fit.spread, ROAD.spread)
+    probability = compute_return_probability(excess, fit.log_range_std, ROAD.log_reflectivity_std)
     for low_m in range(10, 90, 10):
         there = (judged.range_m >= low_m) & (judged.range_m < low_m + 10)
-        rays_there = judged.rays[there].sum()
+        rays_there = judged.ray_counts[there].sum()
         if rays_there >= 200:
-            real = judged.returned[there].sum() / rays_there
-            assert real == pytest.approx((probability * judged.rays)[there].sum() / rays_there, abs=0.06)
+            real = judged.return_counts[there].sum() / rays_there
+            assert real == pytest.approx((probability * judged.ray_counts)[there].sum() / rays_there, abs=0.06)
 
 
 def test_rays_behind_a_wall_are_in_nobodys_count():
     """Else what the wall hides would be road that did not return."""
-    rays = ground_rays([sweep(np.random.default_rng(1), wall_m=30.0)], RIG.sensors[0])
+    rays = count_ground_rays([sweep(np.random.default_rng(1), wall_m=30.0)], RIG.sensors[0])
     ahead = np.abs(rays.azimuth_deg) < 10
     assert rays.range_m[ahead].max() < 31 < 60 < rays.range_m[~ahead].max()
 
 
 def test_rays_pass_over_what_is_low():
     """Behind a beam of 0.5 m the road is hidden from 30 to 30 / (1 - 0.5 / 1.9) = 41 m only."""
-    beam = ground_rays([sweep(np.random.default_rng(1), wall_m=30.0, top_m=0.5)], RIG.sensors[0])
+    beam = count_ground_rays([sweep(np.random.default_rng(1), wall_m=30.0, top_m=0.5)], RIG.sensors[0])
     ahead = np.abs(beam.azimuth_deg) < 10
     assert not ((beam.range_m[ahead] > 31) & (beam.range_m[ahead] < 40)).any()
     assert ((beam.range_m[ahead] > 45) & (beam.range_m[ahead] < 80)).sum() > 100
@@ -120,9 +136,12 @@ def test_rays_pass_over_what_is_low():
 def test_the_road_is_found_where_it_tilts_and_bends():
     x, y = np.meshgrid(np.linspace(-60, 60, 121), np.linspace(-6, 6, 25))
     height_m = 0.02 * x - 0.01 * y + 0.2 * (x / 40) ** 2 * (x > 0)
-    profile = road_profile(np.stack([x, y, height_m], axis=-1).reshape(-1, 3))
+    profile = fit_road_profile(np.stack([x, y, height_m], axis=-1).reshape(-1, 3))
     assert (
-        np.abs(profile.height_m(np.stack([x, y, height_m], axis=-1).reshape(-1, 3)) - height_m.reshape(-1)).max() < 0.02
+        np.abs(
+            profile.compute_heights_m(np.stack([x, y, height_m], axis=-1).reshape(-1, 3)) - height_m.reshape(-1)
+        ).max()
+        < 0.02
     )
 
 
@@ -130,25 +149,27 @@ def test_what_lies_beside_the_lanes_is_no_road():
     x, y = np.meshgrid(np.linspace(-60, 60, 121), np.linspace(-20, 20, 81))
     lanes = np.abs(y) < HALF_LANES_M
     points_m = np.stack([x, y, 0.02 * x + 0.3 * ~lanes], axis=-1)
-    whole, alone = road_profile(points_m.reshape(-1, 3)), road_profile(points_m[lanes])
-    np.testing.assert_allclose(whole.height_m(points_m[lanes]), alone.height_m(points_m[lanes]), atol=1e-9)
+    whole, alone = fit_road_profile(points_m.reshape(-1, 3)), fit_road_profile(points_m[lanes])
+    np.testing.assert_allclose(
+        whole.compute_heights_m(points_m[lanes]), alone.compute_heights_m(points_m[lanes]), atol=1e-9
+    )
 
 
 def test_rays_to_what_is_near_are_in_nobodys_count(sweeps):
     """The steep ones: they return, whatever the LiDAR."""
     assert np.tan(np.deg2rad(RIG.sensors[0].rows_deg())).min() < -HEIGHT_M / 5
-    assert ground_rays(sweeps, RIG.sensors[0]).range_m.min() > NEAREST_M
+    assert count_ground_rays(sweeps, RIG.sensors[0]).range_m.min() > NEAREST_M
 
 
 def test_near_road_cannot_tell_how_far_a_lidar_sees(sweeps, tmp_path):
     """All of it returns: any range that is long enough explains that."""
     _, [found] = calibrate(written(tmp_path, sweeps), RIG)
-    rays = ground_rays(sweeps, RIG.sensors[0])
-    fit = fit_returns(rays.some(rays.range_m < 16), ROAD)
-    assert found.fit.fades
-    assert not fit.fades
-    assert "m at 10 %" in found.words
-    assert "cannot tell" in found._replace(fit=fit).words
+    rays = count_ground_rays(sweeps, RIG.sensors[0])
+    fit = fit_returns(rays.select(rays.range_m < 16), ROAD)
+    assert found.fit.is_range_observable
+    assert not fit.is_range_observable
+    assert "m at 10 %" in found.text
+    assert "cannot tell" in found._replace(fit=fit).text
 
 
 @pytest.mark.parametrize(

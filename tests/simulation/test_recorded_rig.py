@@ -9,13 +9,13 @@ import torch
 
 from tests.recordings import bags, layouts
 from tests.recordings.drives import Drive
-from torchcover.data import RecordingSettings, Scan, open_recording, rig_document
+from torchcover.data import RecordingSettings, Scan, build_rig_document, open_recording
 from torchcover.files import BadFileError
 from torchcover.geometry import build_transform, convert_euler_to_rotation, invert, transform_points
 from torchcover.recordings.formats import argoverse2, kitti, nuscenes
-from torchcover.simulation import Lidar, Rig, builtin_names
+from torchcover.simulation import Lidar, Rig, list_builtin_names
 from torchcover.simulation.camera_sensor import MOUNT_T_CAMERA
-from torchcover.simulation.scan_estimate import estimate_scan, lasers_in_order
+from torchcover.simulation.scan_estimate import estimate_scan, infer_laser_indices
 
 
 def in_a_room(lidar, seed, dropout=0.2):
@@ -28,16 +28,16 @@ def in_a_room(lidar, seed, dropout=0.2):
     return (range_m * directions)[:, random.random(range_m.shape) > dropout].T
 
 
-@pytest.mark.parametrize("model", builtin_names("lidars"))
+@pytest.mark.parametrize("model", list_builtin_names("lidars"))
 def test_the_scan_of_every_model_is_found(model):
     lidar = Lidar.model_validate({"name": "a", "model": model, "columns": 240})
     found = estimate_scan([in_a_room(lidar, seed) for seed in range(2)])
-    np.testing.assert_allclose(found.elevations_deg, np.sort(lidar.rows_deg())[::-1], atol=1e-9)
+    np.testing.assert_allclose(found.elevations_deg, np.sort(lidar.compute_elevations_deg())[::-1], atol=1e-9)
     step_deg = lidar.horizontal_fov_deg / lidar.columns
     if lidar.horizontal_fov_deg < 360 and lidar.azimuth_offsets_deg is not None:  # rows that begin at other azimuths
-        assert found.horizontal_fov_deg / found.columns == pytest.approx(step_deg, rel=1e-3)
+        assert found.horizontal_fov_deg / found.num_columns == pytest.approx(step_deg, rel=1e-3)
         return
-    assert (found.columns, found.centre_deg) == (240, pytest.approx(0.0, abs=0.01))
+    assert (found.num_columns, found.center_azimuth_deg) == (240, pytest.approx(0.0, abs=0.01))
     assert found.horizontal_fov_deg == pytest.approx(lidar.horizontal_fov_deg, abs=1e-6)
 
 
@@ -52,7 +52,7 @@ def test_rows_that_shake_are_found_and_rows_that_blend_are_not():
 
     found = estimate_scan([shaken(0.15)])
     spacing_deg = 1.33
-    np.testing.assert_allclose(found.elevations_deg, lidar.rows_deg(), atol=spacing_deg / 10)
+    np.testing.assert_allclose(found.elevations_deg, lidar.compute_elevations_deg(), atol=spacing_deg / 10)
     assert estimate_scan([shaken(0.8)]) is None
     assert estimate_scan([points_m[:1]]) is None
     assert estimate_scan([]) is None
@@ -78,7 +78,7 @@ class Turning(Drive):
 
     def read_scan(self, sensor, index):
         sense, begin_deg, before = self.turn
-        directions = self.lidar.directions().reshape(3, -1)
+        directions = self.lidar.compute_directions().reshape(3, -1)
         azimuth_deg = np.rad2deg(np.arctan2(directions[1], directions[0]))
         offsets_s = 0.1 * (np.mod(sense * (azimuth_deg - begin_deg), 360.0) / 360.0 - before)
         world_T_cast = self.pose(0.1 * index + offsets_s) @ self.mount
@@ -109,24 +109,24 @@ class Turning(Drive):
     ],
 )
 def test_rows_of_a_vehicle_in_motion_are_those_of_its_rays(drive, said):
-    rig = rig_document(drive)
+    rig = build_rig_document(drive)
     (lidar,) = Rig.model_validate(rig).sensors
     assert re.search(said, rig["description"])
     assert "min_range_m" not in rig["sensors"][0]  # of the nearest return it would be blind to all that comes nearer
     true_deg = drive.lidar.rows_deg()
     assert len(lidar.rows_deg()) == len(true_deg)
     np.testing.assert_allclose(lidar.rows_deg(), np.sort(true_deg)[::-1], atol=0.05)
-    np.testing.assert_allclose(lidar.mount.matrix(), drive.mount, atol=1e-5)
+    np.testing.assert_allclose(lidar.mount.to_matrix(), drive.mount, atol=1e-5)
 
 
 def test_of_frames_seconds_apart_no_motion_is_undone_and_no_clock_is_blamed():
     drive = Turning(told=("rows",))
     drive.times_s = 100.0 * drive.times_s
-    said = rig_document(drive)["description"]
+    said = build_rig_document(drive)["description"]
     assert "motion within a turn not undone, for frames are 10 s apart (at most 0.25 s are needed" in said
     drive.told_of = ("rows", "offsets_s")
     with pytest.raises(ValueError, match=r"the poses before and after .* are 10 s apart; .* at most 1 s apart"):
-        rig_document(drive)
+        build_rig_document(drive)
 
 
 def test_clouds_stored_laser_by_laser_need_no_rows_that_can_be_told_apart():
@@ -137,11 +137,11 @@ def test_clouds_stored_laser_by_laser_need_no_rows_that_can_be_told_apart():
     points_m[:, 2] += np.where(laser < 32, 0.2, 0.1)
     turned = np.mod(np.arctan2(points_m[:, 1], points_m[:, 0]), 2 * np.pi)
     order = np.lexsort((turned, laser))
-    assert np.array_equal(lasers_in_order(points_m[order]), laser[order])
-    assert lasers_in_order(np.random.default_rng(0).permutation(points_m)) is None
-    found = estimate_scan([points_m[order]], [lasers_in_order(points_m[order])])
-    np.testing.assert_allclose(found.elevations_deg, np.sort(lidar.rows_deg())[::-1], atol=0.03)
-    assert found.origin_m == pytest.approx(0.15, abs=0.02)
+    assert np.array_equal(infer_laser_indices(points_m[order]), laser[order])
+    assert infer_laser_indices(np.random.default_rng(0).permutation(points_m)) is None
+    found = estimate_scan([points_m[order]], [infer_laser_indices(points_m[order])])
+    np.testing.assert_allclose(found.elevations_deg, np.sort(lidar.compute_elevations_deg())[::-1], atol=0.03)
+    assert found.origin_height_m == pytest.approx(0.15, abs=0.02)
 
 
 def test_a_field_of_view_has_its_middle_and_ranges():
@@ -149,8 +149,8 @@ def test_a_field_of_view_has_its_middle_and_ranges():
     turned = build_transform(convert_euler_to_rotation(170.0, 0.0, 0.0), np.zeros(3))
     points_m = transform_points(turned, in_a_room(lidar, 0, 0.0))
     found = estimate_scan([points_m])
-    assert (found.columns, found.horizontal_fov_deg) == (40, pytest.approx(80.0))
-    assert found.centre_deg == pytest.approx(170.0)
+    assert (found.num_columns, found.horizontal_fov_deg) == (40, pytest.approx(80.0))
+    assert found.center_azimuth_deg == pytest.approx(170.0)
     ranges_m = np.linalg.norm(points_m, axis=1)
     assert found.max_range_m == ranges_m.max()
 
@@ -298,16 +298,17 @@ def test_cameras_show_points_where_their_data_set_says(layout, raw, tmp_path):
     models = dict.fromkeys(recording.sensors, "velodyne_vlp16")
     if raw and layout in ("nuscenes", "kitti_object"):
         with pytest.raises(ValueError, match="leave out --raw-images"):
-            rig_document(recording, models=models, raw_images=True)
+            build_rig_document(recording, lidar_models=models, raw_images=True)
         return
-    rig = Rig.model_validate(rig_document(recording, models=models, raw_images=raw))
+    rig = Rig.model_validate(build_rig_document(recording, lidar_models=models, raw_images=raw))
     sensor = next(one for one in rig.sensors if one.name == name)
     assert (sensor.width, sensor.height) == ((1392, 512) if raw and layout == "kitti_raw" else size)
     ahead_m = (
-        sensor.mount.matrix() @ np.c_[np.random.default_rng(0).uniform([5, -2, -1], [30, 2, 1], (50, 3)), np.ones(50)].T
+        sensor.mount.to_matrix()
+        @ np.c_[np.random.default_rng(0).uniform([5, -2, -1], [30, 2, 1], (50, 3)), np.ones(50)].T
     )
     vehicle_m = ahead_m[:3].T
-    in_camera_m = transform_points(invert(sensor.mount.matrix() @ MOUNT_T_CAMERA), vehicle_m)
+    in_camera_m = transform_points(invert(sensor.mount.to_matrix() @ MOUNT_T_CAMERA), vehicle_m)
     found, shown = sensor.camera().project(torch.from_numpy(in_camera_m))
     assert shown.sum() > 30
     np.testing.assert_allclose(
@@ -319,31 +320,35 @@ def test_cameras_show_points_where_their_data_set_says(layout, raw, tmp_path):
 
 def test_lidars_are_where_calibrations_say(tmp_path):
     path, *_ = argoverse2_with_camera(Drive(steps=2), tmp_path)
-    rig = rig_document(open_recording(path), sensors=["down_lidar"], models={"down_lidar": "velodyne_vlp32c"})
+    rig = build_rig_document(
+        open_recording(path), sensor_names=["down_lidar"], lidar_models={"down_lidar": "velodyne_vlp32c"}
+    )
     lidar = rig["sensors"][0]
     assert lidar["mount"] == {"x_m": 0.011, "y_m": 0.0, "z_m": 1.83, "yaw_deg": 0.0, "pitch_deg": 0.0, "roll_deg": 0.0}
     assert lidar["model"] == "velodyne_vlp32c"
     drive = Drive(steps=3)
-    rig = rig_document(open_recording(bags.ros(drive, tmp_path)), models=dict.fromkeys(drive.sensors, "velodyne_vlp16"))
+    rig = build_rig_document(
+        open_recording(bags.ros(drive, tmp_path)), lidar_models=dict.fromkeys(drive.sensors, "velodyne_vlp16")
+    )
     for lidar in Rig.model_validate(rig).sensors:
-        np.testing.assert_allclose(lidar.mount.matrix(), drive.vehicle_T_sensor(lidar.name), atol=1e-5)
+        np.testing.assert_allclose(lidar.mount.to_matrix(), drive.vehicle_T_sensor(lidar.name), atol=1e-5)
     assert "transforms to base_link" in rig["description"]
 
 
 def test_what_no_rig_can_be_made_of(tmp_path):
     drive = Drive(steps=2)
     with pytest.raises(ValueError, match="no LiDAR roof, other; the recording has left, right"):
-        rig_document(drive, sensors=["roof", "left"], models={"other": "velodyne_vlp16"})
+        build_rig_document(drive, sensor_names=["roof", "left"], lidar_models={"other": "velodyne_vlp16"})
     with pytest.raises(ValueError, match=r"points of left do not lie in rows .* --lidar left=MODEL"):
-        rig_document(drive)
+        build_rig_document(drive)
     with pytest.raises(FileNotFoundError, match=r"neither a .yaml file nor one of the built-in lidars"):
-        rig_document(drive, models={"left": "velodyne"})
+        build_rig_document(drive, lidar_models={"left": "velodyne"})
     (tmp_path / "sensor").mkdir()
     (tmp_path / "sensor" / "a.xyz").write_text("1 2 3\n")
     with pytest.raises(ValueError, match="where sensor is mounted is not known"):
-        rig_document(open_recording(tmp_path), models={"sensor": "velodyne_vlp16"})
+        build_rig_document(open_recording(tmp_path), lidar_models={"sensor": "velodyne_vlp16"})
     with pytest.raises(FileNotFoundError, match=r"egovehicle_SE3_sensor.feather: no such file"):
-        rig_document(open_recording(layouts.argoverse2_log(drive, tmp_path / "av2")))
+        build_rig_document(open_recording(layouts.argoverse2_log(drive, tmp_path / "av2")))
 
 
 @pytest.mark.parametrize(
@@ -365,10 +370,10 @@ def test_calibrations_of_kitti_that_cannot_be(tmp_path, line, instead, told):
     assert line in file.read_text()
     file.write_text(file.read_text().replace(line, instead))
     with pytest.raises(ValueError, match=told) as error:
-        rig_document(open_recording(path), models={"velodyne": "velodyne_hdl64e"})
+        build_rig_document(open_recording(path), lidar_models={"velodyne": "velodyne_hdl64e"})
     assert str(file) in str(error.value)
     file.unlink()
-    rig = rig_document(open_recording(path), models={"velodyne": "velodyne_hdl64e"})
+    rig = build_rig_document(open_recording(path), lidar_models={"velodyne": "velodyne_hdl64e"})
     assert [sensor["name"] for sensor in rig["sensors"]] == ["velodyne"]
     assert "no cameras, for there is no calib_cam_to_cam.txt" in rig["description"]
 
@@ -380,9 +385,9 @@ def test_cameras_of_others_that_cannot_be(tmp_path):
     table = path / "calibration" / "egovehicle_SE3_sensor.feather"
     feather.write_feather(feather.read_table(table).slice(0, 2), str(table))
     with pytest.raises(BadFileError, match=r"egovehicle_SE3_sensor.feather has no down_lidar"):
-        rig_document(open_recording(path))
+        build_rig_document(open_recording(path))
     (tmp_path / "object").mkdir()
     path, *_ = kitti_object_with_camera(None, tmp_path / "object")
     (path / "image_2" / "000001.png").write_bytes(b"JFIF")
     with pytest.raises(BadFileError, match=r"000001.png: not a PNG image"):
-        rig_document(open_recording(path))
+        build_rig_document(open_recording(path))

@@ -18,7 +18,7 @@ def rectangle(x, y):
 
 
 def test_the_usual_table_has_the_papers_regions_and_the_near_field_of_the_vehicle():
-    asked = RegionsOfInterest().around(ROBOT_M)
+    asked = RegionsOfInterest().build_query_plan(ROBOT_M)
     assert [region.name for region in asked.regions] == ["20m", "80m", "160m", *SIDES]
     assert (asked.grid.x_m, asked.grid.y_m, asked.grid.cell_m, asked.bands_m) == (
         (-40.0, 160.0),
@@ -28,12 +28,12 @@ def test_the_usual_table_has_the_papers_regions_and_the_near_field_of_the_vehicl
     )
     # One area for all of the near field, and the grid last.
     assert asked.areas[3:] == (((-3.5, 3.5), (-3.4, 3.4)), (asked.grid.x_m, asked.grid.y_m))
-    assert [region.name for region in RegionsOfInterest().around().regions] == ["20m", "80m", "160m"]
+    assert [region.name for region in RegionsOfInterest().build_query_plan().regions] == ["20m", "80m", "160m"]
 
 
 @pytest.mark.parametrize("cell", [0.1, 0.25, 0.5])
 def test_the_near_field_is_all_that_is_within_its_reach_of_the_vehicle_and_nothing_twice(cell):
-    asked = RegionsOfInterest().around(ROBOT_M, cell)
+    asked = RegionsOfInterest().build_query_plan(ROBOT_M, cell)
     covered = sum(region.mask_cells(asked.grid).long() for region in asked.regions if region.name in SIDES)
     x, y = asked.grid.x_centers_m, asked.grid.y_centers_m[:, None]
     around = (x >= -3.5) & (x < 3.5) & (y >= -3.4) & (y < 3.4)
@@ -42,16 +42,20 @@ def test_the_near_field_is_all_that_is_within_its_reach_of_the_vehicle_and_nothi
 
 
 def test_what_the_grid_does_not_hold_is_not_in_the_usual_table():
-    small = RegionsOfInterest(grid={"x_m": (-5.0, 5.0), "y_m": (-5.0, 5.0), "cell_m": 0.5}).around(ROBOT_M)
+    small = RegionsOfInterest(grid={"x_m": (-5.0, 5.0), "y_m": (-5.0, 5.0), "cell_m": 0.5}).build_query_plan(ROBOT_M)
     assert [region.name for region in small.regions] == SIDES
-    assert [region.name for region in RegionsOfInterest().around(ROBOT_M, 8.0).regions] == ["20m", "80m", "160m"]
-    elsewhere = RegionsOfInterest(grid={"x_m": (50.0, 55.0), "y_m": (-5.0, 5.0)}).around(ROBOT_M)
+    assert [region.name for region in RegionsOfInterest().build_query_plan(ROBOT_M, 8.0).regions] == [
+        "20m",
+        "80m",
+        "160m",
+    ]
+    elsewhere = RegionsOfInterest(grid={"x_m": (50.0, 55.0), "y_m": (-5.0, 5.0)}).build_query_plan(ROBOT_M)
     assert elsewhere.regions == (Region("grid", (50.0, 55.0), (-5.0, 5.0)),)
     assert elsewhere.areas == (((50.0, 55.0), (-5.0, 5.0)),)
 
 
 def test_a_region_beyond_the_usual_grid_makes_it_larger_by_whole_cells():
-    asked = RegionsOfInterest(regions={"side": rectangle((-41.1, 0.0), (30.0, 55.0))}).around(ROBOT_M)
+    asked = RegionsOfInterest(regions={"side": rectangle((-41.1, 0.0), (30.0, 55.0))}).build_query_plan(ROBOT_M)
     assert (asked.grid.x_m, asked.grid.y_m) == ((-41.25, 160.0), (-40.0, 55.0))
     assert asked.areas == (((-41.1, 0.0), (30.0, 55.0)), (asked.grid.x_m, asked.grid.y_m))
 
@@ -59,19 +63,19 @@ def test_a_region_beyond_the_usual_grid_makes_it_larger_by_whole_cells():
 def test_a_region_beyond_a_grid_that_was_given_is_refused():
     given = {"x_m": (-5.0, 5.0), "y_m": (-5.0, 5.0)}
     with pytest.raises(ValueError, match="region 'side' spans x = 0 to 6 m, beyond the grid's -5 to 5 m; enlarge"):
-        RegionsOfInterest(regions={"side": rectangle((0.0, 6.0), (0.0, 1.0))}, grid=given).around(ROBOT_M)
+        RegionsOfInterest(regions={"side": rectangle((0.0, 6.0), (0.0, 1.0))}, grid=given).build_query_plan(ROBOT_M)
 
 
 def test_a_region_within_the_vehicle_is_warned_of():
     hidden = RegionsOfInterest(regions={"hold": rectangle((-0.4, 0.4), (-0.3, 0.3))})
     with pytest.warns(UserWarning, match="region 'hold' lies within the vehicle"):
-        hidden.around(ROBOT_M)
-    assert hidden.around().regions[0].name == "hold"  # of no vehicle nobody can say so
+        hidden.build_query_plan(ROBOT_M)
+    assert hidden.build_query_plan().regions[0].name == "hold"  # of no vehicle nobody can say so
 
 
 def test_a_region_between_the_centres_of_cells_is_refused():
     with pytest.raises(ValueError, match=r"region 'thin' holds no cell centre; use smaller cells than 0.25 m"):
-        RegionsOfInterest(regions={"thin": rectangle((0.0, 0.1), (0.0, 1.0))}).around(ROBOT_M)
+        RegionsOfInterest(regions={"thin": rectangle((0.0, 0.1), (0.0, 1.0))}).build_query_plan(ROBOT_M)
 
 
 def test_yaml_and_python_say_the_same(tmp_path):
@@ -91,7 +95,7 @@ def test_yaml_and_python_say_the_same(tmp_path):
         heights={"dog": (0.05, 0.5), "child": (0.1, 1.1)},
         grid={"x_m": (-10.0, 10.0), "y_m": (-10.0, 10.0), "cell_m": 0.1},
     )
-    asked = told.around(ROBOT_M)
+    asked = told.build_query_plan(ROBOT_M)
     assert asked.grid.heights == {"dog": (0.05, 0.5), "child": (0.1, 1.1)}
     assert asked.areas[1] == ((0.5, 3.5), (0.4, 3.4))
 
@@ -121,7 +125,7 @@ def test_what_asks_nothing_is_refused(tmp_path, content, message):
 def test_more_cells_than_there_is_memory_for_are_refused_in_one_line():
     given = {"x_m": (-1000.0, 1000.0), "y_m": (-1000.0, 1000.0), "cell_m": 0.1}
     with pytest.raises(ValueError, match="800,000,000 cells, over 100,000,000: use larger cells"):
-        RegionsOfInterest(grid=given).around()
+        RegionsOfInterest(grid=given).build_query_plan()
 
 
 def test_the_sides_are_named_by_their_reach():
@@ -140,22 +144,22 @@ def office(size_m=(14.0, 10.0), ego=None, **others):
 
 
 def test_a_room_is_what_stands_around_the_ego_in_its_frame_wherever_it_drives(tmp_path):
-    np.testing.assert_allclose(office().room_m(), [(-7, 7), (-5, 5)])
+    np.testing.assert_allclose(office().find_room_bounds_m(), [(-7, 7), (-5, 5)])
     turned = office(ego={"pose": {"x_m": -3.0, "yaw_deg": 90.0}})
-    np.testing.assert_allclose(turned.room_m(), [(-5, 5), (-10, 4)], atol=1e-9)
+    np.testing.assert_allclose(turned.find_room_bounds_m(), [(-5, 5), (-10, 4)], atol=1e-9)
     (tmp_path / "way.csv").write_text("t,x,y,z,roll,pitch,yaw\n0,-5,0,0,0,0,0\n2,5,1,0,0,0,0\n")
     driving = office(ego={"trajectory": tmp_path / "way.csv"}, duration_s=2.0)
-    np.testing.assert_allclose(driving.room_m(), [(-12, 12), (-6, 5)], atol=1e-9)
+    np.testing.assert_allclose(driving.find_room_bounds_m(), [(-12, 12), (-6, 5)], atol=1e-9)
 
 
 def test_what_is_no_room_is_none_and_what_is_smaller_than_the_vehicle_is_a_mistake():
-    assert office((100.0, 10.0)).room_m() is None
-    assert office(ego={"pose": {"x_m": 20.0}}).room_m() is None
-    assert Scenario.load("urban").room_m() is None
+    assert office((100.0, 10.0)).find_room_bounds_m() is None
+    assert office(ego={"pose": {"x_m": 20.0}}).find_room_bounds_m() is None
+    assert Scenario.load("urban").find_room_bounds_m() is None
     with pytest.raises(
         ValueError, match=r"'office': all that stands in it is 0.014 x 0.01 m, smaller than box; is the"
     ):
-        office((0.014, 0.010)).room_m()
+        office((0.014, 0.010)).find_room_bounds_m()
 
 
 @pytest.mark.parametrize(

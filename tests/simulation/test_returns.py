@@ -5,9 +5,9 @@ import pytest
 import yaml
 from pydantic import ValidationError
 
-from torchcover.simulation import Lidar, Material, PaperReference, Rig, Scenario, Simulator, builtin_names
-from torchcover.simulation.documents import explain
-from torchcover.simulation.returns import SURE, extinction_per_m, log_excess, return_probability
+from torchcover.simulation import Lidar, Material, PaperReference, Rig, Scenario, Simulator, list_builtin_names
+from torchcover.simulation.documents import format_validation_error
+from torchcover.simulation.returns import SURE, compute_extinction_per_m, compute_log_excess, compute_return_probability
 
 KEYS = {
     "name": "a",
@@ -24,16 +24,16 @@ KEYS = {
 def test_every_other_ray_returns_from_where_the_data_sheet_says(range_at_10_percent_m, reflectivity):
     """Four times as bright is twice as far."""
     range_m = range_at_10_percent_m * np.sqrt(reflectivity / 0.1)
-    excess = log_excess(range_m, 1.0, reflectivity, 1.0, range_at_10_percent_m)
-    assert return_probability(excess, 0.3) == pytest.approx(SURE / 2, abs=1e-15)
-    one_spread_nearer = log_excess(range_m * np.exp(-0.3), 1.0, reflectivity, 1.0, range_at_10_percent_m)
-    assert return_probability(one_spread_nearer, 0.3) / SURE == pytest.approx(0.8413447460685429)
+    excess = compute_log_excess(range_m, 1.0, reflectivity, 1.0, range_at_10_percent_m)
+    assert compute_return_probability(excess, 0.3) == pytest.approx(SURE / 2, abs=1e-15)
+    one_spread_nearer = compute_log_excess(range_m * np.exp(-0.3), 1.0, reflectivity, 1.0, range_at_10_percent_m)
+    assert compute_return_probability(one_spread_nearer, 0.3) / SURE == pytest.approx(0.8413447460685429)
 
 
 def test_lambert_on_a_road_falls_with_the_cube_of_the_range():
     """cos = h / R: where half the rays return is at (R10^2 h)^(1/3)."""
     range_m = (60.0**2 * 1.9) ** (1 / 3)
-    assert log_excess(range_m, 1.9 / range_m, 0.1, 1.0, 60.0) == pytest.approx(0.0, abs=1e-14)
+    assert compute_log_excess(range_m, 1.9 / range_m, 0.1, 1.0, 60.0) == pytest.approx(0.0, abs=1e-14)
 
 
 @pytest.mark.parametrize(
@@ -55,28 +55,28 @@ def test_whatever_is_worse_returns_less(worse):
         "incidence_exponent": 1.0,
         "range_at_10_percent_m": 70.0,
     }
-    assert log_excess(**(hit | worse)) < log_excess(**hit)
+    assert compute_log_excess(**(hit | worse)) < compute_log_excess(**hit)
 
 
 def test_what_reflects_nothing_never_returns_and_a_retroreflector_always_does():
-    excess = log_excess(50.0, 0.1, np.array([0.0, np.inf]), 1.0, 1.0)
-    assert return_probability(excess, 0.3).tolist() == [0.0, SURE]
+    excess = compute_log_excess(50.0, 0.1, np.array([0.0, np.inf]), 1.0, 1.0)
+    assert compute_return_probability(excess, 0.3).tolist() == [0.0, SURE]
 
 
 def test_a_contrast_of_five_percent_is_left_at_the_visibility():
-    assert np.exp(-extinction_per_m(80.0) * 80.0) == pytest.approx(0.05)
-    assert extinction_per_m(None) == 0.0
+    assert np.exp(-compute_extinction_per_m(80.0) * 80.0) == pytest.approx(0.05)
+    assert compute_extinction_per_m(None) == 0.0
 
 
 def test_each_builtin_material_is_called_as_its_file():
-    assert [Material.load(name).name for name in builtin_names("materials")] == builtin_names("materials")
+    assert [Material.load(name).name for name in list_builtin_names("materials")] == list_builtin_names("materials")
 
 
 def test_bad_materials_are_told():
     for reflectivity in (1.5, -0.1, True, "shiny", float("nan"), None):
         with pytest.raises(ValidationError) as refused:
             Material(name="snow", reflectivity=reflectivity)
-        assert explain(refused.value) == (
+        assert format_validation_error(refused.value) == (
             f"reflectivity: a share of light from 0 to 1, or `retroreflective`, is needed; got {reflectivity!r}"
         )
     with pytest.raises(FileNotFoundError, match="is 'brick' meant"):
@@ -121,22 +121,22 @@ def seen(weather=None, index=0, bodies=None, **keys):
     """Which rays of a LiDAR on a plain return at a step."""
     scenario = Scenario.model_validate(PLAIN | {"weather": weather or {}} | ({"bodies": bodies} if bodies else {}))
     rig = Rig.model_validate({"name": "rig", "sensors": [ROOF | keys]})
-    return Simulator(scenario, {"rig": rig}, PaperReference(rows=2, columns=2)).scans(index)["rig"][0]
+    return Simulator(scenario, {"rig": rig}, PaperReference(rows=2, columns=2)).simulate_scans(index)["rig"][0]
 
 
 def test_as_many_return_from_a_plain_as_the_law_says():
     every, returned = seen(range_at_10_percent_m=None), seen()
     road = Material.load("road")
     is_road = every.points[:, 2] < 1e-3
-    excess = log_excess(
+    excess = compute_log_excess(
         every.range_m.astype(float),
         2.0 / every.range_m,
-        road.share,
+        road.numeric_reflectivity,
         road.incidence_exponent,
         ROOF["range_at_10_percent_m"],
     )
-    expected = return_probability(excess, ROOF["spread"], road.spread)
-    there = np.isin(every.ray, returned.ray)
+    expected = compute_return_probability(excess, ROOF["spread"], road.log_reflectivity_std)
+    there = np.isin(every.ray_indices, returned.ray_indices)
     for low_m in range(15, 75, 15):
         some = is_road & (every.range_m > low_m) & (every.range_m < low_m + 15)
         error = np.sqrt((expected * (1 - expected))[some].sum()) / some.sum()
@@ -158,7 +158,7 @@ def test_as_many_return_from_a_plain_as_the_law_says():
 def test_no_ray_returns_because_something_is_worse(worse, keys):
     """The same random numbers: not one return more, and fewer in all."""
     clear, bad = seen(), seen(worse, **keys)
-    assert set(bad.ray.tolist()) < set(clear.ray.tolist())
+    assert set(bad.ray_indices.tolist()) < set(clear.ray_indices.tolist())
 
 
 def test_rows_have_their_own_factors():
@@ -174,11 +174,11 @@ def test_what_reflects_returns_from_farther():
 
     def of(material):
         ground = {"name": "plain", "shape": {"type": "plane", "size_m": [400.0, 400.0]}, "material": material}
-        return len(seen(bodies=[ground]).ray)
+        return len(seen(bodies=[ground]).ray_indices)
 
     assert of("glass") < of("tyre") < of("road") < of("lane_paint") < of("sign")
     assert of("sign") == pytest.approx(
-        SURE * len(seen(range_at_10_percent_m=None, bodies=PLAIN["bodies"][:1]).ray), rel=0.01
+        SURE * len(seen(range_at_10_percent_m=None, bodies=PLAIN["bodies"][:1]).ray_indices), rel=0.01
     )
 
 
@@ -190,7 +190,7 @@ def test_a_material_may_be_a_file_beside_the_scenario(tmp_path):
         ground = PLAIN["bodies"][0] | {"material": "own.yaml"}
         (tmp_path / "scenario.yaml").write_text(yaml.safe_dump(PLAIN | {"bodies": [ground]}))
         scenario = Scenario.load(tmp_path / "scenario.yaml")
-        of.append((len(seen(bodies=scenario.bodies).points), scenario.content()))
+        of.append((len(seen(bodies=scenario.bodies).points), scenario.collect_content()))
     assert of[0] == of[2]
     assert of[0][0] == 0 < of[1][0]
     assert of[0][1] != of[1][1]
@@ -209,7 +209,7 @@ def test_a_rig_is_written_with_the_material_of_a_housing_wherever_it_goes(tmp_pa
     monkeypatch.chdir(tmp_path / "there")
     again = Rig.load("again.yaml")
     assert again.sensors[0].housing[0].material == str(tmp_path / "own.yaml")
-    assert again.content() == Rig.load(tmp_path / "rig.yaml").content()
+    assert again.collect_content() == Rig.load(tmp_path / "rig.yaml").collect_content()
 
 
 def test_a_body_is_as_dark_all_over_and_always():
@@ -230,7 +230,7 @@ def test_a_body_is_as_dark_all_over_and_always():
     on_car = every.points[:, 2] > 0.01
     car = np.round(np.arctan2(every.points[:, 1], every.points[:, 0]) * 4).astype(int)
     for index in (0, 1):
-        there = np.isin(every.ray, seen(index=index, bodies=bodies).ray)
+        there = np.isin(every.ray_indices, seen(index=index, bodies=bodies).ray_indices)
         shares.append(np.array([there[on_car & (car == number)].mean() for number in np.unique(car[on_car])]))
     assert np.ptp(shares[0]) > 0.9
     assert np.abs(shares[0] - shares[1]).max() < 0.25
@@ -238,12 +238,16 @@ def test_a_body_is_as_dark_all_over_and_always():
 
 def test_an_ideal_rig_is_the_one_without_a_range_at_10_percent():
     rig = Rig.model_validate({"name": "rig", "sensors": [ROOF]})
-    ideal = rig.sensing("ideal")
-    assert (rig.sensor_model, ideal.sensor_model, ideal.sensing(None).sensor_model) == ("real", "ideal", "ideal")
+    ideal = rig.apply_sensor_model("ideal")
+    assert (rig.sensor_model, ideal.sensor_model, ideal.apply_sensor_model(None).sensor_model) == (
+        "real",
+        "ideal",
+        "ideal",
+    )
     assert not rig.sensors[0].is_exact
     assert ideal.sensors[0].is_exact
     with pytest.raises(ValueError, match="no LiDAR of the rig 'rig' has a range_at_10_percent_m"):
-        ideal.sensing("real")
+        ideal.apply_sensor_model("real")
 
 
 @pytest.mark.parametrize(
@@ -264,6 +268,6 @@ def test_bad_weather_and_materials_of_a_scenario_are_told(given, told, tmp_path)
 def test_cameras_see_as_far_as_people_and_radars_through_fog():
     foggy = Scenario.model_validate(PLAIN | {"weather": {"visibility_m": 50.0}})
     camera, radar = Rig.load("three_cameras").sensors[0], Rig.load("nuscenes_radars").sensors[0]
-    assert foggy.reach_m(camera) == 50.0
-    assert foggy.reach_m(radar) == radar.max_range_m
-    assert foggy.reach_m(Rig.load("kitti").sensors[0]) == Rig.load("kitti").sensors[0].max_range_m
+    assert foggy.compute_max_range_m(camera) == 50.0
+    assert foggy.compute_max_range_m(radar) == radar.max_range_m
+    assert foggy.compute_max_range_m(Rig.load("kitti").sensors[0]) == Rig.load("kitti").sensors[0].max_range_m

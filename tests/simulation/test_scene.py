@@ -6,19 +6,21 @@ import pytest
 from torchcover.geometry import build_transform, convert_euler_to_rotation
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation import Pose
-from torchcover.simulation.bodies import in_vehicle_frame
-from torchcover.simulation.rays import into_tiles, unit_directions
-from torchcover.simulation.scene import Scene
+from torchcover.simulation.bodies import move_to_vehicle_frame
+from torchcover.simulation.rays import compute_unit_directions, split_into_tiles
+from torchcover.simulation.scene import SceneGeometry
 from torchcover.simulation.shapes import Box, Plane
-from torchcover.simulation.world import Actor, World
+from torchcover.simulation.world import Actor, Scene
 
-SPHERE = into_tiles(unit_directions(np.linspace(-89, 89, 150)[:, None], np.linspace(-179, 179, 300)[None]))
-ABOVE = Pose(z_m=1.5).matrix()
+SPHERE = split_into_tiles(
+    compute_unit_directions(np.linspace(-89, 89, 150)[:, None], np.linspace(-179, 179, 300)[None])
+)
+ABOVE = Pose(z_m=1.5).to_matrix()
 UTM = np.array([513_248.37, 5_403_655.81, 312.5])
 
 
 def box(*size_m):
-    return in_vehicle_frame(Box(type="box", size_m=size_m).mesh())
+    return move_to_vehicle_frame(Box(type="box", size_m=size_m).build_mesh())
 
 
 def world(origin_m=(0, 0, 0), yaw_deg=0.0, moving=True, ego_moves=False):
@@ -30,16 +32,16 @@ def world(origin_m=(0, 0, 0), yaw_deg=0.0, moving=True, ego_moves=False):
         return Trajectory.from_arrays([0.0, 10.0], ends @ place[:3, :3].T + place[:3, 3], [[yaw_deg, 0, 0]] * 2)
 
     static = (
-        box(1, 20, 4).moved(place @ Pose(x_m=10).matrix()),
-        Plane(type="plane", size_m=(300, 300)).mesh().moved(place),
+        box(1, 20, 4).transform(place @ Pose(x_m=10).to_matrix()),
+        Plane(type="plane", size_m=(300, 300)).build_mesh().transform(place),
     )
     ego = Actor("ego", "ego", box(4, 2, 1), along((0, 0, 0), (10 * ego_moves, 0, 0)))
     car = Actor("car", "car", box(3, 1, 1), along((0, 6, 0), (20 * moving, 0, 0)))
-    return World(static, ego, (car,), time_step_s=1.0, duration_s=10.0)
+    return Scene(static, ego, (car,), time_step_s=1.0, duration_s=10.0)
 
 
 def scan(made, step=0, pose=ABOVE, **options):
-    return Scene(made).at(step).scan(pose, SPHERE, **options)
+    return SceneGeometry(made).get_snapshot(step).scan(pose, SPHERE, **options)
 
 
 def as_set(points):
@@ -58,7 +60,7 @@ def test_the_ego_occludes_and_its_points_are_left_out():
         edge = np.maximum(np.abs(directions[0]) / 2, np.abs(directions[1]))
         onto_the_roof = (directions[2] < 0) & (edge * 0.5 < -directions[2])
     assert seen.self_hits == pytest.approx(onto_the_roof.sum(), abs=2)
-    assert seen.rays == directions.shape[1]
+    assert seen.num_rays == directions.shape[1]
 
 
 def test_a_moving_ego_sees_what_a_resting_one_would_see_there():
@@ -89,16 +91,18 @@ def test_the_same_world_far_out_gives_the_same_points(ego_moves):
 def test_an_actor_in_the_ego_is_an_error_that_names_actor_and_time():
     made = world(ego_moves=True)
     crossing = Trajectory.from_arrays([0.0, 10.0], [[5, -25, 0], [5, 25, 0]], [[90, 0, 0]] * 2)
-    scene = Scene(World(made.static, made.ego, (Actor("truck", "truck", box(8, 2, 3), crossing),), 1.0, 10.0))
-    scene.at(3)
+    scene = SceneGeometry(
+        Scene(made.static_meshes, made.ego, (Actor("truck", "truck", box(8, 2, 3), crossing),), 1.0, 10.0)
+    )
+    scene.get_snapshot(3)
     with pytest.raises(ValueError, match=r"actor 'truck' overlaps the ego at t = 5 s"):
-        scene.at(5)
+        scene.get_snapshot(5)
 
 
 @pytest.mark.parametrize("moving", [False, True])
 def test_a_place_in_the_ground_a_wall_or_a_car_is_buried(moving):
-    instant = Scene(world(moving=moving)).at(0)
+    instant = SceneGeometry(world(moving=moving)).get_snapshot(0)
     for buried in ([3, 3, -0.2], [10, 0, 1], [0, 6, 0.5]):
-        assert instant.buried(np.array(buried, dtype=float))
+        assert instant.is_occupied(np.array(buried, dtype=float))
     for free in ([3, 3, 0.2], [9.3, 0, 1], [0, 5.3, 0.5], [0, 0, 1.2]):
-        assert not instant.buried(np.array(free, dtype=float))
+        assert not instant.is_occupied(np.array(free, dtype=float))

@@ -15,7 +15,7 @@ from torchcover.simulation.scene_cache import SceneCache, encode_scene, read_sce
 from torchcover.simulation.shapes import Box
 from torchcover.simulation.traffic import Highway, Parking, Urban
 from torchcover.simulation.traffic.fleet import load_bodies
-from torchcover.simulation.world import Actor, World
+from torchcover.simulation.world import Actor, Scene
 
 EGO = {"shape": {"type": "box", "size_m": [4, 2, 1.5]}}
 LOT = {"type": "parking", "duration_s": 1.0, "time_step_s": 0.2, "crossings": 0, "parked_share": 0.1}
@@ -31,7 +31,7 @@ def disk(monkeypatch, tmp_path):
     monkeypatch.setenv("TORCHCOVER_CACHE_GB", "1")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
 
-    built, world = [], Scenario.world
+    built, world = [], Scenario.build_scene
 
     def counted(self, seed=0, episode=0, ego=None):
         built.append(episode)
@@ -64,7 +64,7 @@ def same(one, other):
 def test_a_world_from_disk_is_the_one_that_was_built_and_shares_its_bodies(disk, traffic):
     files, built = disk
     scenario = Scenario(name="drawn", traffic=traffic)
-    worlds, ego = SceneCache(scenario, 5), scenario.ego_mesh()
+    worlds, ego = SceneCache(scenario, 5), scenario.build_ego_mesh()
     first, again = worlds.build(2, ego), worlds.build(2, ego)
     assert built == [2]
     assert len(files()) == 1
@@ -76,9 +76,9 @@ def test_a_world_from_disk_is_the_one_that_was_built_and_shares_its_bodies(disk,
 
 
 def test_actors_that_share_a_mesh_share_it_again(tmp_path):
-    mesh, way = Box(type="box", size_m=(4, 2, 1.5)).mesh(), Trajectory.create_static([9.0, 0.0, 0.0])
+    mesh, way = Box(type="box", size_m=(4, 2, 1.5)).build_mesh(), Trajectory.create_static([9.0, 0.0, 0.0])
     ego, *actors = (Actor(name, "car", mesh, way) for name in ("ego", "a", "b"))
-    world = World((), ego, tuple(actors))
+    world = Scene((), ego, tuple(actors))
     np.savez(tmp_path / "a.npz", **encode_scene("a", world, {}))
     again = read_scene(tmp_path / "a.npz", {})
     assert same(world, again)
@@ -87,7 +87,7 @@ def test_actors_that_share_a_mesh_share_it_again(tmp_path):
 
 def test_frames_are_the_same_to_the_bit(disk):
     rigs, reference = {"roof": Rig.load("front_roof_128")}, PaperReference(64, 64)
-    seen = [Simulator(lot(), rigs, reference, no_cache=no_cache).step(8) for no_cache in (True, False, False)]
+    seen = [Simulator(lot(), rigs, reference, no_cache=no_cache).simulate_frame(8) for no_cache in (True, False, False)]
     assert disk[1] == [1, 1]
     for other in seen[1:]:
         np.testing.assert_array_equal(other.clouds["roof"], seen[0].clouds["roof"])
@@ -296,7 +296,7 @@ def test_without_a_disk_the_run_goes_on_with_one_remark(disk, monkeypatch, tmp_p
     def run():
         worlds = SceneCache(lot(), 0)
         for number in (0, 1, 0):
-            worlds.build(number, lot().ego_mesh())
+            worlds.build(number, lot().build_ego_mesh())
         world_of(lot())
 
     with pytest.warns(UserWarning, match=r"scenes are not cached .* --set no_cache=true") as said:
@@ -324,7 +324,7 @@ def test_two_runs_write_the_same_world(disk, monkeypatch):
 
 
 def test_a_world_with_doubts_is_not_kept_but_doubted_each_time(disk, monkeypatch):
-    world = Scenario.world
+    world = Scenario.build_scene
 
     def doubtful(self, *args):
         warnings.warn("three lorries left out", stacklevel=2)

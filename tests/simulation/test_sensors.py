@@ -27,13 +27,15 @@ def angles(directions):
 
 
 def test_rows_span_the_vertical_field_of_view_and_columns_the_middles_of_equal_sectors():
-    elevation, azimuth = angles(lidar().directions())
+    elevation, azimuth = angles(lidar().compute_directions())
     np.testing.assert_allclose(elevation.reshape(5, 6)[:, 0], [-20, -12.5, -5, 2.5, 10], atol=1e-12)
     np.testing.assert_allclose(azimuth.reshape(5, 6)[2], [-37.5, -22.5, -7.5, 7.5, 22.5, 37.5], atol=1e-12)
 
 
 def test_a_full_turn_has_no_ray_twice():
-    _, azimuth = angles(lidar(horizontal_fov_deg=360, columns=8, channels=1, vertical_fov_deg=(0, 0)).directions())
+    _, azimuth = angles(
+        lidar(horizontal_fov_deg=360, columns=8, channels=1, vertical_fov_deg=(0, 0)).compute_directions()
+    )
     np.testing.assert_allclose(np.diff(np.sort(azimuth)), 45.0, atol=1e-12)
 
 
@@ -41,13 +43,13 @@ def test_a_table_of_rows_with_offsets_is_taken_as_it_is():
     table = lidar(
         channels=None, vertical_fov_deg=None, elevations_deg=(5, -3, 1), azimuth_offsets_deg=(0, 2, -4), columns=1
     )
-    elevation, azimuth = angles(table.directions())
+    elevation, azimuth = angles(table.compute_directions())
     np.testing.assert_allclose(elevation, [5, -3, 1], atol=1e-12)
     np.testing.assert_allclose(azimuth, [0, 2, -4], atol=1e-12)
 
 
 def test_the_reference_sensor_covers_the_lower_hemisphere_evenly_in_angle():
-    elevation, azimuth = angles(PaperReference(rows=91, columns=36).directions())
+    elevation, azimuth = angles(PaperReference(rows=91, columns=36).compute_directions())
     np.testing.assert_allclose(elevation.reshape(91, 36)[:, 3], np.arange(0, -91, -1), atol=1e-6)
     np.testing.assert_allclose(np.sort(azimuth.reshape(91, 36)[0] % 360), np.arange(0, 360, 10), atol=1e-12)
 
@@ -60,7 +62,7 @@ def test_the_default_is_the_papers():
 def poses(count):
     sensor = PaperReference(rows=1, columns=1)
     generator = np.random.default_rng(7)
-    return np.stack([sensor.vehicle_T_reference(EGO, generator) for _ in range(count)])
+    return np.stack([sensor.sample_pose(EGO, generator) for _ in range(count)])
 
 
 def test_positions_are_uniform_in_the_shell_beside_and_above_the_ego():

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from torchcover.simulation import Rig, SimulatedFrames, bodies, builtin_names
-from torchcover.simulation.bodies import Body, Vehicle, VehicleShape, mover_mesh
+from torchcover.simulation import Rig, SimulatedFrames, bodies, list_builtin_names
+from torchcover.simulation.bodies import Body, Vehicle, VehicleShape, build_actor_mesh
 from torchcover.simulation.documents import Pose
-from torchcover.simulation.scenario import Mover
+from torchcover.simulation.scenario import ActorDescription
 from torchcover.simulation.shapes import Box, Cylinder, Ellipsoid, Frustum, MeshFile
 
 TETRAHEDRON = """ply
@@ -68,7 +68,7 @@ def test_solids_are_closed_face_outwards_and_have_their_volume(shape, volume):
 
 
 def test_an_ellipsoid_has_its_size_and_its_corners_lie_on_the_surface():
-    mesh = Ellipsoid(type="ellipsoid", size_m=(0.2, 0.3, 0.5)).mesh()
+    mesh = Ellipsoid(type="ellipsoid", size_m=(0.2, 0.3, 0.5)).build_mesh()
     np.testing.assert_allclose(mesh.vertices_m.min(0), [-0.1, -0.15, 0.0], atol=1e-15)
     np.testing.assert_allclose(mesh.vertices_m.max(0), [0.1, 0.15, 0.5], atol=1e-15)
     on_sphere = (mesh.vertices_m - [0, 0, 0.25]) / [0.1, 0.15, 0.25]
@@ -88,7 +88,7 @@ def test_unusable_mesh_files_are_named(tmp_path, content, message):
     path = tmp_path / "bad.ply"
     path.write_text(content)
     with pytest.raises(ValueError, match=rf"bad\.ply: .*{message}"):
-        MeshFile(type="mesh", path=path).mesh()
+        MeshFile(type="mesh", path=path).build_mesh()
 
 
 def ply_of(mesh, faces=slice(None)):
@@ -114,38 +114,38 @@ CAR = Box(type="box", size_m=(4.9, 1.94, 1.63))
 def test_closed_meshes_give_no_warning_however_they_are_written(tmp_path, shape):
     mesh = shape.mesh()
     # Warnings are errors here: what is read without one has all its faces.
-    assert len(mesh_file(tmp_path, ply_of(mesh)).mesh().faces) == len(mesh.faces)
+    assert len(mesh_file(tmp_path, ply_of(mesh)).build_mesh().faces) == len(mesh.faces)
     # Each face with corners of its own, as STL has it; then with half of the faces flipped.
     apart = mesh._replace(
         vertices_m=mesh.vertices_m[mesh.faces.ravel()], faces=np.arange(mesh.faces.size).reshape(-1, 3)
     )
-    assert len(mesh_file(tmp_path, ply_of(apart)).mesh().faces) == len(mesh.faces)
+    assert len(mesh_file(tmp_path, ply_of(apart)).build_mesh().faces) == len(mesh.faces)
     flipped = mesh.faces.copy()
     flipped[::2] = flipped[::2, ::-1]
-    mesh_file(tmp_path, ply_of(mesh._replace(faces=flipped))).mesh()
+    mesh_file(tmp_path, ply_of(mesh._replace(faces=flipped))).build_mesh()
     # A face without area is no hole.
-    mesh_file(tmp_path, ply_of(mesh._replace(faces=np.vstack([mesh.faces, [[0, 0, 1]]])))).mesh()
+    mesh_file(tmp_path, ply_of(mesh._replace(faces=np.vstack([mesh.faces, [[0, 0, 1]]])))).build_mesh()
 
 
 def in_millimetres(size_m):
-    return ply_of(Box(type="box", size_m=tuple(1000 * length for length in size_m)).mesh())
+    return ply_of(Box(type="box", size_m=tuple(1000 * length for length in size_m)).build_mesh())
 
 
 @pytest.mark.parametrize("unit", [1000.0, 100.0, 1 / 0.0254, 84 / 4.9])
 def test_an_ego_or_actor_in_another_unit_is_named_with_the_remedy(tmp_path, unit):
-    shape = mesh_file(tmp_path, ply_of(CAR.mesh()), metres_per_unit=unit)
-    with pytest.warns(UserWarning, match=r"ego: its body is .* far too large for .*; .*`metres_per_unit: 0\.001`"):
-        Mover(shape=shape).actor("ego", "ego")
+    shape = mesh_file(tmp_path, ply_of(CAR.build_mesh()), meters_per_unit=unit)
+    with pytest.warns(UserWarning, match=r"ego: its body is .* far too large for .*; .*`meters_per_unit: 0\.001`"):
+        ActorDescription(shape=shape).build_actor("ego", "ego")
 
 
 def test_a_body_in_millimetres_is_named_though_scenery_may_be_large(tmp_path):
     shape = mesh_file(tmp_path, in_millimetres((4.9, 1.94, 1.63)))
     with pytest.warns(UserWarning, match=r"body 'parked car': its body is 4,900 x 1,940 x 1,630 m"):
-        Body(name="parked car", shape=shape).meshes()
+        Body(name="parked car", shape=shape).build_meshes()
     # With the remedy there is nothing to say; nor of a city of 5 km, nor of a train.
-    Body(name="parked car", shape=shape.model_copy(update={"metres_per_unit": 0.001})).meshes()
-    Body(name="city", shape=Box(type="box", size_m=(5000, 5000, 400))).meshes()
-    Mover(shape=Box(type="box", size_m=(75, 2.6, 3.6))).actor("tram", "tram")
+    Body(name="parked car", shape=shape.model_copy(update={"meters_per_unit": 0.001})).build_meshes()
+    Body(name="city", shape=Box(type="box", size_m=(5000, 5000, 400))).build_meshes()
+    ActorDescription(shape=Box(type="box", size_m=(75, 2.6, 3.6))).build_actor("tram", "tram")
 
 
 @pytest.mark.parametrize("category", ["ego", "car", "vehicle.truck", "LARGE_VEHICLE"])
@@ -155,12 +155,12 @@ def test_a_body_in_millimetres_is_named_though_scenery_may_be_large(tmp_path):
         ((25.3, 2.55, 4.0), "a: its body is 25.3 x 2.55 x 4 m, far too large for a vehicle on a road"),
         ((1.94, 4.9, 1.63), r"a: .* wider than long; .* x axis points forward .*{yaw_deg: -90}"),
         ((1.94, 1.63, 4.9), r"a: .* higher than long; .* z up: .*{yaw_deg: 90, roll_deg: 90}.*glTF"),
-        ((0.049, 0.0194, 0.0163), r"a: its body is 0.049 x 0.0194 x 0.0163 m, too small .*metres_per_unit"),
+        ((0.049, 0.0194, 0.0163), r"a: its body is 0.049 x 0.0194 x 0.0163 m, too small .*meters_per_unit"),
     ],
 )
 def test_a_vehicle_as_none_looks_is_named_with_the_remedy(category, size_m, message):
     with pytest.warns(UserWarning, match=message):
-        Mover(shape=Box(type="box", size_m=size_m)).actor("a", category)
+        ActorDescription(shape=Box(type="box", size_m=size_m)).build_actor("a", category)
 
 
 @pytest.mark.parametrize(
@@ -174,7 +174,7 @@ def test_a_vehicle_as_none_looks_is_named_with_the_remedy(category, size_m, mess
 )
 def test_the_turns_that_are_proposed_lead_to_x_forward_and_z_up(pose, forward, up):
     assert str(pose).replace("'", "") in bodies.WIDE + bodies.HIGH
-    turned = Pose(**pose).matrix()[:3, :3] @ np.array([forward, up]).T
+    turned = Pose(**pose).to_matrix()[:3, :3] @ np.array([forward, up]).T
     np.testing.assert_allclose(turned.T, [[1, 0, 0], [0, 0, 1]], atol=1e-12)
 
 
@@ -192,12 +192,12 @@ def test_the_turns_that_are_proposed_lead_to_x_forward_and_z_up(pose, forward, u
     ],
 )
 def test_what_is_real_gives_no_warning(category, size_m):
-    Mover(shape=Box(type="box", size_m=size_m)).actor("a", category)
+    ActorDescription(shape=Box(type="box", size_m=size_m)).build_actor("a", category)
 
 
-@pytest.mark.parametrize("name", builtin_names("vehicles"))
+@pytest.mark.parametrize("name", list_builtin_names("vehicles"))
 def test_no_built_in_vehicle_gives_a_warning(name):
-    Mover(shape=VehicleShape(type="vehicle", vehicle=name)).actor("ego", "ego")
+    ActorDescription(shape=VehicleShape(type="vehicle", vehicle=name)).build_actor("ego", "ego")
 
 
 PART = "{{name: {0}, shape: {{type: box, size_m: {1}}}, poses: [{2}]}}"
@@ -214,11 +214,11 @@ def test_a_vehicle_has_the_parts_and_mount_regions_of_the_one_that_it_extends(tm
     assert extended.parts[:-1] == suv.parts
     assert extended.parts[-1].name == "box"
     assert extended.mount_regions == suv.mount_regions
-    assert np.ptp(extended.mesh().vertices_m, axis=0)[2] == pytest.approx(2.1)
+    assert np.ptp(extended.build_mesh().vertices_m, axis=0)[2] == pytest.approx(2.1)
     cart = vehicle_of(tmp_path, "cart", PART.format("body", "[2, 1, 1]", "{}"))
     pulled = vehicle_of(tmp_path, "pulled", PART.format("bar", "[0.5, 0.1, 0.1]", "{x_m: 1.25}"), extends=cart.name)
     with pytest.warns(UserWarning, match=r"moves the middle of its bounding box.* by x \+0.25, y \+0.00 m"):
-        assert np.ptp(Vehicle.load(pulled).mesh().vertices_m, axis=0)[0] == 2.5
+        assert np.ptp(Vehicle.load(pulled).build_mesh().vertices_m, axis=0)[0] == 2.5
     for name, base, told in (
         ("a", "pulled.yaml", "extends 'cart.yaml' itself"),
         ("b", "b.yaml", "extends 'b.yaml' itself"),
@@ -234,8 +234,8 @@ def test_what_a_rig_carries_hides_from_its_sensors_as_a_part_of_the_vehicle_does
     pose, shape = {"x_m": 1.0, "z_m": 1.5}, {"type": "box", "size_m": [0.1, 1.0, 0.3]}
     loaded = Rig.model_validate({**plain, "bodies": [{"name": "box", "shape": shape, "poses": [pose]}]})
     extended = vehicle_of(tmp_path, "suv_box", box, extends="suv")
-    both = SimulatedFrames("courtyard", rigs={"plain": Rig.load("front_roof_32"), "loaded": loaded}, steps=1)
-    other = SimulatedFrames("courtyard", "front_roof_32", steps=1, vehicle=extended)[0]
+    both = SimulatedFrames("courtyard", rigs={"plain": Rig.load("front_roof_32"), "loaded": loaded}, num_frames=1)
+    other = SimulatedFrames("courtyard", "front_roof_32", num_frames=1, vehicle=extended)[0]
     np.testing.assert_array_equal(both[0].clouds["loaded"], other.sensor)
     assert len(both[0].clouds["plain"]) - len(other.sensor) > 500
     assert both[0].counts["sensor_self_hits"] > 2 * 3380  # those of the vehicle, twice
@@ -245,4 +245,4 @@ def test_what_a_rig_carries_hides_from_its_sensors_as_a_part_of_the_vehicle_does
 def test_an_actor_that_floats_above_its_ground_is_put_down_with_a_warning(tmp_path):
     floats = vehicle_of(tmp_path, "floats", PART.format("body", "[2, 1, 1]", "{z_m: 0.2}"))
     with pytest.warns(UserWarning, match=r"all parts of floats.yaml are 0.2 m or more above z = 0"):
-        mover_mesh("actor", VehicleShape(type="vehicle", vehicle=str(floats)), "cart")
+        build_actor_mesh("actor", VehicleShape(type="vehicle", vehicle=str(floats)), "cart")

@@ -7,26 +7,26 @@ import pytest
 
 from torchcover.geometry import invert
 from torchcover.geometry.trajectory import Trajectory
-from torchcover.simulation import Draws, Lidar, Pose
-from torchcover.simulation.bodies import Body, in_vehicle_frame
-from torchcover.simulation.instant import Instant
-from torchcover.simulation.rays import into_tiles
-from torchcover.simulation.scene import Scene
+from torchcover.simulation import Lidar, Pose, SensorNoise
+from torchcover.simulation.bodies import Body, move_to_vehicle_frame
+from torchcover.simulation.instant import SceneSnapshot
+from torchcover.simulation.rays import split_into_tiles
+from torchcover.simulation.scene import SceneGeometry
 from torchcover.simulation.shapes import Box, Cylinder, Plane
 from torchcover.simulation.sight import MountedSensor
-from torchcover.simulation.world import Actor, World
+from torchcover.simulation.world import Actor, Scene
 
 UTM = np.array([513_248.37, 5_403_655.81, 312.5])
 LIDAR = Lidar(
     name="roof", mount=Pose(x_m=-0.3, z_m=1.5, yaw_deg=10), channels=30, vertical_fov_deg=(-80, 20),
     horizontal_fov_deg=360, columns=120, max_range_m=40,
 )  # fmt: skip
-TILES = into_tiles(LIDAR.directions())
-EXACT = Draws(None)
+TILES = split_into_tiles(LIDAR.compute_directions())
+EXACT = SensorNoise(None)
 
 
 def box(*size_m):
-    return in_vehicle_frame(Box(type="box", size_m=size_m).mesh())
+    return move_to_vehicle_frame(Box(type="box", size_m=size_m).build_mesh())
 
 
 def driving(start, way, yaw_deg=0.0):
@@ -37,31 +37,31 @@ def driving(start, way, yaw_deg=0.0):
 def world(ego_moves=True, actor_moves=True, origin_m=(0.0, 0.0, 0.0)):
     """An ego at up to 1 m/s under a bar that hangs 0.1 m above its roof, and a car beside it."""
     origin_m = np.array(origin_m)
-    bar = box(0.4, 6, 0.1).moved(Pose(x_m=4.0, z_m=1.1).matrix())
-    static = [bar, Plane(type="plane", size_m=(200, 200)).mesh()]
+    bar = box(0.4, 6, 0.1).transform(Pose(x_m=4.0, z_m=1.1).to_matrix())
+    static = [bar, Plane(type="plane", size_m=(200, 200)).build_mesh()]
     for k, mesh in enumerate(static):
         static[k] = mesh._replace(vertices_m=mesh.vertices_m + origin_m)
     ego = Actor("ego", "ego", box(4, 2, 1), driving(origin_m, (10.0 * ego_moves, 0, 0)))
     car = Actor("car", "car", box(3, 1, 1), driving(np.add(origin_m, [0, 5, 0]), (20.0 * actor_moves, 0, 0)))
-    return World(tuple(static), ego, (car,), time_step_s=1.0, duration_s=10.0)
+    return Scene(tuple(static), ego, (car,), time_step_s=1.0, duration_s=10.0)
 
 
 def afresh(instant):
-    return instant.scan(LIDAR.mount.matrix(), TILES, max_range_m=40)
+    return instant.scan(LIDAR.mount.to_matrix(), TILES, max_range_m=40)
 
 
 @pytest.mark.parametrize("origin_m", [(0.0, 0.0, 0.0), UTM])
 @pytest.mark.parametrize("actor_moves", [False, True])
 @pytest.mark.parametrize("ego_moves", [False, True])
 def test_every_step_is_that_of_a_scan_afresh(ego_moves, actor_moves, origin_m):
-    scene = Scene(world(ego_moves, actor_moves, origin_m))
+    scene = SceneGeometry(world(ego_moves, actor_moves, origin_m))
     mounted, self_hits = MountedSensor(LIDAR, scene, LIDAR.max_range_m), []
     for step in (0, 3, 4, 5, 9):
-        instant = scene.at(step, within_m=40.0)
+        instant = scene.get_snapshot(step, max_distance_m=40.0)
         seen, expected = mounted.scan(instant, EXACT), afresh(instant)
         np.testing.assert_array_equal(seen.points.view(np.int32), expected.points.view(np.int32))
-        np.testing.assert_array_equal(seen.ray, expected.ray)
-        assert (seen.rays, seen.self_hits) == (expected.rays, expected.self_hits)
+        np.testing.assert_array_equal(seen.ray_indices, expected.ray_indices)
+        assert (seen.num_rays, seen.self_hits) == (expected.num_rays, expected.self_hits)
         self_hits.append(seen.self_hits)
     # The bar comes between the sensor and the ego's body while the ego passes below it.
     assert self_hits[0] > 500
@@ -70,29 +70,32 @@ def test_every_step_is_that_of_a_scan_afresh(ego_moves, actor_moves, origin_m):
 
 @pytest.mark.parametrize("moves", [False, True])
 def test_hits_that_are_too_close_give_no_points_and_hide_what_lies_behind(moves):
-    scene = Scene(world(moves, moves))
-    instant, exact = scene.at(3), MountedSensor(LIDAR, scene, LIDAR.max_range_m).scan(scene.at(3), EXACT)
+    scene = SceneGeometry(world(moves, moves))
+    instant, exact = (
+        scene.get_snapshot(3),
+        MountedSensor(LIDAR, scene, LIDAR.max_range_m).scan(scene.get_snapshot(3), EXACT),
+    )
     mounted = MountedSensor(LIDAR.model_copy(update={"min_range_m": 4.0}), scene, LIDAR.max_range_m)
     seen, again = mounted.scan(instant, EXACT), mounted.scan(instant, EXACT)
     far = exact.range_m >= 4.0
     assert 0 < far.sum() < len(far) - 20
     for one in (seen, again):
         np.testing.assert_array_equal(one.points, exact.points[far])
-        np.testing.assert_array_equal(one.ray, exact.ray[far])
+        np.testing.assert_array_equal(one.ray_indices, exact.ray_indices[far])
         np.testing.assert_array_equal(one.range_m, exact.range_m[far])
-    ways_m = np.linalg.norm(seen.points - LIDAR.mount.matrix()[:3, 3], axis=1)
+    ways_m = np.linalg.norm(seen.points - LIDAR.mount.to_matrix()[:3, 3], axis=1)
     np.testing.assert_allclose(seen.range_m, ways_m, rtol=1e-5)
 
 
 def test_a_scan_is_made_again_only_where_something_moves(monkeypatch):
-    scans, original = [], Instant.scan
-    monkeypatch.setattr(Instant, "scan", lambda *args, **options: scans.append(1) or original(*args, **options))
+    scans, original = [], SceneSnapshot.scan
+    monkeypatch.setattr(SceneSnapshot, "scan", lambda *args, **options: scans.append(1) or original(*args, **options))
     for moves, expected in [((False, False), 1), ((False, True), 3), ((True, False), 3)]:
         scans.clear()
-        scene = Scene(world(*moves))
+        scene = SceneGeometry(world(*moves))
         mounted = MountedSensor(LIDAR, scene, LIDAR.max_range_m)
         for step in (0, 1, 2):
-            mounted.scan(scene.at(step), EXACT)
+            mounted.scan(scene.get_snapshot(step), EXACT)
         assert len(scans) == expected
 
 
@@ -101,31 +104,33 @@ def test_the_ego_is_at_its_own_place_to_the_last_bit():
     made = world(origin_m=UTM)
     turned = replace(made, ego=replace(made.ego, trajectory=driving(UTM, (10, 0, 0), yaw_deg=37.3)), actors=())
     for step in (0, 3, 7):
-        np.testing.assert_array_equal(Scene(turned).at(step).moving.part_T_vehicle, np.eye(4)[None])
+        np.testing.assert_array_equal(
+            SceneGeometry(turned).get_snapshot(step).moving_bodies.part_T_vehicle, np.eye(4)[None]
+        )
 
 
 @pytest.mark.parametrize("origin_m", [(0.0, 0.0, 0.0), UTM])
 @pytest.mark.parametrize(("ego_moves", "actor_moves"), [(False, False), (False, True), (True, True)])
 def test_a_hit_lies_on_the_face_that_it_says_at_the_angle_that_it_says(ego_moves, actor_moves, origin_m):
     made = world(ego_moves, actor_moves, origin_m)
-    bar, ground = made.static
+    bar, ground = made.static_meshes
     bar = bar._replace(material=np.arange(len(bar.faces), dtype=np.uint8))
     car = replace(made.actors[0], mesh=made.actors[0].mesh._replace(material=np.full(12, 77, dtype=np.uint8)))
     turning = Trajectory.from_arrays([0.0, 10.0], [origin_m, np.add(origin_m, (3, 1, 0))], [[0, 0, 0], [40, 0, 0]])
     ego = replace(made.ego, trajectory=turning if ego_moves else made.ego.trajectory)
-    scene, time_s = Scene(replace(made, static=(bar, ground), actors=(car,), ego=ego)), 3.0
-    scan = afresh(scene.at(3))
-    struck, origin = scan.struck(), LIDAR.mount.matrix()[:3, 3]
+    scene, time_s = SceneGeometry(replace(made, static=(bar, ground), actors=(car,), ego=ego)), 3.0
+    scan = afresh(scene.get_snapshot(3))
+    struck, origin = scan.find_attributes(), LIDAR.mount.to_matrix()[:3, 3]
     vehicle_T_world = invert(ego.trajectory.interpolate(time_s))
-    there = {0: bar.moved(vehicle_T_world), 1: ground.moved(vehicle_T_world)}
-    there[2] = car.mesh.moved(vehicle_T_world @ car.trajectory.interpolate(time_s))
+    there = {0: bar.transform(vehicle_T_world), 1: ground.transform(vehicle_T_world)}
+    there[2] = car.mesh.transform(vehicle_T_world @ car.trajectory.interpolate(time_s))
     # Resting bodies before what never was one, which is before those that move.
     of_body = {(False, False): [-1, 2, 0, 1], (False, True): [-1, 0, 1, 2], (True, True): [0, 1, -1, 2]}
-    number = np.array(of_body[ego_moves, actor_moves])[struck.body]
+    number = np.array(of_body[ego_moves, actor_moves])[struck.body_indices]
     assert set(number) == {0, 1, 2}
     for one, mesh in there.items():
         some = number == one
-        points, triangle = scan.points[some].astype(np.float64), struck.triangle[some]
+        points, triangle = scan.points[some].astype(np.float64), struck.triangle_indices[some]
         first, second, third = mesh.vertices_m[mesh.faces[triangle]].transpose(1, 0, 2)
         across = np.cross(second - first, third - first)
         normals = across / np.linalg.norm(across, axis=1, keepdims=True)
@@ -134,7 +139,7 @@ def test_a_hit_lies_on_the_face_that_it_says_at_the_angle_that_it_says(ego_moves
             assert (np.cross(end - start, points - start) * normals).sum(axis=1).min() > -1e-3
         ways = (points - origin) / np.linalg.norm(points - origin, axis=1, keepdims=True)
         np.testing.assert_allclose(struck.cos_incidence[some], np.abs((ways * normals).sum(axis=1)), atol=1e-5)
-        assert (struck.material[some] == mesh.materials[triangle]).all()
+        assert (struck.material_indices[some] == mesh.filled_material_indices[triangle]).all()
 
 
 @pytest.mark.parametrize("traffic", [False, True], ids=["standing", "driving"])
@@ -145,11 +150,13 @@ def test_the_housing_of_a_sensor_is_in_the_way_of_the_others_alone(traffic):
     level = {"columns": 360, "channels": 4, "vertical_fov_deg": (-20.0, -5.0)}
     rear = LIDAR.model_copy(update={"mount": Pose(z_m=2.5), **level})
     there = Trajectory(np.array([0.0, 1.0]), np.array([[0.0, 0, 0], [float(traffic), 0, 0]]), np.zeros((2, 3)))
-    plain = Plane(type="plane", size_m=(200.0, 200.0)).mesh()
-    scene = Scene(World((plain,), Actor("ego", "car", box(0.1, 0.1, 0.1), there), time_step_s=1.0, duration_s=1.0))
+    plain = Plane(type="plane", size_m=(200.0, 200.0)).build_mesh()
+    scene = SceneGeometry(
+        Scene((plain,), Actor("ego", "car", box(0.1, 0.1, 0.1), there), time_step_s=1.0, duration_s=1.0)
+    )
 
     def azimuths_deg(sensor, others=()):
-        points_m = MountedSensor(sensor, scene, 40.0, others=others).scan(scene.at(0), EXACT).points
+        points_m = MountedSensor(sensor, scene, 40.0, other_sensors=others).scan(scene.get_snapshot(0), EXACT).points
         x, y, _ = (points_m - sensor.mount.matrix()[:3, 3]).T
         return set(np.round(np.rad2deg(np.arctan2(y, x)), 1).tolist())
 

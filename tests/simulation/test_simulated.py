@@ -13,7 +13,7 @@ SMALL = PaperReference(rows=48, columns=64)
 
 
 def frames(seed=3, steps=6, rig="front_grille_128"):
-    return SimulatedFrames("courtyard", rig, steps=steps, seed=seed, reference_sensor=SMALL)
+    return SimulatedFrames("courtyard", rig, num_frames=steps, seed=seed, reference_sensor=SMALL)
 
 
 def same(a, b):
@@ -26,7 +26,8 @@ def same(a, b):
 def test_rays_of_warp_end_where_those_of_embree_do(scenario, device):
     """But for rounding, and for rays that pass an edge on the other side."""
     by_embree, by_warp = (
-        SimulatedFrames(scenario, "kitti", steps=2, frame_interval_s=1.0, device=each)[1] for each in (None, device)
+        SimulatedFrames(scenario, "kitti", num_frames=2, frame_interval_s=1.0, device=each)[1]
+        for each in (None, device)
     )
     for one, other in ((by_embree.sensor, by_warp.sensor), (by_embree.reference, by_warp.reference)):
         for queries, points in ((one, other), (other, one)):
@@ -101,7 +102,9 @@ def lidar(**changes):
 
 def test_several_rigs_see_the_same_instant_and_share_the_reference():
     names = ("front_grille_128", "front_roof_128")
-    both = SimulatedFrames("courtyard", rigs={name: name for name in names}, steps=2, seed=3, reference_sensor=SMALL)[1]
+    both = SimulatedFrames(
+        "courtyard", rigs={name: name for name in names}, num_frames=2, seed=3, reference_sensor=SMALL
+    )[1]
     for name in names:
         alone = frames(rig=name)[1]
         assert torch.equal(both.clouds[name], alone.sensor)
@@ -113,12 +116,12 @@ def test_several_rigs_see_the_same_instant_and_share_the_reference():
 @pytest.mark.parametrize("given", [{}, {"rig": "front_roof_128", "rigs": {"a": "front_roof_128"}}])
 def test_one_rig_or_several_are_needed(given):
     with pytest.raises(ValueError, match="give one rig, or several"):
-        SimulatedFrames("courtyard", steps=1, **given)
+        SimulatedFrames("courtyard", num_frames=1, **given)
 
 
 def test_range_noise_is_along_the_ray_and_has_its_standard_deviation():
-    exact = SimulatedFrames(scenario(), lidar(), steps=1, reference_sensor=SMALL)[0].sensor
-    frame = SimulatedFrames(scenario(), lidar(range_noise_m=0.05), steps=1, reference_sensor=SMALL)[0]
+    exact = SimulatedFrames(scenario(), lidar(), num_frames=1, reference_sensor=SMALL)[0].sensor
+    frame = SimulatedFrames(scenario(), lidar(range_noise_m=0.05), num_frames=1, reference_sensor=SMALL)[0]
     assert torch.equal(frame.sensor, exact)
     exact, noisy = exact.double(), frame.get_measured_points().double()
     origin = torch.tensor([0.0, 0.0, 1.8]).double()
@@ -131,8 +134,8 @@ def test_range_noise_is_along_the_ray_and_has_its_standard_deviation():
 
 
 def test_dropout_takes_its_share_of_the_points():
-    exact = SimulatedFrames(scenario(), lidar(), steps=2, reference_sensor=SMALL)
-    thinned = SimulatedFrames(scenario(), lidar(dropout=0.3), steps=2, reference_sensor=SMALL)
+    exact = SimulatedFrames(scenario(), lidar(), num_frames=2, reference_sensor=SMALL)
+    thinned = SimulatedFrames(scenario(), lidar(dropout=0.3), num_frames=2, reference_sensor=SMALL)
     count, kept = len(exact[0].sensor), len(thinned[0].sensor)
     assert abs(kept / count - 0.7) < 4 * (0.21 / count) ** 0.5
     assert set(map(tuple, thinned[0].sensor.tolist())) <= set(map(tuple, exact[0].sensor.tolist()))
@@ -140,8 +143,8 @@ def test_dropout_takes_its_share_of_the_points():
 
 
 def test_a_reference_pose_inside_a_wall_is_drawn_again_and_counted():
-    close = SimulatedFrames(scenario(wall_x=4.05), lidar(), steps=40, reference_sensor=SMALL)
-    wide = SimulatedFrames(scenario(wall_x=50.0), lidar(), steps=40, reference_sensor=SMALL)
+    close = SimulatedFrames(scenario(wall_x=4.05), lidar(), num_frames=40, reference_sensor=SMALL)
+    wide = SimulatedFrames(scenario(wall_x=50.0), lidar(), num_frames=40, reference_sensor=SMALL)
     assert sum(close[index].counts["reference_poses_resampled"] for index in range(40)) > 0
     assert sum(wide[index].counts["reference_poses_resampled"] for index in range(40)) == 0
     for index in range(40):
@@ -153,19 +156,21 @@ def test_a_reference_pose_inside_a_wall_is_drawn_again_and_counted():
 @pytest.mark.parametrize("name", ["urban", "highway", "parking"])
 def test_traffic_plays_the_same_in_any_order_and_starts_anew_at_its_end(name):
     short = Scenario.model_validate({"name": name, "traffic": {"type": name, "duration_s": 1.0, "time_step_s": 0.5}})
-    made = SimulatedFrames(short, lidar(), steps=5, seed=1, reference_sensor=SMALL)
+    made = SimulatedFrames(short, lidar(), num_frames=5, seed=1, reference_sensor=SMALL)
     in_order = [made[index] for index in range(5)]
-    again = SimulatedFrames(short, lidar(), steps=5, seed=1, reference_sensor=SMALL)
+    again = SimulatedFrames(short, lidar(), num_frames=5, seed=1, reference_sensor=SMALL)
     assert all(same(in_order[index], again[index]) for index in (4, 2, 3, 0))
     assert not torch.equal(in_order[0].sensor, in_order[3].sensor)
-    other = SimulatedFrames(short, lidar(), steps=1, seed=2, reference_sensor=SMALL)[0]
+    other = SimulatedFrames(short, lidar(), num_frames=1, seed=2, reference_sensor=SMALL)[0]
     assert not torch.equal(in_order[0].sensor, other.sensor)
 
 
 def test_a_longer_time_between_frames_shows_the_same_world_later():
     few = PaperReference(rows=2, columns=2)
-    each = SimulatedFrames("parking", "front_roof_32", steps=1301, seed=1, reference_sensor=few)
-    spread = SimulatedFrames("parking", "front_roof_32", steps=3, seed=1, reference_sensor=few, frame_interval_s=65.0)
+    each = SimulatedFrames("parking", "front_roof_32", num_frames=1301, seed=1, reference_sensor=few)
+    spread = SimulatedFrames(
+        "parking", "front_roof_32", num_frames=3, seed=1, reference_sensor=few, frame_interval_s=65.0
+    )
     assert (each.frame_interval_s, spread.frame_interval_s) == (0.1, 65.0)
     for index in range(3):  # the last one plays in another world
         assert torch.equal(spread[index].sensor, each[650 * index].sensor)
@@ -176,4 +181,4 @@ def test_a_time_between_frames_that_is_no_multiple_of_the_time_step_is_refused(f
     with pytest.raises(
         ValueError, match=r"frame_interval_s: a positive multiple of the time step of .urban., 0.1 s, is needed"
     ):
-        SimulatedFrames("urban", "front_roof_32", steps=1, frame_interval_s=frame_interval_s)
+        SimulatedFrames("urban", "front_roof_32", num_frames=1, frame_interval_s=frame_interval_s)

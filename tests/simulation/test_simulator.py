@@ -7,10 +7,10 @@ import pytest
 
 from torchcover.data import SimulatedFrames
 from torchcover.geometry import BoundingBox
-from torchcover.simulation import PaperReference, Rig, Scenario, Simulator, SurfaceReference, builtin_names
+from torchcover.simulation import PaperReference, Rig, Scenario, Simulator, SurfaceReference, list_builtin_names
 
 SMALL = PaperReference(rows=24, columns=32)
-SURFACE = SurfaceReference((((0.0, 20.0), (-5.0, 5.0)),), rays=256)
+SURFACE = SurfaceReference((((0.0, 20.0), (-5.0, 5.0)),), num_rays=256)
 SHORT = {"name": "urban", "traffic": {"type": "urban", "duration_s": 2.0, "time_step_s": 0.5}}
 
 
@@ -29,9 +29,9 @@ def same(a, b):
 
 @pytest.mark.parametrize("reference_sensor", [SMALL, SURFACE])
 def test_a_frame_is_a_step_in_tensors(reference_sensor):
-    seen = simulator(reference_sensor, seed=5).step(2)
+    seen = simulator(reference_sensor, seed=5).simulate_frame(2)
     rigs = {name: name for name in seen.clouds}
-    frame = SimulatedFrames("courtyard", rigs=rigs, steps=3, seed=5, reference_sensor=reference_sensor)[2]
+    frame = SimulatedFrames("courtyard", rigs=rigs, num_frames=3, seed=5, reference_sensor=reference_sensor)[2]
     assert list(frame.clouds) == list(seen.clouds)
     for name, points in seen.clouds.items():
         assert points.dtype == np.float32
@@ -46,34 +46,34 @@ def test_a_frame_is_a_step_in_tensors(reference_sensor):
 
 def test_a_step_depends_on_seed_and_index_only_and_survives_pickling():
     made = simulator(scenario=Scenario.model_validate(SHORT), seed=1)
-    late = made.step(6)
-    assert made.step(0).counts["moving_bodies"] > 0
-    assert same(made.step(6), late)
+    late = made.simulate_frame(6)
+    assert made.simulate_frame(0).counts["moving_bodies"] > 0
+    assert same(made.simulate_frame(6), late)
     assert same(pickle.loads(pickle.dumps(made)).step(6), late)
-    assert not same(simulator(scenario=made.scenario, seed=2).step(6), late)
+    assert not same(simulator(scenario=made.scenario, seed=2).simulate_frame(6), late)
 
 
 def test_another_reference_sensor_sees_the_same_bodies_and_leaves_the_first_as_it_is():
     base = simulator(frame_interval_s=0.5)
-    other = base.with_reference_sensor(SURFACE)
-    assert other.scene_of(3)[0] is base.scene_of(3)[0]
+    other = base.replace_reference_sensor(SURFACE)
+    assert other.get_scene_geometry(3)[0] is base.get_scene_geometry(3)[0]
     assert (base.reference_sensor, other.reference_sensor) == (SMALL, SURFACE)
     assert (base.frame_interval_s, other.frame_interval_s) == (0.5, 0.5)
-    assert len(other.step(1).reference_weights) == len(other.step(1).reference)
+    assert len(other.simulate_frame(1).reference_weights) == len(other.simulate_frame(1).reference)
 
 
 def test_labels_are_of_the_objects_in_the_reference_sensors_range():
     far = simulator(PaperReference(8, 8, max_range_m=60.0), Scenario.model_validate(SHORT))
-    near = far.with_reference_sensor(PaperReference(8, 8, max_range_m=20.0))
-    names = [{label.name for label in made.labels(1)} for made in (near, far)]
+    near = far.replace_reference_sensor(PaperReference(8, 8, max_range_m=20.0))
+    names = [{label.name for label in made.compute_labels(1)} for made in (near, far)]
     assert names[0] < names[1]
-    assert all(np.hypot(*label.centre_m[:2]) < 65.0 for label in far.labels(1))
+    assert all(np.hypot(*label.center_m[:2]) < 65.0 for label in far.compute_labels(1))
 
 
 def test_without_a_rig_there_is_the_reference_alone():
-    seen = Simulator(Scenario.load("courtyard"), {}, SMALL).step(0)
+    seen = Simulator(Scenario.load("courtyard"), {}, SMALL).simulate_frame(0)
     assert seen.clouds == {}
-    np.testing.assert_array_equal(seen.reference, simulator().step(0).reference)
+    np.testing.assert_array_equal(seen.reference, simulator().simulate_frame(0).reference)
 
 
 @pytest.mark.parametrize(
@@ -81,8 +81,8 @@ def test_without_a_rig_there_is_the_reference_alone():
     [
         (lambda: simulator(seed=-1), "seed: a number >= 0 is needed; got -1"),
         (lambda: simulator(frame_interval_s=0.03), "frame_interval_s: a positive multiple"),
-        (lambda: simulator().step(-1), "index: a number >= 0 is needed; got -1"),
-        (lambda: simulator().labels(-2), "index: a number >= 0 is needed; got -2"),
+        (lambda: simulator().simulate_frame(-1), "index: a number >= 0 is needed; got -1"),
+        (lambda: simulator().compute_labels(-2), "index: a number >= 0 is needed; got -2"),
     ],
 )
 def test_impossible_requests_are_refused(ask, message):
@@ -90,11 +90,11 @@ def test_impossible_requests_are_refused(ask, message):
         ask()
 
 
-@pytest.mark.parametrize("name", builtin_names("scenarios"))
+@pytest.mark.parametrize("name", list_builtin_names("scenarios"))
 def test_the_egos_box_is_that_of_a_world_of_the_scenario(name):
     scenario = Scenario.load(name)
     if hasattr(scenario.traffic, "duration_s"):
         scenario = scenario.model_copy(update={"traffic": scenario.traffic.model_copy(update={"duration_s": 1.0})})
-    ego = scenario.world(seed=3, episode=1).ego.mesh
-    np.testing.assert_array_equal(scenario.ego_mesh().vertices_m, ego.vertices_m)
-    assert scenario.ego_box() == BoundingBox.from_points(ego.vertices_m)
+    ego = scenario.build_scene(seed=3, run_index=1).ego.mesh
+    np.testing.assert_array_equal(scenario.build_ego_mesh().vertices_m, ego.vertices_m)
+    assert scenario.compute_ego_box() == BoundingBox.from_points(ego.vertices_m)

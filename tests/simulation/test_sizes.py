@@ -14,11 +14,11 @@ from torchcover.simulation import (
     SurfaceReference,
     memory,
 )
-from torchcover.simulation.memory import check_fits, machine_bytes
-from torchcover.simulation.scene import Scene
+from torchcover.simulation.memory import check_memory_fits, find_memory_limit_bytes
+from torchcover.simulation.scene import SceneGeometry
 from torchcover.simulation.shapes import Box
 from torchcover.simulation.traffic import Highway, Urban
-from torchcover.simulation.world import Actor, World, steps_of
+from torchcover.simulation.world import Actor, Scene, count_time_steps
 
 SPACED = {"vertical_fov_deg": (-10, 10), "horizontal_fov_deg": 360, "max_range_m": 50}
 AREAS = (((0.0, 20.0), (-5.0, 5.0)),)
@@ -27,25 +27,25 @@ AREAS = (((0.0, 20.0), (-5.0, 5.0)),)
 @pytest.fixture
 def small(monkeypatch):
     """A machine of 100 MB."""
-    monkeypatch.setattr(memory, "machine_bytes", lambda: 1e8)
+    monkeypatch.setattr(memory, "find_memory_limit_bytes", lambda: 1e8)
 
 
 def test_a_machine_has_memory_and_what_is_more_is_refused(small):
-    assert 1e8 < machine_bytes() < 1e15
-    check_fits("a scan", 1e8, "take less")
+    assert 1e8 < find_memory_limit_bytes() < 1e15
+    check_memory_fits("a scan", 1e8, "take less")
     with pytest.raises(ValueError, match=r"a scan: 0.2 GB of memory .*, and this machine has 0.1 GB; take less"):
-        check_fits("a scan", 2e8, "take less")
+        check_memory_fits("a scan", 2e8, "take less")
 
 
 def test_the_limit_of_a_container_counts(tmp_path, monkeypatch):
     (tmp_path / "memory.max").write_text("5000000\n")
     (tmp_path / "none").write_text("max\n")
     monkeypatch.setattr(memory, "CGROUP_LIMITS", (tmp_path / "missing", tmp_path / "none", tmp_path / "memory.max"))
-    machine_bytes.cache_clear()
+    find_memory_limit_bytes.cache_clear()
     try:
-        assert machine_bytes() == 5e6
+        assert find_memory_limit_bytes() == 5e6
     finally:
-        machine_bytes.cache_clear()
+        find_memory_limit_bytes.cache_clear()
 
 
 @pytest.mark.parametrize(
@@ -57,8 +57,8 @@ def test_the_limit_of_a_container_counts(tmp_path, monkeypatch):
         (lambda: Pose(x_m=1e300), "x_m\n.*less than or equal to 1000000000"),
         (lambda: Urban(people_per_km=1e6), "people_per_km\n.*less than or equal to 1000"),
         (lambda: Highway(duration_s=1e9), "duration_s\n.*less than or equal to 3600"),
-        (lambda: steps_of(1e9, 0.1), r"1e\+10 time steps of 0.1 s, over 1,000,000; shorten it"),
-        (lambda: steps_of(1.0, 1e-320), "inf time steps"),
+        (lambda: count_time_steps(1e9, 0.1), r"1e\+10 time steps of 0.1 s, over 1,000,000; shorten it"),
+        (lambda: count_time_steps(1.0, 1e-320), "inf time steps"),
     ],
 )
 def test_no_number_is_larger_than_there_can_be(make, message):
@@ -80,15 +80,15 @@ def test_more_rays_than_there_is_memory_for_are_refused_before_they_are_made(sma
         Simulator(scenario, rigs, PaperReference(rows=3, columns=4))
     fits = Simulator(scenario, {}, PaperReference(rows=3, columns=4))
     with pytest.raises(ValueError, match=r"1,000,000 of the reference\): 0.3 GB"):
-        fits.with_reference_sensor(SurfaceReference(AREAS, rays=1_000_000))
+        fits.replace_reference_sensor(SurfaceReference(AREAS, num_rays=1_000_000))
 
 
 def test_more_steps_and_bodies_than_there_is_memory_for_are_refused(small):
-    mesh = Box(type="box", size_m=(4, 2, 1)).mesh()
+    mesh = Box(type="box", size_m=(4, 2, 1)).build_mesh()
     ego = Actor("ego", "ego", mesh, Trajectory.create_static((0, 0, 0)))
     cars = tuple(Actor(f"car {k}", "car", mesh, Trajectory.create_static((9.0 * k, 9, 0))) for k in range(3))
     with pytest.raises(ValueError, match=r"500,001 time steps of 4 bodies: 0.192 GB of memory are needed"):
-        Scene(World((), ego, cars, time_step_s=0.1, duration_s=50_000.0))
+        SceneGeometry(Scene((), ego, cars, time_step_s=0.1, duration_s=50_000.0))
 
 
 @pytest.mark.parametrize("traffic", [Urban(duration_s=600.0, traffic_per_km=100), Highway(duration_s=3600.0)])
@@ -112,7 +112,7 @@ def test_an_actor_that_will_get_into_the_ego_is_known_before_the_run(tmp_path):
     with pytest.raises(ValueError, match=r"actor 'a' overlaps the ego at t = 9 s"):
         simulator.check_run(10)
     with pytest.raises(ValueError, match=r"at t = 9 s"):
-        simulator.step(9)
+        simulator.simulate_frame(9)
     # 0, 3, 6, and then 9.
     every_third = Simulator(scenario, {}, PaperReference(rows=4, columns=4), frame_interval_s=3.0)
     every_third.check_run(3)
@@ -121,4 +121,4 @@ def test_an_actor_that_will_get_into_the_ego_is_known_before_the_run(tmp_path):
 
 
 def test_traffic_has_two_instants_however_short_it_is():
-    assert len(Highway(duration_s=1e-320).world(0).ego.trajectory.times_s) == 2
+    assert len(Highway(duration_s=1e-320).build_scene(0).ego.trajectory.times_s) == 2

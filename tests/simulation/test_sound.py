@@ -8,15 +8,15 @@ import trimesh
 
 from torchcover.geometry import build_transform
 from torchcover.simulation import SurfaceReference, shapes
-from torchcover.simulation.local_ground import GroundSquares, level_faces
-from torchcover.simulation.patches import Bounds, Patches, outward_faces
-from torchcover.simulation.scene import Scene
+from torchcover.simulation.local_ground import GroundHeightPyramid, find_level_faces
+from torchcover.simulation.patches import Patches, UprightBoxes, find_outward_faces
+from torchcover.simulation.scene import SceneGeometry
 from torchcover.simulation.shapes import Box, Ellipsoid, Mesh, Plane
-from torchcover.simulation.sound import coincident_faces, told
+from torchcover.simulation.sound import check_mesh, find_coincident_faces
 
 from .small_worlds import AHEAD, ALL_HEIGHTS, FLOOR, agrees, box, scenario, sums
 
-CUBE = Box(type="box", size_m=(2, 2, 2)).mesh()
+CUBE = Box(type="box", size_m=(2, 2, 2)).build_mesh()
 
 
 def file_body(folder, mesh, name="body"):
@@ -42,33 +42,38 @@ def turned(mesh, which):
 
 @pytest.mark.parametrize(
     "mesh",
-    [CUBE, Ellipsoid(type="ellipsoid", size_m=(2, 1, 1)).mesh(), Plane(type="plane", size_m=(3, 3)).mesh(), grid()],
+    [
+        CUBE,
+        Ellipsoid(type="ellipsoid", size_m=(2, 1, 1)).build_mesh(),
+        Plane(type="plane", size_m=(3, 3)).build_mesh(),
+        grid(),
+    ],
 )
 @pytest.mark.parametrize("inside_out", [False, True])
 def test_sound_meshes_are_told_nothing_about(mesh, inside_out):
     mesh = turned(mesh, slice(None)) if inside_out else mesh
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert told("it", mesh).faces is mesh.faces
+        assert check_mesh("it", mesh).faces is mesh.faces
 
 
 def test_what_is_wrong_is_said_with_the_name_and_the_share():
     with pytest.warns(UserWarning, match=r"body 'a': 3 of 15 of its faces are there more than once"):
-        once = told("body 'a'", Mesh(CUBE.vertices_m, np.concatenate([CUBE.faces, CUBE.faces[[0, 5, 5], ::1]])))
+        once = check_mesh("body 'a'", Mesh(CUBE.vertices_m, np.concatenate([CUBE.faces, CUBE.faces[[0, 5, 5], ::1]])))
     assert len(once.faces) == 12
     with pytest.warns(UserWarning, match=r"body 'b': the normals of neighbours disagree at 3 of 18 of its inner edges"):
-        told("body 'b'", turned(CUBE, [4]))
+        check_mesh("body 'b'", turned(CUBE, [4]))
     with pytest.warns(UserWarning, match=r"body 'c': 6 of 18 of its edges have a face on one side only"):
-        told("body 'c'", Mesh(CUBE.vertices_m, CUBE.faces[2:]))
+        check_mesh("body 'c'", Mesh(CUBE.vertices_m, CUBE.faces[2:]))
 
 
 def test_faces_coincide_with_what_looks_the_same_way():
-    plane, cube = Plane(type="plane", size_m=(30, 30)).mesh(), CUBE
-    decal = Plane(type="plane", size_m=(0.5, 0.5)).mesh().moved(build_transform(np.eye(3), [9, 9, 5e-4]))
-    far = decal.moved(build_transform(np.eye(3), [0, 0, 2e-3]))
+    plane, cube = Plane(type="plane", size_m=(30, 30)).build_mesh(), CUBE
+    decal = Plane(type="plane", size_m=(0.5, 0.5)).build_mesh().transform(build_transform(np.eye(3), [9, 9, 5e-4]))
+    far = decal.transform(build_transform(np.eye(3), [0, 0, 2e-3]))
 
     def counts(*meshes):
-        return [int(mask.sum()) for mask in coincident_faces(meshes, [False] * len(meshes))]
+        return [int(mask.sum()) for mask in find_coincident_faces(meshes, [False] * len(meshes))]
 
     assert counts(plane, cube) == [0, 0]  # it stands on the plane, and nobody sees its bottom
     assert counts(plane, decal)[1] == 2
@@ -83,18 +88,18 @@ def test_faces_coincide_with_what_looks_the_same_way():
 
 def test_how_many_faces_are_looked_at_together_changes_nothing(monkeypatch):
     """A mesh of ten million is looked at in parts: of hills, a ball, and a patch of the hills once more."""
-    hills, ball = grid(), Ellipsoid(type="ellipsoid", size_m=(9, 9, 9)).mesh()
+    hills, ball = grid(), Ellipsoid(type="ellipsoid", size_m=(9, 9, 9)).build_mesh()
     hills = hills._replace(vertices_m=hills.vertices_m + [0, 0, 1] * np.sin(hills.vertices_m[:, :1]))
-    meshes = [hills, ball, hills.with_faces(np.arange(30, 50))]
-    around = Bounds(np.array([[-20.0, -15.0, -9.0]]), np.array([[30.0, 5.0, 9.0]]))
+    meshes = [hills, ball, hills.select_faces(np.arange(30, 50))]
+    around = UprightBoxes(np.array([[-20.0, -15.0, -9.0]]), np.array([[30.0, 5.0, 9.0]]))
 
     def found():
-        cut = [Patches.cut(mesh, around) for mesh in meshes]
+        cut = [Patches.from_mesh(mesh, around) for mesh in meshes]
         return [
-            *(mask for mesh in meshes for mask in (outward_faces(mesh), level_faces(mesh))),
-            *coincident_faces(meshes, [True] * 3),
-            *GroundSquares.of(meshes, np.zeros(3)).levels,
-            *(np.sort(patches.corner_m + patches.first_m, axis=1) for patches in cut),
+            *(mask for mesh in meshes for mask in (find_outward_faces(mesh), find_level_faces(mesh))),
+            *find_coincident_faces(meshes, [True] * 3),
+            *GroundHeightPyramid.from_meshes(meshes, np.zeros(3)).levels,
+            *(np.sort(patches.corner_m + patches.first_edge_m, axis=1) for patches in cut),
         ]
 
     at_once = found()
@@ -110,7 +115,7 @@ def test_how_many_faces_are_looked_at_together_changes_nothing(monkeypatch):
 def test_a_decal_on_the_road_counts_once(at, raised_m, rays, steps):
     at([2.5, 0.3, 1.0])
     decal = {"name": "decal", "shape": {"type": "plane", "size_m": [8, 6]}, "poses": [{"x_m": 12, "z_m": raised_m}]}
-    sensor = SurfaceReference((AHEAD,), rays=rays, places=1, bands_m=ALL_HEIGHTS)
+    sensor = SurfaceReference((AHEAD,), num_rays=rays, num_poses=1, bands_m=ALL_HEIGHTS)
     agrees(sums(scenario(FLOOR, decal), sensor, steps=steps), 200.0)
     agrees(sums(scenario(FLOOR, decal), sensor, lambda points: points[:, 0].astype(float), steps=steps), 200.0 * 14)
 
@@ -119,7 +124,7 @@ def test_doubled_faces_count_once(at, tmp_path):
     at([2.5, 3.0, 2.5])
     cube = Mesh(CUBE.vertices_m * [1, 1, 0.75] + [10, 0, 0], CUBE.faces)
     twice = file_body(tmp_path, Mesh(cube.vertices_m, np.tile(cube.faces, (2, 1))))
-    sensor = SurfaceReference((AHEAD,), rays=1000, places=1, bands_m=((0.5, 2.0),))
+    sensor = SurfaceReference((AHEAD,), num_rays=1000, num_poses=1, bands_m=((0.5, 2.0),))
     with pytest.warns(UserWarning, match=r"body 'body': 12 of 24 of its faces are there more than once"):
         found = sums(scenario(twice, FLOOR), sensor)
     agrees(found, 2.0 + 2.0 + 4.0)
@@ -129,7 +134,7 @@ def test_two_bodies_at_one_place_count_once_and_are_named(at):
     at([2.5, 3.0, 2.5])
     one = box([2, 2, 1.5], x_m=10)
     other = {**one, "name": "again"}
-    sensor = SurfaceReference((AHEAD,), rays=1000, places=1, bands_m=((0.5, 2.0),))
+    sensor = SurfaceReference((AHEAD,), num_rays=1000, num_poses=1, bands_m=((0.5, 2.0),))
     with pytest.warns(
         UserWarning, match=r"'box' \(10 of 12 of the faces\), 'again' \(10 of 12 of the faces\): faces lie"
     ):
@@ -142,9 +147,9 @@ def test_scenarios_and_movers_name_the_body_of_a_file(tmp_path, flipped):
     lying = file_body(tmp_path, turned(Mesh(CUBE.vertices_m, CUBE.faces[2:]), flipped))
     what = "normals of neighbours disagree" if flipped.step else "6 of 18 of its edges"
     with pytest.warns(UserWarning, match=f"body 'body': .*{what}"):
-        scenario({**lying, "poses": [{"z_m": 0.5}]}, FLOOR).world()
+        scenario({**lying, "poses": [{"z_m": 0.5}]}, FLOOR).build_scene()
     with pytest.warns(UserWarning, match=f"ego: .*{what}"):
-        scenario(FLOOR, ego={"shape": lying["shape"]}).world()
+        scenario(FLOOR, ego={"shape": lying["shape"]}).build_scene()
 
 
 @pytest.mark.filterwarnings("ignore:.*normals of neighbours disagree")
@@ -153,9 +158,9 @@ def test_a_terrain_sheet_gives_its_area_whichever_way_its_faces_look(at, tmp_pat
     mesh = grid()
     which = {"up": [], "down": slice(None), "mixed": slice(None, None, 2)}[kind]
     at([2.5, 0.3, 1.0])
-    sensor = SurfaceReference((AHEAD,), rays=400, places=1, bands_m=ALL_HEIGHTS)
+    sensor = SurfaceReference((AHEAD,), num_rays=400, num_poses=1, bands_m=ALL_HEIGHTS)
     body = file_body(tmp_path, turned(mesh, which))
     agrees(sums(scenario(body), sensor), 200.0)
-    instant = Scene(scenario(body).world()).at(0)
-    assert not instant.buried(np.array([3.0, 0.0, 0.4]))
-    assert instant.buried(np.array([3.0, 0.0, -0.4]))
+    instant = SceneGeometry(scenario(body).build_scene()).get_snapshot(0)
+    assert not instant.is_occupied(np.array([3.0, 0.0, 0.4]))
+    assert instant.is_occupied(np.array([3.0, 0.0, -0.4]))

@@ -3,10 +3,16 @@
 import numpy as np
 import pytest
 
-from torchcover.simulation import CameraSensor, Draws, Lidar, Pose, Radar, Scenario
+from torchcover.simulation import CameraSensor, Lidar, Pose, Radar, Scenario, SensorNoise
 from torchcover.simulation.camera_sensor import Stereo
-from torchcover.simulation.rays import FEW, Balls, into_tiles, pixels_in_tiles, unit_directions
-from torchcover.simulation.scene import Scene
+from torchcover.simulation.rays import (
+    FEW,
+    SearchSpheres,
+    compute_ray_pixel_indices,
+    compute_unit_directions,
+    split_into_tiles,
+)
+from torchcover.simulation.scene import SceneGeometry
 from torchcover.simulation.sensor import ScanTimes
 from torchcover.simulation.sight import MountedSensor
 
@@ -30,7 +36,7 @@ SENSORS = {
 
 @pytest.fixture(scope="module")
 def scene():
-    return Scene(Scenario.load("parking").world(seed=3))
+    return SceneGeometry(Scenario.load("parking").build_scene(seed=3))
 
 
 def is_near(scan, balls):
@@ -46,12 +52,12 @@ def test_points_near_what_is_asked_about_are_the_same_to_the_bit(scene, name, ra
     mounted = MountedSensor(sensor, scene, sensor.max_range_m)
 
     def scan(**asked):
-        draws = Draws(np.random.default_rng(7), rays=len(mounted.pixel_of_ray))
-        return mounted.scan(instant, draws, threads=2, **asked)
+        draws = SensorNoise(np.random.default_rng(7), num_rays=len(mounted.ray_pixel_indices))
+        return mounted.scan(instant, draws, num_threads=2, **asked)
 
     full, generator = scan(), np.random.default_rng(8)
     places_m = full.points[generator.choice(len(full.points), 12)] + generator.normal(0, radius_m / 2, (12, 3))
-    balls = Balls(places_m.astype(np.float32), radius_m)
+    balls = SearchSpheres(places_m.astype(np.float32), radius_m)
     spared = scan(within=balls)
     of_full, of_spared = is_near(full, balls), is_near(spared, balls)
     assert of_full.sum() > 0
@@ -60,16 +66,16 @@ def test_points_near_what_is_asked_about_are_the_same_to_the_bit(scene, name, ra
         assert (one is None) == (other is None)
         if one is not None:
             np.testing.assert_array_equal(one[of_full], other[of_spared], err_msg=column)
-    assert (spared.rays, spared.self_hits) == (full.rays, full.self_hits)
-    assert (spared.rays_spared > 0.3 * full.rays) == (name != "lidar that takes time") or radius_m > 1
+    assert (spared.num_rays, spared.self_hits) == (full.num_rays, full.self_hits)
+    assert (spared.num_omitted_rays > 0.3 * full.num_rays) == (name != "lidar that takes time") or radius_m > 1
 
 
 def test_a_ray_is_met_exactly_if_it_passes_through_a_ball():
     """But for some millimetres, and a millimetre in a metre far away; at the sensor every ray is."""
     generator = np.random.default_rng(5)
-    directions = unit_directions(np.linspace(-89, 89, 50)[:, None], np.linspace(-179, 179, 100)[None])
-    pose = ROOF.matrix()
-    pixels, tiles = pixels_in_tiles(directions), into_tiles(directions)
+    directions = compute_unit_directions(np.linspace(-89, 89, 50)[:, None], np.linspace(-179, 179, 100)[None])
+    pose = ROOF.to_matrix()
+    pixels, tiles = compute_ray_pixel_indices(directions), split_into_tiles(directions)
     towards = (pose[:3, :3] @ directions.reshape(3, -1)[:, pixels]).T
     for count, far_m, radius_m in ((1, 3, 1.5), (40, 60, 0.4), (300, 200, 0.2), (3, 0.5, 0.6), (0, 1, 1)):
         centres_m = generator.normal(0, far_m, (count, 3)).astype(np.float32)
@@ -77,7 +83,7 @@ def test_a_ray_is_met_exactly_if_it_passes_through_a_ball():
         along_m = np.maximum(towards @ ways_m.T, 0)
         squared_m2 = (ways_m**2).sum(axis=1)
         away_m = np.sqrt(np.maximum(squared_m2 - 2 * along_m * (towards @ ways_m.T) + along_m**2, 0))
-        met = np.concatenate([Balls(centres_m, radius_m).met_by(tile, pose) for tile in tiles])
+        met = np.concatenate([SearchSpheres(centres_m, radius_m).find_rays_through(tile, pose) for tile in tiles])
         assert met[(away_m <= radius_m).any(axis=1)].all()
         if (squared_m2 > radius_m**2).all():
             assert not met[(away_m > np.hypot(radius_m + 5e-3, 1.5e-3 * np.sqrt(squared_m2))).all(axis=1)].any()
@@ -88,23 +94,25 @@ def test_of_many_places_neighbours_are_looked_at_together(scene, name):
     """All rays of their own are among those of balls that hold them; where nearly all are, none is spared."""
     sensor, instant = SENSORS[name], scene.at(0, within_m=90.0)
     mounted, generator = MountedSensor(sensor, scene, 90.0), np.random.default_rng(9)
-    full = mounted.scan(instant, Draws(np.random.default_rng(7), rays=len(mounted.pixel_of_ray)))
+    full = mounted.scan(instant, SensorNoise(np.random.default_rng(7), num_rays=len(mounted.ray_pixel_indices)))
     ahead = full.points[(full.points[:, 0] > 2) & (np.abs(full.points[:, 1]) < 4)]
     ahead_m = ahead[generator.integers(0, len(ahead), FEW + 1)] + generator.normal(0, 0.3, (FEW + 1, 3))
-    around, each = Balls.around(ahead_m, 0.4), Balls(ahead_m, 0.4)
-    assert 1 < len(around.centres_m) < FEW
+    around, each = SearchSpheres.from_points(ahead_m, 0.4), SearchSpheres(ahead_m, 0.4)
+    assert 1 < len(around.centers_m) < FEW
     assert (
-        (np.linalg.norm(ahead_m[:, None] - around.centres_m, axis=2) + 0.4 <= around.radius_m + 1e-9).any(axis=1).all()
+        (np.linalg.norm(ahead_m[:, None] - around.centers_m, axis=2) + 0.4 <= around.radius_m + 1e-9).any(axis=1).all()
     )
     for tile in mounted.tiles:
-        own = each.met_by(tile, mounted.vehicle_T_sensor)
-        assert around.met_by(tile, mounted.vehicle_T_sensor)[own].all()
-    spared = mounted.scan(instant, Draws(np.random.default_rng(7), rays=len(mounted.pixel_of_ray)), within=around)
+        own = each.find_rays_through(tile, mounted.vehicle_T_sensor)
+        assert around.find_rays_through(tile, mounted.vehicle_T_sensor)[own].all()
+    spared = mounted.scan(
+        instant, SensorNoise(np.random.default_rng(7), num_rays=len(mounted.ray_pixel_indices)), search_spheres=around
+    )
     of_full, of_spared = is_near(full, each), is_near(spared, each)
     np.testing.assert_array_equal(full.points[of_full], spared.points[of_spared])
-    assert 0.2 * full.rays < spared.rays_spared
-    everywhere = Balls.around(generator.normal(0, 9, (FEW + 1, 3)), 4.0)
-    assert mounted.scan(instant, Draws(None), within=everywhere).rays_spared == 0
+    assert 0.2 * full.num_rays < spared.num_omitted_rays
+    everywhere = SearchSpheres.from_points(generator.normal(0, 9, (FEW + 1, 3)), 4.0)
+    assert mounted.scan(instant, SensorNoise(None), search_spheres=everywhere).num_omitted_rays == 0
 
 
 def test_an_instant_is_placed_once_for_several_rigs_and_few_are_kept(scene):

@@ -23,7 +23,7 @@ ORDER = np.random.default_rng(0).permutation(24).tolist()
 @pytest.fixture
 def built(monkeypatch):
     """The numbers of the runs whose worlds were built, in order."""
-    episodes, world = [], Scenario.world
+    episodes, world = [], Scenario.build_scene
 
     def counted(self, seed=0, episode=0, ego=None):
         episodes.append(episode)
@@ -46,38 +46,38 @@ def places(made):
 def test_shuffled_steps_build_each_world_once(built):
     found = places(simulator())
     assert sorted(built) == [0, 1, 2, 3]
-    alone = SHORT.world(episode=1).ego.trajectory.positions_m
+    alone = SHORT.build_scene(run_index=1).ego.trajectory.positions_m
     np.testing.assert_array_equal([found[index] for index in range(6, 12)], alone)
 
 
 @pytest.mark.parametrize(("room_for", "workers"), [(0.5, 1), (2.5, 1), (2.5, 4)])
 def test_no_more_worlds_are_kept_than_the_budget_has_room_for(monkeypatch, built, room_for, workers):
-    size = simulator().scene_of(0)[0].bytes
-    monkeypatch.setattr(stage, "machine_bytes", lambda: room_for * size / stage.KEPT_SHARE)
+    size = simulator().get_scene_geometry(0)[0].num_bytes
+    monkeypatch.setattr(stage, "find_memory_limit_bytes", lambda: room_for * size / stage.KEPT_SHARE)
     monkeypatch.setattr(stage, "get_worker_info", lambda: SimpleNamespace(num_workers=workers))
     built.clear()
     made = simulator()
     for run in (0, 1, 0, 2, 0, 1):
-        made.scene_of(6 * run)
+        made.get_scene_geometry(6 * run)
     # Two worlds at most: 2 takes the place of 1, which was asked for longest ago.
     assert built == ([0, 1, 2, 1] if room_for / workers > 2 else [0, 1, 0, 2, 0, 1])
 
 
 def test_a_world_that_is_dropped_is_gone_without_a_collection_of_garbage():
-    made = Simulator(SHORT, {"roof": Rig.load("front_roof_128")}, PaperReference(8, 8), kept_bytes=0.0)
-    made.step(0)
-    first = weakref.ref(made.scene_of(0)[0])
+    made = Simulator(SHORT, {"roof": Rig.load("front_roof_128")}, PaperReference(8, 8), max_cached_bytes=0.0)
+    made.simulate_frame(0)
+    first = weakref.ref(made.get_scene_geometry(0)[0])
     gc.disable()
     try:
-        made.step(6)
+        made.simulate_frame(6)
         assert first() is None
     finally:
         gc.enable()
 
 
 def test_worlds_share_what_is_the_same_in_all():
-    stages = stage.Stages(stage.Scenes(SHORT, seed=0), {"roof": Rig.load("front_roof_128")})
-    one, other = stages.of_run(0), stages.of_run(1)
-    casters = [set(stage.scene.at(0).moving.casters) for stage in (one, other)]
+    stages = stage.MountedRigStore(stage.SceneStore(SHORT, seed=0), {"roof": Rig.load("front_roof_128")})
+    one, other = stages.get_mounted_rigs(0), stages.get_mounted_rigs(1)
+    casters = [set(stage.scene_geometry.get_snapshot(0).moving_bodies.casters) for stage in (one, other)]
     assert casters[0] & casters[1]
-    assert one.mounted is other.mounted
+    assert one.sensors_by_rig is other.sensors_by_rig

@@ -38,7 +38,7 @@ def test_a_floor_with_a_hole(at, tmp_path):
     parts = [((-50, 10), (-50, 50)), ((12, 50), (-50, 50)), ((10, 12), (-50, -1)), ((10, 12), (1, 50))]
     floor = sheet_file(tmp_path, [triangle for part in parts for triangle in rectangle(*part)])
     at([2.5, 0.3, 1.0])
-    sensor = SurfaceReference((AHEAD,), rays=400, places=1, bands_m=ALL_HEIGHTS)
+    sensor = SurfaceReference((AHEAD,), num_rays=400, num_poses=1, bands_m=ALL_HEIGHTS)
     agrees(sums(scenario(floor), sensor), 200.0 - 4.0)
     agrees(sums(scenario(floor), sensor, along_x), 200.0 * 14.0 - 4.0 * 11.0)
 
@@ -55,9 +55,9 @@ def test_surface_without_ground_below_it_is_counted_and_changes_no_number(at, tm
     parts = [((-50, 10), (-50, 50)), ((12, 50), (-50, 50)), ((10, 12), (-50, -1)), ((10, 12), (1, 50))]
     floor = sheet_file(tmp_path, [triangle for part in parts for triangle in rectangle(*part)])
     at([11.0, 0.0, 2.0])
-    sensor = SurfaceReference((AHEAD,), rays=2000, places=2, bands_m=ALL_HEIGHTS)
+    sensor = SurfaceReference((AHEAD,), num_rays=2000, num_poses=2, bands_m=ALL_HEIGHTS)
     simulator = Simulator(scenario(floor, sheet_file(tmp_path, pit, "pit.ply")), {}, sensor)
-    seen = [simulator.step(index) for index in range(20)]
+    seen = [simulator.simulate_frame(index) for index in range(20)]
     in_no_band = [np.isnan(step.reference_heights_m) for step in seen]
     pairs = list(zip(seen, in_no_band, strict=True))
     agrees(np.array([step.reference_weights[mask].astype(np.float64).sum() for step, mask in pairs]), m2, within=0.05)
@@ -71,7 +71,7 @@ def test_surface_without_ground_below_it_is_counted_and_changes_no_number(at, tm
     without = Simulator(scenario(floor), {}, sensor)
     if m2 == 4.0 and pit[0][0][2] < 0:  # nothing of the floor is hidden, and no number of the floor is drawn otherwise
         for index, (step, mask) in enumerate(pairs):
-            assert np.array_equal(step.reference[~mask], without.step(index).reference)
+            assert np.array_equal(step.reference[~mask], without.simulate_frame(index).reference)
 
 
 @pytest.mark.parametrize("turned", [False, True])
@@ -80,21 +80,21 @@ def test_an_open_sheet_is_seen_from_either_side(at, tmp_path, turned):
     upright = np.array([triangle for part in parts for triangle in rectangle(*part)])[..., [2, 0, 1]] + [12, 0, 0]
     sheet = sheet_file(tmp_path, upright[:, ::-1] if turned else upright)
     at([2.5, 0.3, 1.0])
-    sensor = SurfaceReference((AHEAD,), rays=400, places=1, bands_m=((0.5, 2.0),))
+    sensor = SurfaceReference((AHEAD,), num_rays=400, num_poses=1, bands_m=((0.5, 2.0),))
     agrees(sums(scenario(sheet, FLOOR), sensor), 8 * 1.5 - 2 * 1)
 
 
 def test_of_a_face_that_is_seen_edge_on_there_is_nothing(at, tmp_path):
     upright = np.array(rectangle((-2, 2), (0, 3)))[..., [2, 0, 1]] + [12, 0, 0]
     at([12.0, -5.0, 1.0])
-    sensor = SurfaceReference((AHEAD,), rays=400, places=1, bands_m=((0.5, 2.0),))
+    sensor = SurfaceReference((AHEAD,), num_rays=400, num_poses=1, bands_m=((0.5, 2.0),))
     assert not sums(scenario(sheet_file(tmp_path, upright), FLOOR), sensor).any()
 
 
 def test_a_sheet_with_a_face_on_either_side_counts_once(at, tmp_path):
     one = np.array(rectangle((-2, 2), (0, 3)))[..., [2, 0, 1]] + [12, 0, 0]
     at([2.5, 0.3, 1.0])
-    sensor = SurfaceReference((AHEAD,), rays=400, places=1, bands_m=((0.5, 2.0),))
+    sensor = SurfaceReference((AHEAD,), num_rays=400, num_poses=1, bands_m=((0.5, 2.0),))
     both = sheet_file(tmp_path, np.concatenate([one, one[:, ::-1]]))
     agrees(sums(scenario(both, FLOOR), sensor), 4 * 1.5)
 
@@ -107,7 +107,7 @@ def test_of_a_box_the_sides_that_are_turned_to_the_place_are_seen(at, tmp_path, 
     faces = made.vertices[made.faces]
     body = sheet_file(tmp_path, faces[:, ::-1] if inside_out else faces)
     at([2.5, 3.0, 2.5])
-    sensor = SurfaceReference((AHEAD,), rays=1000, places=1, bands_m=((0.5, 2.0),))
+    sensor = SurfaceReference((AHEAD,), num_rays=1000, num_poses=1, bands_m=((0.5, 2.0),))
     agrees(sums(scenario(body, FLOOR), sensor), 2.0 + 2.0 + 4.0)
     on_top = sums(scenario(body, FLOOR), sensor, lambda points: points[:, 2] > 1.49999)
     agrees(on_top, 4.0)
@@ -116,7 +116,7 @@ def test_of_a_box_the_sides_that_are_turned_to_the_place_are_seen(at, tmp_path, 
 def test_a_wall_that_another_one_half_hides(at):
     wall, screen = box([0.2, 10, 3], x_m=20), box([0.2, 2, 10], x_m=10, y_m=1)
     at([2.6, 0.0, 1.0])
-    sensor = SurfaceReference((((15.0, 25.0), (-6.0, 6.0)),), rays=1000, places=1, bands_m=((0.5, 2.0),))
+    sensor = SurfaceReference((((15.0, 25.0), (-6.0, 6.0)),), num_rays=1000, num_poses=1, bands_m=((0.5, 2.0),))
     hidden_m = 2.0 * (19.9 - 2.6) / (9.9 - 2.6)
     agrees(sums(scenario(wall, screen, FLOOR), sensor), 1.5 * (10 - hidden_m))
     heights = sums(scenario(wall, screen, FLOOR), sensor, lambda points: points[:, 2].astype(np.float64))
@@ -125,10 +125,10 @@ def test_a_wall_that_another_one_half_hides(at):
 
 def test_the_egos_own_surface_is_in_no_cloud_but_hides(at):
     at([0.0, 0.0, 2.0])  # half a metre above the roof
-    around = SurfaceReference((((-5.0, 5.0), (-5.0, 5.0)),), rays=2000, places=1, bands_m=ALL_HEIGHTS)
+    around = SurfaceReference((((-5.0, 5.0), (-5.0, 5.0)),), num_rays=2000, num_poses=1, bands_m=ALL_HEIGHTS)
     # The shadow of the roof, four times as far from the place as the roof is.
     agrees(sums(scenario(box([1, 1, 1], x_m=90), FLOOR), around), 100.0 - 10.0 * 8.0)
-    seen = Simulator(scenario(FLOOR), {}, around).step(0)
+    seen = Simulator(scenario(FLOOR), {}, around).simulate_frame(0)
     assert np.abs(seen.reference[:, 2]).max() < 1e-4
     assert seen.counts["reference_self_hits"] == seen.counts["reference_rays"] - len(seen.reference)
 
@@ -136,17 +136,17 @@ def test_the_egos_own_surface_is_in_no_cloud_but_hides(at):
 def test_a_vehicle_that_pitches_takes_its_boxes_along(at):
     at([2.6, 0.0, 1.0])
     ego = {**EGO, "pose": {"z_m": 3.0, "pitch_deg": 5.0}}
-    sensor = SurfaceReference((AHEAD,), rays=1000, places=2, bands_m=((-6.0, 0.0),), band_frame="vehicle")
+    sensor = SurfaceReference((AHEAD,), num_rays=1000, num_poses=2, bands_m=((-6.0, 0.0),), band_frame="vehicle")
     agrees(sums(scenario(FLOOR, ego=ego), sensor), 200.0 / math.cos(math.radians(5)))
 
 
 def test_the_ray_budget_and_the_number_of_places_do_not_move_the_mean():
     made = Scenario.load("courtyard")
     areas = (((0.0, 20.0), (-5.0, 5.0)), ((-10.0, 40.0), (-10.0, 10.0)))
-    many = sums(made, SurfaceReference(areas, rays=8192, places=4), steps=12)
+    many = sums(made, SurfaceReference(areas, num_rays=8192, num_poses=4), steps=12)
     spread = {}
     for rays, places, steps in [(1024, 1, 64), (1024, 4, 32), (64, 4, 32), (1, 1, 64)]:
-        few = sums(made, SurfaceReference(areas, rays=rays, places=places), steps=steps, first=100)
+        few = sums(made, SurfaceReference(areas, num_rays=rays, num_poses=places), steps=steps, first=100)
         error = math.hypot(*(kind.std(ddof=1) / math.sqrt(len(kind)) for kind in (few, many)))
         assert abs(few.mean() - many.mean()) < 4 * error
         assert error < 0.1 * many.mean() or rays == 1
@@ -158,10 +158,10 @@ def test_the_ray_budget_and_the_number_of_places_do_not_move_the_mean():
 def test_strata_that_overlap_share_their_points_out(at):
     at([2.6, 0.0, 1.0])
     inner = ((6.0, 9.0), (-2.0, 3.0))
-    sensor = SurfaceReference((AHEAD, inner, AHEAD), rays=900, places=1, bands_m=((-0.5, 0.5), (-0.2, 0.1)))
+    sensor = SurfaceReference((AHEAD, inner, AHEAD), num_rays=900, num_poses=1, bands_m=((-0.5, 0.5), (-0.2, 0.1)))
     agrees(sums(scenario(FLOOR), sensor), 200.0)
     agrees(sums(scenario(FLOOR), sensor, lambda points: (points[:, 0] >= 6) & (points[:, 0] < 9)), 30.0)
-    step = Simulator(scenario(FLOOR), {}, sensor).step(0)
+    step = Simulator(scenario(FLOOR), {}, sensor).simulate_frame(0)
     inside = (np.abs(step.reference[:, 1] - 0.5) < 2.5) & (np.abs(step.reference[:, 0] - 7.5) < 1.5)
     assert len(np.unique(step.reference_weights.round(4))) == 2
     assert step.reference_weights[inside].max() < step.reference_weights[~inside].min()
@@ -169,13 +169,13 @@ def test_strata_that_overlap_share_their_points_out(at):
 
 def test_nothing_to_see_is_no_point_and_no_square_metre(at):
     at([2.5, 0.0, 1.0])
-    empty = SurfaceReference((AHEAD,), rays=100, bands_m=((1.0, 2.0), (50.0, 60.0)))
-    seen = Simulator(scenario(FLOOR), {}, empty).step(0)
+    empty = SurfaceReference((AHEAD,), num_rays=100, bands_m=((1.0, 2.0), (50.0, 60.0)))
+    seen = Simulator(scenario(FLOOR), {}, empty).simulate_frame(0)
     assert seen.reference.shape == (0, 3)
     assert seen.reference_weights.shape == (0,)
     assert seen.counts["reference_rays"] == 0
-    behind = SurfaceReference((((15.0, 20.0), (-1.0, 1.0)),), rays=100)
-    hidden = Simulator(scenario(box([0.2, 40, 30], x_m=8), FLOOR), {}, behind).step(0)
+    behind = SurfaceReference((((15.0, 20.0), (-1.0, 1.0)),), num_rays=100)
+    hidden = Simulator(scenario(box([0.2, 40, 30], x_m=8), FLOOR), {}, behind).simulate_frame(0)
     assert len(hidden.reference) == 0
     assert hidden.counts["reference_rays"] > 40
 
@@ -185,7 +185,7 @@ def test_huge_faces_needles_and_faces_without_area_are_taken_as_they_are(at, tmp
     huge = rectangle((-1e5, 1e5), (-1e5, 1e5))
     needle = [[[5, 0, 0.6], [1e5, 0, 0.6], [5, 1e-7, 0.6]]]
     nothing = [[[6, 0, 1], [6, 0, 1], [6, 0, 1]], [[6, 0, 1], [7, 0, 1], [8, 0, 1]]]
-    sensor = SurfaceReference((AHEAD,), rays=400, places=1, bands_m=ALL_HEIGHTS)
+    sensor = SurfaceReference((AHEAD,), num_rays=400, num_poses=1, bands_m=ALL_HEIGHTS)
     agrees(sums(scenario(sheet_file(tmp_path, [*huge, *needle, *nothing])), sensor), 200.0)
 
 
@@ -193,8 +193,8 @@ def test_threads_workers_and_pickling_change_nothing():
     car = {"category": "car", "shape": {"type": "vehicle", "vehicle": "sedan"}}
     actors = [{**car, "name": f"car {x_m}", "pose": {"x_m": x_m, "y_m": 3.0}} for x_m in (8.0, 14.0, 30.0)]
     made = scenario(FLOOR, box([2, 2, 1.5], x_m=12), actors=actors)
-    sensor = SurfaceReference((AHEAD, ((0.0, 80.0), (-20.0, 20.0))), rays=30_000, places=2, object_points=8)
-    frames = SimulatedFrames(made, "front_roof_32", steps=4, seed=2, reference_sensor=sensor, boxes=True)
+    sensor = SurfaceReference((AHEAD, ((0.0, 80.0), (-20.0, 20.0))), num_rays=30_000, num_poses=2, points_per_object=8)
+    frames = SimulatedFrames(made, "front_roof_32", num_frames=4, seed=2, reference_sensor=sensor, boxes=True)
     threads = torch.get_num_threads()
     try:
         torch.set_num_threads(1)
@@ -243,13 +243,13 @@ def test_what_is_hidden_from_a_roadside_rig_counts_as_not_detected():
     lidar = {"type": "lidar", "name": "top", "mount": {"z_m": 6.2}, "channels": 64, "vertical_fov_deg": [-60, 0],
              "horizontal_fov_deg": 360, "columns": 256, "max_range_m": 200}  # fmt: skip
     rig = Rig.model_validate({"name": "roadside", "sensors": [lidar]})
-    frames = SimulatedFrames(road, rig, steps=1)
+    frames = SimulatedFrames(road, rig, num_frames=1)
     x_m, y_m, _ = frames[0].reference.T
     behind = (x_m > 11) & (x_m < 25) & (y_m.abs() < 20)
     assert behind.sum() > 100
     assert nearest(frames[0].reference[behind], frames[0].sensor).distance.min() > 0.4
     assert frames.reference_record["notes"][-1].startswith("Reference positions: anywhere in the regions")
     with pytest.raises(ValueError, match="looks from the mast of this roadside rig"):
-        SimulatedFrames(road, rig, steps=1, reference_sensor=PaperReference())
-    on_car = SimulatedFrames("courtyard", "front_roof_32", steps=1).reference_sensor
+        SimulatedFrames(road, rig, num_frames=1, reference_sensor=PaperReference())
+    on_car = SimulatedFrames("courtyard", "front_roof_32", num_frames=1).reference_sensor
     assert (on_car.over_areas, on_car.shell_m) == (False, 0.5)

@@ -7,25 +7,25 @@ import pytest
 
 from torchcover.geometry import invert, transform_points
 from torchcover.geometry.trajectory import Trajectory
-from torchcover.simulation import CameraSensor, Draws, Lidar, Pose
-from torchcover.simulation.bodies import in_vehicle_frame
-from torchcover.simulation.scene import Scene
+from torchcover.simulation import CameraSensor, Lidar, Pose, SensorNoise
+from torchcover.simulation.bodies import move_to_vehicle_frame
+from torchcover.simulation.scene import SceneGeometry
 from torchcover.simulation.sensor import ScanTimes
 from torchcover.simulation.shapes import Box, Plane
 from torchcover.simulation.sight import MountedSensor
-from torchcover.simulation.world import Actor, World
+from torchcover.simulation.world import Actor, Scene
 
 PERIOD_S, COLUMNS = 0.1, 40
 LIDAR = Lidar(
     name="roof", mount=Pose(x_m=-0.3, z_m=1.5, yaw_deg=10), channels=16, vertical_fov_deg=(-40, 6),
     horizontal_fov_deg=360, columns=COLUMNS, max_range_m=60, scan={"period_s": PERIOD_S},
 )  # fmt: skip
-EXACT = Draws(None)
+EXACT = SensorNoise(None)
 STEP_S = PERIOD_S / COLUMNS / 2
 
 
 def box(*size_m):
-    return in_vehicle_frame(Box(type="box", size_m=size_m).mesh())
+    return move_to_vehicle_frame(Box(type="box", size_m=size_m).build_mesh())
 
 
 def driving(start, way, turn_deg=0.0):
@@ -37,18 +37,18 @@ def driving(start, way, turn_deg=0.0):
 
 def world(ego_mps=0.0, cars_mps=0.0, turn_deg=0.0, step_s=PERIOD_S):
     """An ego between two walls, with a car that comes closer beside it and one that crosses far ahead."""
-    ground, wall = Plane(type="plane", size_m=(400, 400)).mesh(), box(60, 0.5, 4)
-    walls = [wall.moved(Pose(y_m=y_m).matrix()) for y_m in (-9.0, 12.0)]
+    ground, wall = Plane(type="plane", size_m=(400, 400)).build_mesh(), box(60, 0.5, 4)
+    walls = [wall.transform(Pose(y_m=y_m).to_matrix()) for y_m in (-9.0, 12.0)]
     ego = Actor("ego", "ego", box(4, 2, 1), driving((0, 0, 0), (5 * ego_mps, 0, 0), turn_deg))
     beside = Actor("beside", "car", box(4, 2, 1.5), driving((6, 5, 0), (-5 * cars_mps, 0, 0)))
     ahead = Actor("ahead", "car", box(4, 2, 1.5), driving((15, -2, 0), (0, 5 * cars_mps, 0), 2 * turn_deg))
-    return World((ground, *walls), ego, (beside, ahead), time_step_s=step_s, duration_s=1.0)
+    return Scene((ground, *walls), ego, (beside, ahead), time_step_s=step_s, duration_s=1.0)
 
 
 def swept(made, time_s=0.5, lidar=LIDAR, draws=EXACT):
-    scene = Scene(made)
+    scene = SceneGeometry(made)
     mounted = MountedSensor(lidar, scene, lidar.max_range_m)
-    return mounted, mounted.scan(scene.at(round(time_s / made.time_step_s)), draws)
+    return mounted, mounted.scan(scene.get_snapshot(round(time_s / made.time_step_s)), draws)
 
 
 @pytest.mark.parametrize(
@@ -60,25 +60,29 @@ def test_each_column_is_that_of_a_scan_at_its_own_time(ego_mps, cars_mps, turn_d
     mounted, seen = swept(made)
     _, raw = swept(made, lidar=LIDAR.model_copy(update={"scan": ScanTimes(period_s=PERIOD_S, deskewed=False)}))
     np.testing.assert_array_equal(raw.points, seen.points)
-    fine = Scene(world(ego_mps, cars_mps, turn_deg, step_s=STEP_S))
+    fine = SceneGeometry(world(ego_mps, cars_mps, turn_deg, step_s=STEP_S))
     now, at_once = round(0.5 / STEP_S), LIDAR.model_copy(update={"scan": None})
     world_T_now = made.ego.trajectory.interpolate(0.5)
     compared = moved = 0
     for column in range(COLUMNS):
         step = now - 2 * (COLUMNS - column) + 1
-        then, time_s = fine.at(step), step * STEP_S
+        then, time_s = fine.get_snapshot(step), step * STEP_S
         there = MountedSensor(at_once, fine, LIDAR.max_range_m).scan(then, EXACT)
-        own, mine = (mounted.pixel_of_ray[scan.ray] % COLUMNS == column for scan in (there, seen))
-        np.testing.assert_array_equal(there.ray[own], seen.ray[mine])
+        own, mine = (mounted.ray_pixel_indices[scan.ray_indices] % COLUMNS == column for scan in (there, seen))
+        np.testing.assert_array_equal(there.ray_indices[own], seen.ray_indices[mine])
         np.testing.assert_allclose(seen.range_m[mine], there.range_m[own], rtol=1e-4, atol=2e-3)
-        np.testing.assert_allclose(raw.landed[mine], there.points[own], atol=5e-3)
-        struck = then.scan(at_once.mount.matrix(), mounted.tiles, max_range_m=60).struck()
+        np.testing.assert_allclose(raw.measured_points[mine], there.points[own], atol=5e-3)
+        struck = then.scan(at_once.mount.to_matrix(), mounted.tiles, max_range_m=60).find_attributes()
         now_T_then = invert(world_T_now) @ made.ego.trajectory.interpolate(time_s)
         true = transform_points(now_T_then, there.points[own])
-        np.testing.assert_allclose((seen.points if seen.landed is None else seen.landed)[mine], true, atol=5e-3)
+        np.testing.assert_allclose(
+            (seen.points if seen.measured_points is None else seen.measured_points)[mine], true, atol=5e-3
+        )
         others = [actor for actor in made.actors if actor.trajectory.is_moving]
-        for actor, number in zip(others, [body for body in then.moving.body if body != then.ego], strict=True):
-            on_body, trajectory = struck.body[own] == number, actor.trajectory
+        for actor, number in zip(
+            others, [body for body in then.moving_bodies.body_indices if body != then.ego_index], strict=True
+        ):
+            on_body, trajectory = struck.body_indices[own] == number, actor.trajectory
             travelled = (
                 invert(world_T_now) @ trajectory.interpolate(0.5) @ invert(trajectory.interpolate(time_s)) @ world_T_now
             )
@@ -94,13 +98,15 @@ def test_where_nothing_moves_it_is_the_same_to_the_bit():
     _, still = swept(world())
     _, at_once = swept(world(), lidar=LIDAR.model_copy(update={"scan": None}))
     np.testing.assert_array_equal(still.points.view(np.int32), at_once.points.view(np.int32))
-    assert still.landed is None
+    assert still.measured_points is None
     # An ego that stands, in a world in which others drive: what rests is the same, and its landed points are true.
     moving = world(cars_mps=15.0)
     _, seen = swept(moving)
     _, at_once = swept(moving, lidar=LIDAR.model_copy(update={"scan": None}))
-    both = np.intersect1d(seen.ray, at_once.ray)
-    same = (seen.points[np.isin(seen.ray, both)] == at_once.points[np.isin(at_once.ray, both)]).all(axis=1)
+    both = np.intersect1d(seen.ray_indices, at_once.ray_indices)
+    same = (seen.points[np.isin(seen.ray_indices, both)] == at_once.points[np.isin(at_once.ray_indices, both)]).all(
+        axis=1
+    )
     assert same.mean() > 0.85
 
 
@@ -109,13 +115,13 @@ def test_a_sweep_moves_a_point_by_speed_times_time(car_mps):
     """The rear of a car ahead, 8 m before an ego at 20 m/s, at the frame's time: three clouds in closed form."""
     made = world(ego_mps=20.0)
     car = Actor("car", "car", box(4, 6, 1.5), driving((20.0 - car_mps / 2, 0, 0), (5 * car_mps, 0, 0)))
-    mounted, seen = swept(replace(made, static=made.static[:1], actors=(car,)))
-    pixel = mounted.pixel_of_ray[seen.ray]
-    time_s = LIDAR.times_s().reshape(-1)[pixel]
-    directions = LIDAR.mount.matrix()[:3, :3] @ LIDAR.directions().reshape(3, -1)[:, pixel]
-    as_cast_m = LIDAR.mount.matrix()[:3, 3] + (directions * seen.range_m).T
+    mounted, seen = swept(replace(made, static=made.static_meshes[:1], actors=(car,)))
+    pixel = mounted.ray_pixel_indices[seen.ray_indices]
+    time_s = LIDAR.compute_ray_times_s().reshape(-1)[pixel]
+    directions = LIDAR.mount.to_matrix()[:3, :3] @ LIDAR.compute_directions().reshape(3, -1)[:, pixel]
+    as_cast_m = LIDAR.mount.to_matrix()[:3, 3] + (directions * seen.range_m).T
     rear = (seen.points[:, 2] > 0.3) & (seen.points[:, 2] < 1.4) & (np.abs(seen.points[:, 0] - 8.0) < 0.01)
-    landed = seen.points if seen.landed is None else seen.landed
+    landed = seen.points if seen.measured_points is None else seen.measured_points
     assert rear.sum() > 5
     # As it came from the sensor: by the speed relative to the ego.
     np.testing.assert_allclose(as_cast_m[rear, 0], 8.0 + (car_mps - 20.0) * time_s[rear], atol=2e-3)
@@ -127,7 +133,7 @@ def test_a_sweep_moves_a_point_by_speed_times_time(car_mps):
 def test_the_first_frame_of_a_world_is_as_its_second():
     """Before a world begins it is told from how it goes on."""
     made = world(ego_mps=20.0)
-    made = replace(made, static=made.static[:1], actors=())
+    made = replace(made, static=made.static_meshes[:1], actors=())
     (_, first), (_, later), (_, at_once) = (
         swept(made, time_s, lidar)
         for time_s, lidar in ((0.0, LIDAR), (0.5, LIDAR), (0.0, LIDAR.model_copy(update={"scan": None})))
@@ -159,13 +165,15 @@ def test_where_points_of_a_sensor_that_errs_land():
     made = world(ego_mps=20.0)
     exact, erring = (
         swept(made, lidar=LIDAR.model_copy(update={"range_noise_m": sigma_m}), draws=draws)[1]
-        for sigma_m, draws in ((0.0, EXACT), (0.5, Draws(np.random.default_rng(1))))
+        for sigma_m, draws in ((0.0, EXACT), (0.5, SensorNoise(np.random.default_rng(1))))
     )
     np.testing.assert_array_equal(erring.points, exact.points)
-    way = (erring.landed - exact.points).astype(np.float64)
-    np.testing.assert_allclose(np.linalg.norm(way, axis=1), np.abs(erring.error_m), atol=1e-4)
-    origins = (exact.points - way / erring.error_m[:, None] * exact.range_m[:, None])[np.abs(erring.error_m) > 0.1]
-    assert np.abs(origins[:, 1:] - LIDAR.mount.matrix()[1:3, 3]).max() < 0.05
+    way = (erring.measured_points - exact.points).astype(np.float64)
+    np.testing.assert_allclose(np.linalg.norm(way, axis=1), np.abs(erring.range_error_m), atol=1e-4)
+    origins = (exact.points - way / erring.range_error_m[:, None] * exact.range_m[:, None])[
+        np.abs(erring.range_error_m) > 0.1
+    ]
+    assert np.abs(origins[:, 1:] - LIDAR.mount.to_matrix()[1:3, 3]).max() < 0.05
     assert 1.8 < np.ptp(origins[:, 0]) < 2.1
 
 

@@ -10,9 +10,9 @@ from torchcover import Scenario
 from torchcover.geometry import convert_euler_to_rotation
 from torchcover.recordings.formats.tracks import read_trajectory
 from torchcover.simulation import Pose
-from torchcover.simulation.rays import into_tiles, unit_directions
+from torchcover.simulation.rays import compute_unit_directions, split_into_tiles
 from torchcover.simulation.recorded.bodies import read_boxes
-from torchcover.simulation.scene import Scene
+from torchcover.simulation.scene import SceneGeometry
 
 HEADER = "t,x,y,z,roll,pitch,yaw\n"
 BOXES = "t,id,category,x,y,z,length,width,height,yaw\n"
@@ -58,7 +58,7 @@ def test_small_headings_in_degrees_are_not_reported(tmp_path):
 
 
 def test_poses_are_read(tmp_path):
-    poses = np.stack([Pose(x_m=k, yaw_deg=10 * k, roll_deg=3).matrix() for k in range(4)])
+    poses = np.stack([Pose(x_m=k, yaw_deg=10 * k, roll_deg=3).to_matrix() for k in range(4)])
     np.savez(tmp_path / "p.npz", times_s=np.arange(4.0), world_T_body=poses)
     track = read_trajectory(tmp_path / "p.npz")
     for k in range(4):
@@ -107,7 +107,7 @@ def scenario_at(folder, ego_s, actor_s, boxes_s):
 
 @pytest.mark.parametrize("start_s", [0, UNIX_S, 1e5])
 def test_trajectories_of_another_clock_move_alike(tmp_path, start_s):
-    world = scenario_at(tmp_path, start_s, start_s + 1, start_s).world()
+    world = scenario_at(tmp_path, start_s, start_s + 1, start_s).build_scene()
     places_m = [
         actor.trajectory.interpolate_positions_m(np.array([0.0, 1.5, 3.0]))[:, 0]
         for actor in (world.ego, *world.actors)
@@ -117,7 +117,7 @@ def test_trajectories_of_another_clock_move_alike(tmp_path, start_s):
 
 def test_trajectories_of_different_clocks_are_named(tmp_path):
     with pytest.warns(UserWarning, match="give all trajectories one clock") as warned:
-        scenario_at(tmp_path, UNIX_S, 0, UNIX_S).world()
+        scenario_at(tmp_path, UNIX_S, 0, UNIX_S).build_scene()
     first, second = (str(warning.message) for warning in warned)
     assert first.startswith(
         "ego rests: its times, 1700000000.000 to 1700000004.000 s, lie outside of the run, 0.000 to"
@@ -199,13 +199,15 @@ def test_a_scenario_of_files_plays(tmp_path):
     write(tmp_path, HEADER + "0,0,0,0,0,0,0\n4,40,0,0,0,0,0\n", "ego.csv")
     write(tmp_path, HEADER + "0,30,4,0,0,0,0\n4,30,4.004,0,0,0,0\n", "bus.csv")
     write(tmp_path, BOXES + "1,a,car,20,-5,0,4,2,1.5,0\n2,a,car,20,-5,0,4,2,1.5,0\n", "boxes.csv")
-    world = Scenario.load(write(tmp_path, SCENARIO, "s.yaml")).world()
-    assert world.steps == 5
-    scene = Scene(world)
-    sphere = into_tiles(unit_directions(np.linspace(-60, 30, 90)[:, None], np.linspace(-180, 179, 360)[None]))
+    world = Scenario.load(write(tmp_path, SCENARIO, "s.yaml")).build_scene()
+    assert world.num_time_steps == 5
+    scene = SceneGeometry(world)
+    sphere = split_into_tiles(
+        compute_unit_directions(np.linspace(-60, 30, 90)[:, None], np.linspace(-180, 179, 360)[None])
+    )
     rear_of_bus, box_seen = [], []
     for step in range(5):
-        x, y, z = scene.at(step).scan(Pose(z_m=2.0).matrix(), sphere).points.T
+        x, y, z = scene.get_snapshot(step).scan(Pose(z_m=2.0).to_matrix(), sphere).points.T
         rear_of_bus.append(x[(y > 2.7) & (z > 0.1)].min())
         box_seen.append(bool(((y < -3) & (z > 0.5)).any()))
     np.testing.assert_allclose(rear_of_bus, [24 - 10 * step for step in range(5)], atol=0.5)

@@ -56,14 +56,14 @@ def test_a_link_and_its_sensor_are_where_all_joints_before_them_are_at_0(robot_o
     expected[2, 3] += 0.2  # the middle of the chassis is so far above the ground
     (keys,) = robot.sensors
     rig = Rig.model_validate({"name": "a", "sensors": [keys]})
-    np.testing.assert_allclose(rig.sensors[0].mount.matrix(), expected, atol=2e-4)
+    np.testing.assert_allclose(rig.sensors[0].mount.to_matrix(), expected, atol=2e-4)
     assert (rig.sensors[0].rate_hz, rig.sensors[0].range_noise_m) == (20.0, 0.02)
 
 
 def test_the_rays_of_a_lidar_are_those_that_gazebo_casts(robot_of):
     keys = robot_of(CHASSIS, on("base", LIDAR.format("left", "<pose>0 0 1 0 0 0</pose>", math.pi))).sensors[0]
     (lidar,) = Rig.model_validate({"name": "a", "sensors": [keys]}).sensors
-    rays = np.einsum("ij,jrc->irc", lidar.mount.matrix()[:3, :3], lidar.directions())
+    rays = np.einsum("ij,jrc->irc", lidar.mount.to_matrix()[:3, :3], lidar.compute_directions())
     np.testing.assert_allclose(np.arctan2(rays[1], rays[0])[0], np.linspace(0.0, math.pi, 181), atol=1e-4)
     np.testing.assert_allclose(np.arcsin(rays[2])[:, 0], [-0.1, 0.1, 0.3], atol=1e-5)
 
@@ -252,8 +252,8 @@ def test_what_is_written_can_be_simulated_and_names_stay_names(robot_of, tmp_pat
     assert files == {"body.ply", "vehicle.yaml", "rig.yaml", "summary.json"}
     rig, vehicle = Rig.load(tmp_path / "out" / "rig.yaml"), Vehicle.load(tmp_path / "out" / "vehicle.yaml")
     assert rig.sensors[0].name == "<b>"
-    np.testing.assert_allclose(vehicle.mesh().vertices_m, robot.body.vertices_m, atol=1e-6)
-    frame = SimulatedFrames(Scenario.load("courtyard"), tmp_path / "out" / "rig.yaml", steps=1)[0]
+    np.testing.assert_allclose(vehicle.build_mesh().vertices_m, robot.body.vertices_m, atol=1e-6)
+    frame = SimulatedFrames(Scenario.load("courtyard"), tmp_path / "out" / "rig.yaml", num_frames=1)[0]
     assert len(frame.sensor) > 100
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from torchcover.simulation import builtin_names
+from torchcover.simulation import list_builtin_names
 from torchcover.simulation.bodies import Vehicle
 
 SIZES_M = {
@@ -69,12 +69,12 @@ def profile(mesh, x_m):
 
 
 def test_these_are_all():
-    assert builtin_names("vehicles") == sorted(SIZES_M)
+    assert list_builtin_names("vehicles") == sorted(SIZES_M)
 
 
 @pytest.mark.parametrize("name", SIZES_M)
 def test_a_vehicle_stands_on_the_ground_in_the_middle_of_its_box(name):
-    vertices = load(name).mesh().vertices_m
+    vertices = load(name).build_mesh().vertices_m
     length, width, height = SIZES_M[name]
     np.testing.assert_allclose(vertices.min(0), [-length / 2, -width / 2, 0], atol=1e-3)
     np.testing.assert_allclose(vertices.max(0), [length / 2, width / 2, height], atol=1e-3)
@@ -83,7 +83,7 @@ def test_a_vehicle_stands_on_the_ground_in_the_middle_of_its_box(name):
 @pytest.mark.parametrize("name", SIZES_M)
 def test_every_part_is_closed_and_faces_outwards(name):
     for part in load(name).parts:
-        for mesh in part.meshes():
+        for mesh in part.build_meshes():
             solid = trimesh.Trimesh(mesh.vertices_m, mesh.faces, process=False)
             assert solid.is_watertight
             assert solid.is_winding_consistent
@@ -94,7 +94,7 @@ def test_every_part_is_closed_and_faces_outwards(name):
 def test_left_and_right_are_mirror_images(name):
     # Part by part: the corners of all copies of a part, and of their mirror image, are the same points.
     for part in load(name).parts:
-        corners = np.concatenate([mesh.vertices_m for mesh in part.meshes()])
+        corners = np.concatenate([mesh.vertices_m for mesh in part.build_meshes()])
         rounded = {tuple(corner) for corner in (np.round(corners, 6) + 0.0).tolist()}
         mirrored = {tuple(corner) for corner in (np.round(corners * [1, -1, 1], 6) + 0.0).tolist()}
         assert rounded == mirrored, part.name
@@ -103,7 +103,7 @@ def test_left_and_right_are_mirror_images(name):
 @pytest.mark.parametrize("name", WITH_WHEELS)
 def test_wheels_stand_on_the_ground_and_nothing_else_does(name):
     for part in load(name).parts:
-        lowest = min(mesh.vertices_m[:, 2].min() for mesh in part.meshes())
+        lowest = min(mesh.vertices_m[:, 2].min() for mesh in part.build_meshes())
         if "wheels" in part.name:
             assert lowest == pytest.approx(0.0, abs=1e-12)
         else:
@@ -119,7 +119,7 @@ def test_the_cars_of_published_rigs_have_their_axles_where_the_rigs_have_them(na
 
 @pytest.mark.parametrize("name", CARS)
 def test_a_car_has_a_hood_below_a_raked_windscreen_below_a_roof(name):
-    mesh = load(name).mesh()
+    mesh = load(name).build_mesh()
     x = np.linspace(-0.98, 0.98, 197) * SIZES_M[name][0] / 2
     outline = profile(mesh, x)
     roof = SIZES_M[name][2]
@@ -136,7 +136,7 @@ def test_a_car_has_a_hood_below_a_raked_windscreen_below_a_roof(name):
 
 @pytest.mark.parametrize("name", CARS)
 def test_a_cars_cabin_is_narrower_than_its_body(name):
-    vertices = load(name).mesh().vertices_m
+    vertices = load(name).build_mesh().vertices_m
     height = SIZES_M[name][2]
     roof = vertices[vertices[:, 2] > 0.99 * height]
     assert np.ptp(roof[:, 1]) < 0.8 * SIZES_M[name][1]
@@ -145,13 +145,13 @@ def test_a_cars_cabin_is_narrower_than_its_body(name):
 @pytest.mark.parametrize("name", [*CARS, "truck", "lorry", "bus"])
 def test_mirrors_end_within_the_width(name):
     (mirrors,) = [part for part in load(name).parts if part.name == "mirrors"]
-    outermost = max(mesh.vertices_m[:, 1].max() for mesh in mirrors.meshes())
+    outermost = max(mesh.vertices_m[:, 1].max() for mesh in mirrors.build_meshes())
     assert outermost <= SIZES_M[name][1] / 2 + 1e-9
-    assert len(mirrors.meshes()) == 2
+    assert len(mirrors.build_meshes()) == 2
 
 
 def test_riders_and_walkers_have_a_head_on_top():
     for name in ("adult", "child_110cm", "child_120cm", "cyclist", "motorcycle"):
-        mesh = load(name).mesh()
+        mesh = load(name).build_mesh()
         top = mesh.vertices_m[mesh.vertices_m[:, 2] > SIZES_M[name][2] - 0.05]
         assert np.ptp(top[:, 1]) < 0.2

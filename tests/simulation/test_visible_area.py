@@ -8,7 +8,7 @@ from embreex.rtcore_scene import EmbreeScene
 from torch.quasirandom import SobolEngine
 
 from torchcover.geometry import invert
-from torchcover.simulation import Scenario, Simulator, SurfaceReference, position_in_shell
+from torchcover.simulation import Scenario, Simulator, SurfaceReference, sample_position_in_shell
 
 
 def visible_area(scene, place_m, box_m, rays, seed, max_range_m=250.0):
@@ -60,18 +60,18 @@ def test_both_see_the_same_area_at_the_same_places(made, seed, monkeypatch):
     places = []
 
     def remembered(ego, shell_m, generator):
-        places.append(position_in_shell(ego, shell_m, generator))
+        places.append(sample_position_in_shell(ego, shell_m, generator))
         return places[-1]
 
-    monkeypatch.setattr("torchcover.simulation.surface_reference.position_in_shell", remembered)
-    simulator = Simulator(made, {}, SurfaceReference((AREA,), rays=16_384, bands_m=BANDS), seed=seed)
+    monkeypatch.setattr("torchcover.simulation.surface_reference.sample_position_in_shell", remembered)
+    simulator = Simulator(made, {}, SurfaceReference((AREA,), num_rays=16_384, bands_m=BANDS), seed=seed)
     points, twins = [], []
     for index in range(8):
         places.clear()
-        step = simulator.step(index)
+        step = simulator.simulate_frame(index)
         points.append((step.reference, step.reference_weights))
-        scene, time_step = simulator.scene_of(index)
-        twin = _scene(scene.world, time_step)
+        scene, time_step = simulator.get_scene_geometry(index)
+        twin = _scene(scene.scene, time_step)
         for place_m in places[-4:]:
             points_m, m2 = visible_area(twin, place_m, (*AREA, (-0.6, 2.1)), 2**15, seed=index)
             twins.append((points_m, m2 / 4))

@@ -55,7 +55,7 @@ def leaks(at_what, caster):
 @lru_cache
 def room_with_needles():
     """The room, and faces without area in front of its walls: single points, and three corners on a line."""
-    room, generator = box(*ROOM_M).moved(at(0.0, 0.0, -ROOM_M[2] / 2)), np.random.default_rng(6)
+    room, generator = box(*ROOM_M).transform(at(0.0, 0.0, -ROOM_M[2] / 2)), np.random.default_rng(6)
     start, along = np.round(generator.uniform(-4, 4, size=(2, 500, 3)) * 64) / 64  # exact in float32, so is the line
     lines = np.stack([start, start + along, start + 2 * along], axis=1)
     points = np.repeat(start[:, None] / 2, 3, axis=1)

@@ -8,7 +8,7 @@ import numpy as np
 from torchcover.geometry import HeightField
 from torchcover.recordings.ground_model import GroundModel, extract_low_surfaces
 from torchcover.recordings.sweeps import find_pose_discontinuities
-from torchcover.simulation.recorded_world import CELL_M, cell_mesh
+from torchcover.simulation.recorded_world import CELL_M, build_cell_mesh
 
 from .case import Case, most
 
@@ -93,8 +93,8 @@ def cells():
 
 def corners_m(dtype=np.float64):
     here, away = cells()
-    found = cell_mesh(here + away).vertices_m.astype(dtype).astype(np.longdouble)
-    return most(found - np.longdouble(CELL_M) * away - cell_mesh(here).vertices_m)
+    found = build_cell_mesh(here + away).vertices_m.astype(dtype).astype(np.longdouble)
+    return most(found - np.longdouble(CELL_M) * away - build_cell_mesh(here).vertices_m)
 
 
 CASES = [

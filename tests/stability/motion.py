@@ -11,7 +11,7 @@ from torchcover.encounters.encounter import Way
 from torchcover.encounters.sighting import MountedRig
 from torchcover.encounters.staging import _along
 from torchcover.simulation import Rig, Scenario
-from torchcover.simulation.moving import Solid
+from torchcover.simulation.moving import BodyGeometry
 from torchcover.simulation.shapes import Box
 from torchcover.simulation.traffic.fleet import tractrix
 from torchcover.simulation.traffic.idm import Driver, acceleration_in, advance, tightness
@@ -113,7 +113,7 @@ def by_cosine(radius_m):
 @lru_cache
 def contacts():
     """Seconds of contact as found and as they are, of a box that crosses at each speed, or stands, before an ego."""
-    ego = Solid(Box.model_validate({"type": "box", "size_m": EGO_M}).mesh())
+    ego = BodyGeometry(Box.model_validate({"type": "box", "size_m": EGO_M}).build_mesh())
     found = []
     for ego_kmh in SPEEDS_KMH:
         for other_kmh in (0.0, *SPEEDS_KMH):

@@ -11,11 +11,11 @@ from embreex.rtcore_scene import EmbreeScene
 from torchcover.geometry import build_transform, convert_euler_to_rotation, transform_points
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation.raycaster import RayCaster
-from torchcover.simulation.rays import Balls, into_tiles, unit_directions
-from torchcover.simulation.scene import Scene
+from torchcover.simulation.rays import SearchSpheres, compute_unit_directions, split_into_tiles
+from torchcover.simulation.scene import SceneGeometry
 from torchcover.simulation.shapes import Box, Mesh, Plane
-from torchcover.simulation.sweep import parabola_weights
-from torchcover.simulation.world import Actor, World
+from torchcover.simulation.sweep import compute_parabola_weights
+from torchcover.simulation.world import Actor, Scene
 
 from .case import Case, most, relative
 
@@ -23,11 +23,11 @@ ROOM_M = np.array([60.37, 40.59, 12.83])
 
 
 def box(*size_m):
-    return Box.model_validate({"type": "box", "size_m": size_m}).mesh()
+    return Box.model_validate({"type": "box", "size_m": size_m}).build_mesh()
 
 
 def plane(*size_m):
-    return Plane.model_validate({"type": "plane", "size_m": size_m}).mesh()
+    return Plane.model_validate({"type": "plane", "size_m": size_m}).build_mesh()
 
 
 def at(*position_m):
@@ -89,7 +89,7 @@ def far_room(offset_m):
     """Walls at UTM-like coordinates, and a vehicle among them."""
     here = np.array([offset_m, -offset_m, 0.0])
     ego = Actor("ego", "car", box(0.1, 0.1, 0.1), Trajectory.create_static(here))
-    return World(static=(box(*ROOM_M).moved(at(*here)),), ego=ego)
+    return Scene(static_meshes=(box(*ROOM_M).transform(at(*here)),), ego=ego)
 
 
 def from_mid_room(caster):
@@ -99,17 +99,19 @@ def from_mid_room(caster):
 
 
 def offset(offset_m):
-    instant = Scene(far_room(offset_m)).at(0)
-    return from_mid_room(lambda rays: instant.range_image(at(0.0, 0.0, 2.0), rays[:, None].astype(np.float64))[0])
+    instant = SceneGeometry(far_room(offset_m)).get_snapshot(0)
+    return from_mid_room(
+        lambda rays: instant.render_range_image(at(0.0, 0.0, 2.0), rays[:, None].astype(np.float64))[0]
+    )
 
 
 def offset_in_float32(offset_m):
-    return from_mid_room(partial(bare_embree, far_room(offset_m).static, [offset_m, -offset_m, 2.0]))
+    return from_mid_room(partial(bare_embree, far_room(offset_m).static_meshes, [offset_m, -offset_m, 2.0]))
 
 
 def scaled(scale, caster):
     """The room in other units; the sensor in its middle."""
-    room = box(*ROOM_M).moved(at(0.0, 0.0, -ROOM_M[2] / 2))
+    room = box(*ROOM_M).transform(at(0.0, 0.0, -ROOM_M[2] / 2))
     mesh = Mesh(room.vertices_m * scale, room.faces)
     return relative(caster(mesh), to_walls(directions(5000), -ROOM_M / 2, ROOM_M / 2) * scale)
 
@@ -138,8 +140,8 @@ def tilted_floor_and_ceiling():
     """Two planes 3 m apart in general position, places on the lower one, directions away from it, and the ranges."""
     rotation = convert_euler_to_rotation(37.0, 21.0, -13.0)
     floor_T = build_transform(rotation, [1.0, 2.0, 3.0])
-    floor = plane(200.0, 200.0).moved(floor_T)
-    ceiling = plane(4000.0, 4000.0).moved(floor_T @ at(0.0, 0.0, 3.0))
+    floor = plane(200.0, 200.0).transform(floor_T)
+    ceiling = plane(4000.0, 4000.0).transform(floor_T @ at(0.0, 0.0, 3.0))
     generator = np.random.default_rng(3)
     places = np.append(generator.uniform(-80, 80, size=(20, 2)), np.zeros((20, 1)), axis=1)
     towards = directions(500).astype(np.float64)
@@ -166,14 +168,14 @@ def along_a_surface(caster):
         slope, azimuth = np.geomspace(0.1, 1e-5, 100), generator.uniform(0, 2 * np.pi, 100)
         flat = np.sqrt(1 - slope**2)
         towards = floor_T[:3, :3] @ np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), slope])
-        range_m = caster([plane(200.0, 200.0).moved(floor_T)], place, towards.astype(np.float32))
+        range_m = caster([plane(200.0, 200.0).transform(floor_T)], place, towards.astype(np.float32))
         found += int(np.isfinite(range_m).sum())
     return found
 
 
 def coincident(caster):
     """Two boxes with a wall in one plane, one inside the outline of the other."""
-    boxes = box(1.0, 1.0, 1.0).moved(at(5.0, 0.0, -0.5)), box(1.0, 3.0, 3.0).moved(at(5.0, 0.0, -1.5))
+    boxes = box(1.0, 1.0, 1.0).transform(at(5.0, 0.0, -0.5)), box(1.0, 3.0, 3.0).transform(at(5.0, 0.0, -1.5))
     y, z = np.random.default_rng(4).uniform(-0.49, 0.49, size=(2, 5000))
     ends = np.stack([np.full(5000, 4.5), y, z])
     towards = (ends / np.linalg.norm(ends, axis=0)).astype(np.float32)
@@ -183,12 +185,16 @@ def coincident(caster):
 def between_slabs(held):
     """Places in the middle one of three slabs upon each other, turned about: those that are not found to be in it."""
     generator, lost = np.random.default_rng(6), 0
-    slabs = box(20.0, 20.0, 1.0), box(20.0, 20.0, 2.0).moved(at(0, 0, 1.0)), box(24.0, 16.0, 1.0).moved(at(0, 0, 3.0))
+    slabs = (
+        box(20.0, 20.0, 1.0),
+        box(20.0, 20.0, 2.0).transform(at(0, 0, 1.0)),
+        box(24.0, 16.0, 1.0).transform(at(0, 0, 3.0)),
+    )
     for scale_m in np.repeat([1e-6, 1.0, 1e6], 200):
         turn = build_transform(
             convert_euler_to_rotation(*generator.uniform(-180, 180, 3)), generator.uniform(-50, 50, 3)
         )
-        moved = [mesh.moved(turn) for mesh in slabs]
+        moved = [mesh.transform(turn) for mesh in slabs]
         caster = RayCaster([Mesh(mesh.vertices_m * scale_m, mesh.faces) for mesh in moved])
         place_m = transform_points(turn, np.append(generator.uniform(-6, 6, 2), generator.uniform(1.1, 2.9))[None])[0]
         lost += not held(caster, place_m * scale_m)
@@ -211,9 +217,9 @@ def by_a_ray(caster, place_m):
 @lru_cache
 def around_and_ahead():
     """A turn of 40 rows, and a narrow field of view, as tiles; and where they are mounted."""
-    turn = unit_directions(np.linspace(-60.0, 60.0, 40)[:, None], np.linspace(-180.0, 180.0, 180)[None])
-    ahead = unit_directions(np.linspace(-0.01, 0.01, 16)[:, None], np.linspace(-0.01, 0.01, 16)[None])
-    return (*into_tiles(turn), *into_tiles(ahead)), build_transform(
+    turn = compute_unit_directions(np.linspace(-60.0, 60.0, 40)[:, None], np.linspace(-180.0, 180.0, 180)[None])
+    ahead = compute_unit_directions(np.linspace(-0.01, 0.01, 16)[:, None], np.linspace(-0.01, 0.01, 16)[None])
+    return (*split_into_tiles(turn), *split_into_tiles(ahead)), build_transform(
         convert_euler_to_rotation(37.0, 11.0, -8.0), [1.7, -0.4, 1.9]
     )
 
@@ -233,7 +239,7 @@ def spared(met_by):
                     way_m = (centre_m[0] - vehicle_T_sensor[:3, 3]).astype(np.longdouble) @ vehicle_T_sensor[:3, :3]
                     along_m = np.maximum(rays @ way_m, 0.0)
                     through = np.sqrt(((along_m[:, None] * rays - way_m) ** 2).sum(axis=1)) <= radius_m
-                    lost += int((through & ~met_by(Balls(centre_m, radius_m), tile, vehicle_T_sensor)).sum())
+                    lost += int((through & ~met_by(SearchSpheres(centre_m, radius_m), tile, vehicle_T_sensor)).sum())
     return lost
 
 
@@ -249,8 +255,10 @@ def met_by_cosine(balls, tile, vehicle_T_sensor):
 def slope_from(offset_m):
     """A slope of 400 m in general position at UTM-like coordinates, under an ego."""
     here = np.array([offset_m, -offset_m, 0.0])
-    slope = plane(400.0, 400.0).moved(build_transform(convert_euler_to_rotation(37.0, 11.0, -8.0), [*here[:2], -3.0]))
-    return World(static=(slope,), ego=Actor("ego", "car", box(0.1, 0.1, 0.1), Trajectory.create_static(here)))
+    slope = plane(400.0, 400.0).transform(
+        build_transform(convert_euler_to_rotation(37.0, 11.0, -8.0), [*here[:2], -3.0])
+    )
+    return Scene(static_meshes=(slope,), ego=Actor("ego", "car", box(0.1, 0.1, 0.1), Trajectory.create_static(here)))
 
 
 def incidence(cosine):
@@ -262,15 +270,15 @@ def incidence(cosine):
 
 
 def incidence_ours(towards):
-    (tile,) = into_tiles(towards[:, None].astype(np.float64), tile_columns=towards.shape[1])
-    scan = Scene(slope_from(1e6 + 0.3)).at(0).scan(at(0.0, 0.0, 2.0), [tile])
+    (tile,) = split_into_tiles(towards[:, None].astype(np.float64), max_columns=towards.shape[1])
+    scan = SceneGeometry(slope_from(1e6 + 0.3)).get_snapshot(0).scan(at(0.0, 0.0, 2.0), [tile])
     cosine = np.full(towards.shape[1], np.nan)
-    cosine[scan.ray] = scan.struck().cos_incidence
+    cosine[scan.ray_indices] = scan.find_attributes().cos_incidence
     return np.where(np.isnan(cosine), np.abs(convert_euler_to_rotation(37.0, 11.0, -8.0)[:, 2] @ towards), cosine)
 
 
 def incidence_in_float32(towards):
-    (mesh,) = slope_from(1e6 + 0.3).static
+    (mesh,) = slope_from(1e6 + 0.3).static_meshes
     a, b, c = mesh.vertices_m.astype(np.float32)[mesh.faces[0]]
     normal = np.cross(b - a, c - a)
     return np.abs(normal / np.linalg.norm(normal) @ towards)
@@ -283,7 +291,7 @@ def turning(samples):
     samples_s = np.linspace(0.2, 0.3, samples)
     poses = np.stack([turn.interpolate(each) for each in samples_s])
     if samples == 3:
-        found = np.tensordot(parabola_weights(samples_s, times_s), poses, 1)
+        found = np.tensordot(compute_parabola_weights(samples_s, times_s), poses, 1)
     else:
         share = ((times_s - 0.2) / 0.1)[:, None, None]
         found = (1 - share) * poses[0] + share * poses[1]
@@ -331,7 +339,7 @@ CASES = [
     Case("a frame that turns 9 degrees in a sweep, 100 m away", "float64 at each time", "m", 0.01, partial(turning, 3),
          "straight between two poses", partial(turning, 2)),
     Case("rays through balls of 1e-9 m to 100 km, around the sensor, beside and behind it, 100 km away", "longdouble",
-         "of 536,832 spared", 0, partial(spared, Balls.met_by), "cosine in float32", partial(spared, met_by_cosine)),
+         "of 536,832 spared", 0, partial(spared, SearchSpheres.find_rays_through), "cosine in float32", partial(spared, met_by_cosine)),
 ]  # fmt: skip
 
 

@@ -5,7 +5,7 @@ from functools import lru_cache
 import mpmath
 import numpy as np
 
-from torchcover.simulation.returns import SURE, log_excess, return_probability
+from torchcover.simulation.returns import SURE, compute_log_excess, compute_return_probability
 
 from .case import Case, most
 
@@ -39,7 +39,7 @@ def exact_probability():
 
 def our_excess():
     range_m, cosine, reflectivity, exponent = extremes()
-    return log_excess(range_m, cosine, reflectivity, exponent, 100.0, FOG_PER_M)
+    return compute_log_excess(range_m, cosine, reflectivity, exponent, 100.0, FOG_PER_M)
 
 
 def excess_error():
@@ -57,7 +57,7 @@ def power_first_error():
 
 
 def probability_error():
-    return most(return_probability(our_excess(), SPREAD) - exact_probability())
+    return most(compute_return_probability(our_excess(), SPREAD) - exact_probability())
 
 
 def logistic_error():

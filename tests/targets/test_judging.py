@@ -11,7 +11,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from torchcover.evaluation import build_flat_ground, build_target_record, map_target_visibility, save_target_map
 from torchcover.geometry import BoundingBox
 from torchcover.report.scene import UNSEEN
-from torchcover.simulation import with_ego
+from torchcover.simulation import set_ego
 from torchcover.targets import Raster, Target, TargetMap
 
 CAR = BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5))
@@ -157,10 +157,10 @@ def test_names_become_bodies(tmp_path):
         "name: my post\nparts: [{name: p, shape: {type: box, size_m: [0.2, 0.2, 0.5]}, poses: [{z_m: -3}]}]\n"
     )
     post = Target.load(tmp_path / "post.yaml")
-    assert (post.name, post.solid.box.lower_m[2]) == ("post", 0.0)  # it stands on the ground
+    assert (post.name, post.solid.bounding_box.lower_m[2]) == ("post", 0.0)  # it stands on the ground
     (tmp_path / "plate.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
-    assert Target.load(tmp_path / "plate.obj").solid.box.size_m == (1.0, 1.0, 1.0)
-    assert with_ego(build_flat_ground(), {}, tmp_path / "plate.obj").ego_box().size_m == (1.0, 1.0, 1.0)
+    assert Target.load(tmp_path / "plate.obj").solid.bounding_box.size_m == (1.0, 1.0, 1.0)
+    assert set_ego(build_flat_ground(), {}, tmp_path / "plate.obj").compute_ego_box().size_m == (1.0, 1.0, 1.0)
     (tmp_path / "flat.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\nf 1 3 2\n")
     with pytest.raises(ValueError, match="lower < upper"):
         Target.load(tmp_path / "flat.obj")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from torchcover.simulation import Rig, Scenario
-from torchcover.simulation.scene import Scene
+from torchcover.simulation.scene import SceneGeometry
 from torchcover.targets.placing import Raster, ground_under
 from torchcover.targets.result import FREE, OUTSIDE
 from torchcover.targets.surface import Target
@@ -21,14 +21,14 @@ def scenario(*bodies, **pose):
 
 
 def instant(made):
-    return Scene(made.world()).at(0)
+    return SceneGeometry(made.world()).get_snapshot(0)
 
 
 @pytest.mark.parametrize(("pitch_deg", "roll_deg"), [(0, 0), (4, 0), (-4, 3), (0, -3)])
 def test_the_ground_under_a_place_is_that_of_a_tilted_plane(pitch_deg, roll_deg):
     tilted = {**FLOOR, "poses": [{"pitch_deg": pitch_deg, "roll_deg": roll_deg}]}
     places = np.random.default_rng(1).uniform(-20, 20, (200, 2))
-    normal = Scene(scenario(tilted).world()).world.static[0].vertices_m
+    normal = SceneGeometry(scenario(tilted).build_scene()).scene.static_meshes[0].vertices_m
     across = np.cross(normal[1] - normal[0], normal[2] - normal[0])
     np.testing.assert_allclose(
         ground_under(instant(scenario(tilted)), places), -(places @ across[:2]) / across[2], atol=1e-3

@@ -11,7 +11,7 @@ from torchcover.coverage.bodies import TRIED
 from torchcover.data import SimulatedFrames
 from torchcover.geometry import build_transform
 from torchcover.simulation import PaperReference
-from torchcover.simulation.regions_of_interest import near_field
+from torchcover.simulation.regions_of_interest import build_near_field
 from torchcover.targets import Probes, Raster, Target, counting, probing, survey
 from torchcover.targets.probing import Probe
 
@@ -25,7 +25,9 @@ BLOCK = {"name": "block", "shape": {"type": "box", "size_m": [40, 4, 2]}, "poses
 
 
 def simulated(scenario, steps=8, rigs=TOP, seed=0):
-    return SimulatedFrames(scenario, rigs, steps=steps, seed=seed, reference_sensor=PaperReference(rows=2, columns=2))
+    return SimulatedFrames(
+        scenario, rigs, num_frames=steps, seed=seed, reference_sensor=PaperReference(rows=2, columns=2)
+    )
 
 
 def probed(frames, indices=None, body="pole", **budget):
@@ -45,7 +47,7 @@ def test_the_numbers_are_those_of_targets_over_the_same_cells(name, bodies, monk
     scenario, target = world(*bodies), Target.load(name)
     for module in (counting, probing):  # its surface is looked at from random places
         monkeypatch.setattr(module, "pose_in_shell", lambda *_: build_transform(np.eye(3), np.array([0.3, 0.2, 1.3])))
-    found = survey(TOP, scenario, target, Raster.around(scenario.ego_box(), 3.0))
+    found = survey(TOP, scenario, target, Raster.around(scenario.compute_ego_box(), 3.0))
     probes = probed(simulated(scenario, steps=1), body=name, places=ALL)
     x, y = (torch.from_numpy(each) for each in found.raster.positions_m.T)
     for number, region in enumerate(probes.regions):
@@ -60,9 +62,9 @@ def test_the_numbers_are_those_of_targets_over_the_same_cells(name, bodies, monk
 
 
 def test_every_place_of_a_region_is_as_likely_as_any_other_and_so_the_budget_moves_no_number():
-    vehicle = world().ego_box()
+    vehicle = world().compute_ego_box()
     grid = BevGrid((-6.0, 6.0), (-5.0, 5.0), 1.0)
-    pole = Probe.of(Target.load("pole"), vehicle, near_field(vehicle.outline_m), grid)
+    pole = Probe.of(Target.load("pole"), vehicle, build_near_field(vehicle.outline_m), grid)
     generator = np.random.default_rng(0)
     for places, draws in ((1, 1200), (3, 400)):
         counts = np.bincount(
@@ -122,11 +124,11 @@ def test_rays_that_were_cast_for_the_clouds_end_where_they_are_cast_again(tmp_pa
     frame = frames[3]
     probes = Probes(frames.simulator, [Target.load("pole")], every=1)
     kept = probes.compute_sums(frame)
-    stage, instant = frames.simulator.placed(3)
-    (mounted,) = stage.mounted["small"]
-    known = mounted.ends(instant)
+    stage, instant = frames.simulator.prepare_frame(3)
+    (mounted,) = stage.sensors_by_rig["small"]
+    known = mounted.compute_ray_ends(instant)
     monkeypatch.setattr(mounted, "_scanned", None)
-    anew = mounted.ends(instant)
+    anew = mounted.compute_ray_ends(instant)
     assert np.array_equal(known.range_m, anew.range_m)
     assert np.array_equal(known.is_hit, anew.is_hit)
     assert 0 < known.is_hit.sum() < len(known.is_hit)

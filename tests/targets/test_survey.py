@@ -7,7 +7,7 @@ import torch
 from torchcover.evaluation.target_survey import summarize_target_maps
 from torchcover.geometry import BoundingBox, build_transform
 from torchcover.simulation import PaperReference, Scenario, Simulator
-from torchcover.simulation.bodies import merge
+from torchcover.simulation.bodies import merge_meshes
 from torchcover.simulation.shapes import Box
 from torchcover.targets import STATES, Raster, Target, counting, survey
 from torchcover.targets.placing import yaws
@@ -42,15 +42,15 @@ def test_points_are_those_of_a_simulation_with_the_target_in_the_world(name, hea
     target, scenario = Target.load(name), world(WALL)
     sensors = rig(lidar(), lidar("corner", mount={"x_m": 2.1, "y_m": 1.1, "z_m": 0.6, "yaw_deg": 45}), CAMERA)
     seen = survey(sensors, scenario, target, RASTER, heading=heading)
-    yaw = yaws(heading, target.solid.box, seen.vehicle, RASTER.positions_m).reshape(RASTER.shape)
+    yaw = yaws(heading, target.solid.bounding_box, seen.vehicle, RASTER.positions_m).reshape(RASTER.shape)
     compared = 0
     for row, column in [(0, 0), (4, 9), (4, 12), (6, 12), (5, 13), (8, 7), (2, 10), (5, 2)]:
         assert seen.state[row, column] == FREE
         x_m, y_m = seen.x_m[column], seen.y_m[row]
         simulator = Simulator(with_target(scenario, target.name, x_m, y_m, yaw[row, column]), {"r": sensors}, REFERENCE)
-        scans = simulator.step(0).scans["r"]
+        scans = simulator.simulate_frame(0).scans["r"]
         counts = [
-            sensor.counts_as * on_target(scan.points, target, x_m, y_m, yaw[row, column])
+            sensor.pixels_per_sample * on_target(scan.points, target, x_m, y_m, yaw[row, column])
             for sensor, scan in zip(sensors.sensors, scans, strict=True)
         ]
         assert seen.sensor_points[:, row, column].tolist() == counts
@@ -70,7 +70,7 @@ def test_a_radars_points_are_those_of_its_cells_with_the_target_in_the_world(nam
     counts = []
     for row, column in zip(*np.nonzero(seen.state == FREE), strict=True):
         place = seen.x_m[column], seen.y_m[row], 0.0
-        [scan] = Simulator(with_target(scenario, target.name, *place), {"r": sensors}, REFERENCE).scans(0)["r"]
+        [scan] = Simulator(with_target(scenario, target.name, *place), {"r": sensors}, REFERENCE).simulate_scans(0)["r"]
         counts.append(on_target(scan.points, target, *place))
         assert seen.points[row, column] == counts[-1]
     assert len(counts) > 20
@@ -104,7 +104,7 @@ def test_points_are_the_mean_over_the_steps_of_a_world_that_moves(tmp_path):
         counts = []
         for index in free:
             pose = seen.x_m[column] + 2.0 * index, seen.y_m[row], 0.0
-            step = Simulator(with_target(scenario, target.name, *pose), {"r": sensors}, REFERENCE).step(index)
+            step = Simulator(with_target(scenario, target.name, *pose), {"r": sensors}, REFERENCE).simulate_frame(index)
             counts.append(on_target(step.clouds["r"], target, seen.x_m[column], seen.y_m[row], 0.0))
         assert seen.points[row, column] == pytest.approx(np.mean(counts))
         assert seen.seen[row, column] == pytest.approx(np.mean(np.array(counts) >= 5))
@@ -192,7 +192,7 @@ def test_a_target_that_no_random_place_sees_has_an_unknown_share():
 
 def test_the_share_is_that_of_the_surface_which_is_near_a_measured_point():
     """One row of rays at 1 m meets a wall of 2 m: what is within 0.3 m of it, of the side that faces the vehicle."""
-    mesh = Box(type="box", size_m=(0.02, 4.0, 2.0)).mesh()
+    mesh = Box(type="box", size_m=(0.02, 4.0, 2.0)).build_mesh()
     level = lidar(mount={"z_m": 1.0}, channels=1, vertical_fov_deg=[0, 0], columns=36000)
     ego = {"shape": {"type": "box", "size_m": [4.0, 2.0, 0.5]}}
     raster = Raster((4.0, 12.0), (-4.0, 4.0), 8.0)
@@ -219,10 +219,11 @@ def test_the_surface_is_spread_by_area_and_leaves_out_what_is_inside():
 def test_a_target_hides_its_own_rear():
     """Two plates of a square metre, one behind the other."""
     front, rear = (
-        Box(type="box", size_m=(0.02, 1, 1)).mesh().moved(build_transform(np.eye(3), [x, 0, 0])) for x in (0.1, -0.1)
+        Box(type="box", size_m=(0.02, 1, 1)).build_mesh().transform(build_transform(np.eye(3), [x, 0, 0]))
+        for x in (0.1, -0.1)
     )
     raster = Raster((11.0, 13.0), (-1.0, 1.0), 2.0)
-    seen = survey(rig(), world(), Target("plates", merge([front, rear])), raster, heading="wide")
+    seen = survey(rig(), world(), Target("plates", merge_meshes([front, rear])), raster, heading="wide")
     assert seen.visible_m2[0, 0] == pytest.approx(1.0, abs=0.35)
 
 

@@ -42,5 +42,5 @@ def on_target(points_m, target: Target, x_m, y_m, yaw_rad):
     away = points_m[:, :2].astype(np.float64) - [x_m, y_m]
     cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
     there = np.column_stack([away[:, 0] * cos + away[:, 1] * sin, away[:, 1] * cos - away[:, 0] * sin, points_m[:, 2]])
-    low, high = np.array(target.solid.box.lower_m) - 1e-3, np.array(target.solid.box.upper_m) + 1e-3
+    low, high = np.array(target.solid.bounding_box.lower_m) - 1e-3, np.array(target.solid.bounding_box.upper_m) + 1e-3
     return int(((there >= low) & (there <= high)).all(axis=1)[points_m[:, 2] > 1e-4].sum())

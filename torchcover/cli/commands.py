@@ -114,12 +114,12 @@ def rig(
 ) -> None:
     """Print the sensors of a recording as a rig: mounts, LiDARs and cameras for `show` and `evaluate`."""
     from torchcover.files import to_yaml
-    from torchcover.simulation import rig_document
+    from torchcover.simulation import build_rig_document
 
     models = dict(_pair(text, "--lidar", "LIDAR_TOP=velodyne_hdl32e") for text in lidar or ())
     names = [name for of in sensors or () for name in of.split(",")]
     recording = options.open_recording(frames, options.load_recording_settings(assignments))
-    document = rig_document(recording, sensors=names or None, models=models, raw_images=raw_images)
+    document = build_rig_document(recording, sensor_names=names or None, lidar_models=models, raw_images=raw_images)
     typer.echo(to_yaml(document), nl=False)
 
 
@@ -137,10 +137,10 @@ def world(
     ] = None,
 ) -> None:
     """Make a drive a scenario: the ground and all that stands as it was seen, what moves on its tracks."""
-    from torchcover.simulation import write_world
+    from torchcover.simulation import write_scenario
 
     opened = options.open_recording(recording, options.load_recording_settings(assignments), vehicle)
-    told = write_world(opened, out, steps=num_frames)
+    told = write_scenario(opened, out, num_frames=num_frames)
     typer.echo(f"{told}. Wrote {out}; try rigs in it: torchcover evaluate RIG --scenario {out / 'scenario.yaml'}")
 
 
@@ -185,7 +185,7 @@ def calibrate(
     calibrated, found = calibrate(opened, Rig.load(rig))
     calibrated.save(out)
     for one in found:
-        typer.echo(one.words)
+        typer.echo(one.text)
     typer.echo(f"Wrote {out}; simulate with it: torchcover evaluate {out}")
 
 

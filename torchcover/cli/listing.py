@@ -10,7 +10,7 @@ from typing import Any
 
 import typer
 
-from torchcover.simulation import builtin_documents
+from torchcover.simulation import load_builtin_documents
 
 
 def print_builtin(search_text: str | None) -> None:
@@ -38,7 +38,7 @@ def print_builtin(search_text: str | None) -> None:
     for kind, what_of in kinds.items():
         if search_text in kinds and search_text != kind:
             continue
-        documents = builtin_documents(kind)
+        documents = load_builtin_documents(kind)
         if search_text is None:
             names = textwrap.fill(", ".join(documents), width or 80, initial_indent="  ", subsequent_indent="  ")
             typer.echo(f"{kind} ({len(documents)})\n{names}\n")

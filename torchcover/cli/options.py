@@ -178,9 +178,9 @@ def open_recording(frames: Path, settings: "RecordingSettings", vehicle: str | N
 
     recording = open_(frames, settings)
     if vehicle is not None:
-        from torchcover.simulation.recorded_rig import recorded_body
+        from torchcover.simulation.recorded_rig import build_ego_box
 
-        recording.ego_box = recorded_body(recording, vehicle)
+        recording.ego_box = build_ego_box(recording, vehicle)
     return recording
 
 
@@ -200,7 +200,7 @@ def combine_regions(regions_file: Path | None, regions: Sequence[str] | None) ->
     from pydantic import ValidationError
 
     from torchcover.simulation import RegionsOfInterest
-    from torchcover.simulation.documents import explain
+    from torchcover.simulation.documents import format_validation_error
 
     content = {} if regions_file is None else RegionsOfInterest.load(regions_file).model_dump(exclude_unset=True)
     if regions:
@@ -209,7 +209,7 @@ def combine_regions(regions_file: Path | None, regions: Sequence[str] | None) ->
     try:
         return RegionsOfInterest.model_validate(content)
     except ValidationError as error:
-        raise ValueError(explain(error)) from error
+        raise ValueError(format_validation_error(error)) from error
 
 
 def _named(option: str, given: Sequence[str], bounds: Sequence[str]) -> dict[str, tuple[float, ...]]:

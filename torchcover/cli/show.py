@@ -14,10 +14,17 @@ from torchcover.evaluation.settings import DEFAULT_SCENARIO
 from torchcover.evaluation.task import load_named_rig
 from torchcover.files import BadFileError, write_atomically
 from torchcover.report import Terminal, check_animation, write_animation
-from torchcover.simulation import Scenario, builtin_names
-from torchcover.simulation.bodies import Body, Vehicle, VehicleShape, body_called, describe_windows, mover_mesh
-from torchcover.simulation.documents import nearest, read_mapping
-from torchcover.simulation.rig import with_ego
+from torchcover.simulation import Scenario, list_builtin_names
+from torchcover.simulation.bodies import (
+    Body,
+    Vehicle,
+    VehicleShape,
+    build_actor_mesh,
+    create_body_shape,
+    describe_windows,
+)
+from torchcover.simulation.documents import read_mapping, suggest_names
+from torchcover.simulation.rig import set_ego
 from torchcover.simulation.shapes import MeshFile
 from torchcover.simulation.sight import describe_self_hits
 
@@ -54,12 +61,14 @@ def show_item(
         given = {"--scenario": scenario, "--rig": rig, "--vehicle": vehicle, "--step": frame_index, "--seed": seed}
         _refuse("rigs and scenarios", given, f"{name!r} is a vehicle")
         _refuse("a scenario", {"--animation": animation}, f"{name!r} is a vehicle")
-        shape = body_called(name)
+        shape = create_body_shape(name)
         body = Vehicle.load(name) if isinstance(shape, VehicleShape) else _of_mesh(shape)
         _say(console, body.description)
-        length_m, width_m, height_m = np.ptp(mover_mesh(name, shape).vertices_m, axis=0)  # with what is doubtful of it
+        length_m, width_m, height_m = np.ptp(
+            build_actor_mesh(name, shape).vertices_m, axis=0
+        )  # with what is doubtful of it
         _say(console, f"{length_m:.2f} m long (x, forward), {width_m:.2f} m wide (y), {height_m:.2f} m high (z, up)")
-        corners_m = np.concatenate([mesh.vertices_m for part in body.parts for mesh in part.meshes()])
+        corners_m = np.concatenate([mesh.vertices_m for part in body.parts for mesh in part.build_meshes()])
         moved_m = -np.append((corners_m.min(axis=0) + corners_m.max(axis=0))[:2] / 2, corners_m[:, 2].min())
         if np.abs(moved_m).max() >= SMALLEST_MOVE_M:
             by = ", ".join(f"{axis} {metres:+.2f}" for axis, metres in zip("xyz", moved_m.round(2) + 0.0, strict=True))
@@ -76,8 +85,11 @@ def show_item(
             )
         world = Scenario.load(scenario or DEFAULT_SCENARIO)
         _say(console, shown.description)
-        ego = with_ego(world, {name: shown}, vehicle).ego_mesh()
-        _say(console, describe_self_hits(shown.sensors, shown.own_mesh(ego)) or "No ray ends on the own vehicle.")
+        ego = set_ego(world, {name: shown}, vehicle).build_ego_mesh()
+        _say(
+            console,
+            describe_self_hits(shown.sensors, shown.build_occluder_mesh(ego)) or "No ray ends on the own vehicle.",
+        )
         _write(
             console,
             out / Path(name).stem,
@@ -99,7 +111,7 @@ def show_item(
         _write(console, out / Path(name).stem, (("", figure) for figure in figures))
         return
     drawn = track(figures, "pictures", total=len(steps), console=console)
-    write_animation(animation, drawn, frames_per_s=1 / (world.step_s * steps.step))
+    write_animation(animation, drawn, frames_per_s=1 / (world.effective_time_step_s * steps.step))
     console.print(f"Wrote {animation}", markup=False, soft_wrap=True)
 
 
@@ -120,8 +132,8 @@ def _write(console: Terminal, stem: Path, figures: Iterable[tuple[str, Figure]])
 
 
 def _steps_of_film(world: Scenario, first: int) -> range:
-    every = max(round(1 / (PER_S * world.step_s)), 1)
-    return range(first, first + max(round(FILM_S / world.step_s), every) + 1, every)
+    every = max(round(1 / (PER_S * world.effective_time_step_s)), 1)
+    return range(first, first + max(round(FILM_S / world.effective_time_step_s), every) + 1, every)
 
 
 def _kind(name: str) -> str:
@@ -133,11 +145,11 @@ def _kind(name: str) -> str:
         return next((kind for kind, key in KINDS.items() if key in keys), "scenario")
     if Path(name).suffix:
         return "vehicle"  # a mesh
-    of = {kind: builtin_names(f"{kind}s") for kind in KINDS}
+    of = {kind: list_builtin_names(f"{kind}s") for kind in KINDS}
     kinds = [kind for kind, names in of.items() if name in names]
     if len(kinds) != 1:
         both = f"both a {' and a '.join(kinds)}: give the YAML file"
-        meant = nearest(name, sorted(set().union(*of.values())))
+        meant = suggest_names(name, sorted(set().union(*of.values())))
         raise ValueError(f"{name!r} is {both if kinds else f'neither a .yaml file nor built in; {meant}'}")
     return kinds[0]
 

@@ -97,7 +97,8 @@ def score_placements(
     if len(rigs) < LEAST:
         raise ValueError(f"rigs: three or more are needed to speak of ranks; got {', '.join(rigs) or 'none'}")
     carried = {
-        name: load_rig(rig).sensing(sensor_model).model_copy(update={"name": name}) for name, rig in rigs.items()
+        name: load_rig(rig).apply_sensor_model(sensor_model).model_copy(update={"name": name})
+        for name, rig in rigs.items()
     }
     region = build_circle_region() if region is None else region
     result = evaluate(
@@ -120,7 +121,9 @@ def score_placements(
             *_own([result.coverages[rig] for rig in rigs], region, seed),
             *_of_others(result.metrics.rankings),
             _of_rigs("mean mounting height", "m", [round(height_m, 6) for height_m in heights_m]),
-            _of_rigs("rays", "rays", [float(sum(sensor.rays for sensor in rig.sensors)) for rig in carried.values()]),
+            _of_rigs(
+                "rays", "rays", [float(sum(sensor.num_rays for sensor in rig.sensors)) for rig in carried.values()]
+            ),
         ),
         num_frames=num_frames,
         sensor_models={name: rig.sensor_model for name, rig in carried.items()},

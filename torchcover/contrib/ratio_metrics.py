@@ -166,7 +166,7 @@ class PerceptionEntropy(SceneRatios):
         range_borders_m: Sequence[float] = RANGE_BORDERS_M,
         **kwargs: Any,  # noqa: ANN401  (of `FrameMetric`)
     ) -> None:
-        cameras = {sensor.name: sensor.counts_as for sensor in sensors if isinstance(sensor, CameraSensor)}
+        cameras = {sensor.name: sensor.pixels_per_sample for sensor in sensors if isinstance(sensor, CameraSensor)}
         strata = ObjectStrata(categories, range_borders_m)
         given = {"range_m": strata.range_borders_m[-1], "constants": dict(CONSTANTS), "cameras": sorted(cameras)}
         ratios = [

@@ -274,8 +274,8 @@ def compute_field_of_view(sensors: Sequence[Sensor], grid: BevGrid, ego_mesh: Me
     seen = np.zeros((len(grid.heights), *flat.shape), dtype=bool)
     caster = None if ego_mesh is None else RayCaster([ego_mesh])
     for sensor in sensors:
-        vehicle_T_sensor = sensor.mount.matrix()
-        directions = sensor.directions().reshape(3, -1)
+        vehicle_T_sensor = sensor.mount.to_matrix()
+        directions = sensor.compute_directions().reshape(3, -1)
         directions = vehicle_T_sensor[:3, :3] @ directions[:, ~np.isnan(directions[0])]
         origin_m = vehicle_T_sensor[:3, 3]
         ends_m = _ends_m(origin_m, directions, min(sensor.max_range_m, FARTHEST_M), caster)
@@ -309,5 +309,5 @@ def _ends_m(origin_m: Float64, directions: Float64, range_m: float, ego: RayCast
     if ego is None:
         return ends_m
     hits = ego.cast(origin_m, directions.astype(np.float32), ends_m.astype(np.float32))
-    ends_m[hits.body >= 0] = 0.0  # what points at the vehicle sees the vehicle
+    ends_m[hits.body_indices >= 0] = 0.0  # what points at the vehicle sees the vehicle
     return ends_m

@@ -16,7 +16,7 @@ from torchcover.frames import Frame
 from torchcover.geometry import BoundingBox
 from torchcover.geometry.arrays import Bools, Float64, Int64
 from torchcover.simulation import Sensor
-from torchcover.simulation.memory import check_fits
+from torchcover.simulation.memory import check_memory_fits
 
 # In voxels. A ray that passes an edge or a corner this closely goes through it: what it has of the voxel beside it is
 # rounding. At 10,000 voxels a coordinate of float64 is a thousand times finer.
@@ -271,7 +271,7 @@ def create_voxel_grid(region: BoundingBox, voxel_m: float, bytes_per_voxel: int)
     """
     grid = VoxelGrid(region, float(voxel_m))
     what = f"{grid.num_voxels:,} voxels of {voxel_m:g} m in {' x '.join(f'{size:g}' for size in region.size_m)} m"
-    check_fits(what, bytes_per_voxel * grid.num_voxels, "take larger voxels, or a smaller region")
+    check_memory_fits(what, bytes_per_voxel * grid.num_voxels, "take larger voxels, or a smaller region")
     return grid
 
 
@@ -286,7 +286,7 @@ def check_sensors(sensors: Sequence[Sensor]) -> None:
 
 def count_rays(sensors: Sequence[Sensor]) -> int:
     """How many rays they have, without the pixels that have none."""
-    return sum(int((~np.isnan(sensor.directions()[0])).sum()) for sensor in sensors)
+    return sum(int((~np.isnan(sensor.compute_directions()[0])).sum()) for sensor in sensors)
 
 
 def mark_crossed_by_rays(sensors: Sequence[Sensor], grid: VoxelGrid) -> Bools:
@@ -296,8 +296,8 @@ def mark_crossed_by_rays(sensors: Sequence[Sensor], grid: VoxelGrid) -> Bools:
     """
     crossed = np.zeros(grid.shape, dtype=bool)
     for sensor in sensors:
-        vehicle_T_sensor = sensor.mount.matrix()
-        directions = sensor.directions().reshape(3, -1).T @ vehicle_T_sensor[:3, :3].T
+        vehicle_T_sensor = sensor.mount.to_matrix()
+        directions = sensor.compute_directions().reshape(3, -1).T @ vehicle_T_sensor[:3, :3].T
         find_crossed_voxels(grid, vehicle_T_sensor[:3, 3], directions, sensor.max_range_m, output=crossed)
     return crossed
 
@@ -310,7 +310,7 @@ def mark_crossed_before_hits(sensors: Sequence[Sensor], frame: Frame, rig_name: 
 
     ValueError: which points are of which sensor is unknown, or a sensor is none of these.
     """
-    mounts = {sensor.name: sensor.mount.matrix()[:3, 3] for sensor in sensors}
+    mounts = {sensor.name: sensor.mount.to_matrix()[:3, 3] for sensor in sensors}
     crossed = np.zeros(grid.shape, dtype=bool)
     for name, points in frame.get_clouds_by_sensor(rig_name).items():
         if name not in mounts:

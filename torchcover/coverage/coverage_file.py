@@ -29,9 +29,9 @@ from torchcover.files import (
     TooLargeError,
     check_dtype_kind,
     check_memory,
+    guard_reader,
     parse_json,
     read_npz,
-    guard_reader,
     write_npz,
 )
 from torchcover.metrics.blocks import FINER

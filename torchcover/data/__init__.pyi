@@ -28,10 +28,10 @@ from torchcover.recordings import read_objects as read_objects
 from torchcover.simulation import DEFAULT_REFERENCE as DEFAULT_REFERENCE
 from torchcover.simulation import GRID_X_M as GRID_X_M
 from torchcover.simulation import GRID_Y_M as GRID_Y_M
-from torchcover.simulation import Asked as Asked
+from torchcover.simulation import QueryPlan as QueryPlan
 from torchcover.simulation import RegionsOfInterest as RegionsOfInterest
 from torchcover.simulation import SimulatedFrames as SimulatedFrames
-from torchcover.simulation import reference_called as reference_called
-from torchcover.simulation import reference_of_objects as reference_of_objects
-from torchcover.simulation import rig_document as rig_document
+from torchcover.simulation import build_rig_document as build_rig_document
+from torchcover.simulation import create_object_reference as create_object_reference
+from torchcover.simulation import create_reference_sensor as create_reference_sensor
 from torchcover.simulation import write_recording as write_recording

@@ -19,7 +19,7 @@ from pydantic import (
 )
 
 from torchcover.simulation.bodies import Shape, Vehicle, VehicleShape
-from torchcover.simulation.documents import BuiltIn, Document, by_name, explain
+from torchcover.simulation.documents import BuiltInDocument, Document, build_name_validator, format_validation_error
 from torchcover.simulation.returns import CLEAR, Weather
 
 # Of a family: ten times what anybody would wait for.
@@ -131,7 +131,7 @@ class Encounter(Document):
     ego: Way
     other: Other
     obstacles: tuple[Obstacle, ...] = ()
-    weather: Annotated[Weather, by_name(Weather)] = CLEAR
+    weather: Annotated[Weather, build_name_validator(Weather)] = CLEAR
     seconds: Annotated[float, Field(gt=0.0, le=60.0)] = 6.0
     speed_is_swept: bool = True
 
@@ -170,7 +170,7 @@ class Encounter(Document):
         return self.seconds if from_m is None or speed_mps == 0 else min(self.seconds, from_m / speed_mps)
 
 
-class EncounterSet(BuiltIn):
+class EncounterSet(BuiltInDocument):
     """Encounters of some families. In a family any value may be swept, as a list, or drawn, as `{from: 1.0, to: 1.4}`.
 
     All lists are combined with each other, and each combination with the same `draws` of what is drawn: evenly from
@@ -218,7 +218,7 @@ class EncounterSet(BuiltIn):
                     if first.setdefault(name, number) < number:
                         raise ValueError(f"encounters.{first[name]} is called {name!r}, too")
             except ValueError as error:
-                words = explain(error) if isinstance(error, ValidationError) else error
+                words = format_validation_error(error) if isinstance(error, ValidationError) else error
                 raise ValueError(f"encounters.{number}: {words}") from error
         return {**content, "encounters": tuple(found)}
 

@@ -14,14 +14,14 @@ from torchcover.encounters.staging import STEP_S, Staged
 from torchcover.geometry.arrays import Bools, Float64, Int64
 from torchcover.simulation.camera_sensor import CameraSensor
 from torchcover.simulation.lidar import Lidar
-from torchcover.simulation.moving import Moving, Solid, Solids
+from torchcover.simulation.moving import BodyGeometry, BodyGeometryCache, MovingBodies
 from torchcover.simulation.radar import Radar
 from torchcover.simulation.rig import Rig
 from torchcover.simulation.scenario import Scenario
-from torchcover.simulation.scene import Scene
-from torchcover.simulation.sensor import Draws, Sensor
-from torchcover.simulation.sight import Ends, MountedSensor, sight
-from torchcover.simulation.stage import mounted_on
+from torchcover.simulation.scene import SceneGeometry
+from torchcover.simulation.sensor import Sensor, SensorNoise
+from torchcover.simulation.sight import MountedSensor, RayEnds, compute_visibility
+from torchcover.simulation.stage import mount_sensors
 from torchcover.targets.counting import Beams, Met, SensorStep, measured_points, meetings
 
 if TYPE_CHECKING:
@@ -61,23 +61,23 @@ class MountedRig:
     """A rig on its vehicle, for any number of encounters.
 
     `rig`: the sensors; what takes time to scan is looked at as if it took none; `scenario`: whose ego carries it; see
-    `with_ego`.
+    `set_ego`.
     """
 
     def __init__(self, rig: Rig, scenario: Scenario) -> None:
         self.rig, self._scenario = rig, scenario
-        self.ego, self.solids = Solid(scenario.ego_mesh()), Solids()
+        self.ego, self.solids = BodyGeometry(scenario.build_ego_mesh()), BodyGeometryCache()
         self._mounted: dict[str, Sequence[MountedSensor]] = {}
         self._told = set[str]()
 
-    def mounted(self, encounter: Encounter, scene: Scene) -> Sequence[MountedSensor]:
+    def mounted(self, encounter: Encounter, scene: SceneGeometry) -> Sequence[MountedSensor]:
         """The sensors, in the weather of an encounter. ValueError: a sensor inside the ego's body."""
         weather = self.rig.weather or encounter.weather
         key = weather.model_dump_json()
         if key not in self._mounted:
             at_once = [_at_once(sensor) for sensor in self.rig.sensors]
             here = self.rig.model_copy(update={"sensors": at_once, "weather": weather})
-            self._mounted[key] = mounted_on(scene, self._scenario, self.rig.name, here)
+            self._mounted[key] = mount_sensors(scene, self._scenario, self.rig.name, here)
         return self._mounted[key]
 
     def check_rates(self, looks: int, staged: Staged) -> None:
@@ -258,8 +258,8 @@ class Looks:
     def _look(self, number: int, steps: Int64) -> Int64:
         mounted, other = self._mounted[number], self._staged.other
         poses = self._staged.vehicle_T_other(STEP_S * steps.astype(np.float64))
-        placed = Moving.placed([other] * len(steps), poses, np.full(len(steps), -1))
-        reach_m = np.concatenate(mounted.own_m).clip(max=np.float32(mounted.reach_m))
+        placed = MovingBodies.from_geometries([other] * len(steps), poses, np.full(len(steps), -1))
+        reach_m = np.concatenate(mounted.ego_hit_range_m).clip(max=np.float32(mounted.max_range_m))
         met = meetings(placed, mounted, reach_m)
         first = np.searchsorted(met.position, np.arange(len(steps) + 1)).tolist()
         points = np.zeros(len(steps), dtype=np.int64)
@@ -267,21 +267,21 @@ class Looks:
             there = Met._make(column[first[k] : first[k + 1]] for column in met)
             if len(there.ray):
                 ends = self._ends(number, step, there, len(reach_m))
-                draws = Draws(np.random.default_rng([self._seed, step, number]), rays=len(reach_m))
+                draws = SensorNoise(np.random.default_rng([self._seed, step, number]), num_rays=len(reach_m))
                 seen, beams = SensorStep(ends, draws), self._rig.beams[number]
                 measured = measured_points(mounted, beams, there, seen, placed, WITHIN_M)
-                points[k] = mounted.sensor.counts_as * len(measured)
+                points[k] = mounted.sensor.pixels_per_sample * len(measured)
         return points
 
-    def _ends(self, number: int, step: int, met: Met, rays: int) -> Ends:
+    def _ends(self, number: int, step: int, met: Met, rays: int) -> RayEnds:
         """Where the rays end that meet the other; of those that are measured together with others, all."""
         mounted = self._mounted[number]
         # The ego's body ends its rays already.
-        instant = self._scene.at(step, within_m=-math.inf)
+        instant = self._scene.get_snapshot(step, max_distance_m=-math.inf)
         if self._rig.beams[number] is not None:
-            return mounted.ends(instant)
+            return mounted.compute_ray_ends(instant)
         origin_m = mounted.vehicle_T_sensor[:3, 3]
         at_m = (origin_m + met.direction * met.range_m[:, None]).astype(np.float32)
         range_m = np.full(rays, np.inf, dtype=np.float32)
-        range_m[met.ray[~sight(instant, origin_m, at_m).seen]] = 0.0
-        return Ends(range_m, np.zeros(rays, dtype=bool))
+        range_m[met.ray[~compute_visibility(instant, origin_m, at_m).is_visible]] = 0.0
+        return RayEnds(range_m, np.zeros(rays, dtype=bool))

@@ -10,11 +10,11 @@ from torchcover.encounters.encounter import Encounter, Obstacle, Way
 from torchcover.geometry import BoundingBox, compute_contact_time_s, find_overlaps, invert, transform_outline
 from torchcover.geometry.arrays import Bools, Float64
 from torchcover.geometry.trajectory import Trajectory
-from torchcover.simulation.bodies import Shape, called, mover_mesh
-from torchcover.simulation.moving import Solid, Solids
-from torchcover.simulation.scene import Scene
+from torchcover.simulation.bodies import Shape, build_actor_mesh, get_shape_name
+from torchcover.simulation.moving import BodyGeometry, BodyGeometryCache
+from torchcover.simulation.scene import SceneGeometry
 from torchcover.simulation.shapes import Plane
-from torchcover.simulation.world import Actor, World
+from torchcover.simulation.world import Actor, Scene
 from torchcover.targets.placing import poses
 
 # Looks are at whole ones of these.
@@ -31,9 +31,9 @@ TOUCH_M = 1e-6
 
 
 @lru_cache(maxsize=64)
-def solid_of(shape: Shape) -> Solid:
+def solid_of(shape: Shape) -> BodyGeometry:
     """The body, made once for all encounters that have it."""
-    return Solid(mover_mesh(f"body {called(shape)!r}", shape, "other", keep_height=True))
+    return BodyGeometry(build_actor_mesh(f"body {get_shape_name(shape)!r}", shape, "other", keep_height=True))
 
 
 class Staged:
@@ -49,7 +49,7 @@ class Staged:
         ValueError: The two never touch, or do from the beginning; an obstacle on a way.
     """
 
-    def __init__(self, encounter: Encounter, ego: Solid) -> None:
+    def __init__(self, encounter: Encounter, ego: BodyGeometry) -> None:
         self.encounter, self.ego = encounter, ego
         self.other = solid_of(encounter.other.body)
         self.obstacles = self._placed_obstacles()
@@ -59,12 +59,12 @@ class Staged:
     def world_T_ego(self, times_s: Float64) -> Float64:
         """(T, 4, 4) where the ego is; the meeting is at the origin, and the ego heads along x there."""
         way = self.encounter.ego
-        end_m = self.ego.box.upper_m[0] if way.speed_kmh >= 0 else self.ego.box.lower_m[0]
+        end_m = self.ego.bounding_box.upper_m[0] if way.speed_kmh >= 0 else self.ego.bounding_box.lower_m[0]
         return _along(way, times_s - self.encounter.before_s, (-end_m, 0.0), 0.0)
 
     def world_T_other(self, times_s: Float64) -> Float64:
         """(T, 4, 4) where the other is."""
-        way, box = self.encounter.other, self.ego.box
+        way, box = self.encounter.other, self.ego.bounding_box
         y_m = box.lower_m[1] + way.at_width * box.size_m[1]
         return _along(way, times_s - self.encounter.before_s, (0.0, y_m), math.radians(way.yaw_deg))
 
@@ -72,24 +72,24 @@ class Staged:
         """(T, 4, 4) where the other is, as the ego has it."""
         return np.asarray(invert(self.world_T_ego(times_s)) @ self.world_T_other(times_s))
 
-    def scene(self, solids: Solids, *, whole: bool = False) -> Scene:
+    def scene(self, solids: BodyGeometryCache, *, whole: bool = False) -> SceneGeometry:
         """All but the other, or the `whole`, with a time step of a millisecond."""
         steps = math.ceil(self.contact_s / STEP_S)
         times_s = np.linspace(0.0, steps * STEP_S, 1 + math.ceil(steps * STEP_S / BEND_S))
         along = Trajectory.from_poses(times_s, self.world_T_ego(times_s))
         # Transient: even an ego at rest is no part of what never moves, as it is in all other encounters.
         drive = Trajectory(along.times_s, along.positions_m, along.angles_deg, is_transient=True)
-        ground = Plane(type="plane", size_m=(GROUND_M, GROUND_M)).mesh().made_of("road")
-        static = (ground, *(solid_of(one.body).mesh.moved(pose) for one, pose in self.obstacles))
+        ground = Plane(type="plane", size_m=(GROUND_M, GROUND_M)).build_mesh().assign_material("road")
+        static = (ground, *(solid_of(one.body).mesh.transform(pose) for one, pose in self.obstacles))
         ego = Actor("ego", "ego", self.ego.mesh, drive)
         way = Trajectory.from_poses(times_s, self.world_T_other(times_s))
-        others = (Actor("other", called(self.encounter.other.body), self.other.mesh, way),) if whole else ()
-        return Scene(World(static, ego, others, STEP_S, steps * STEP_S, ground=(0,)), solids)
+        others = (Actor("other", get_shape_name(self.encounter.other.body), self.other.mesh, way),) if whole else ()
+        return SceneGeometry(Scene(static, ego, others, STEP_S, steps * STEP_S, ground_mesh_indices=(0,)), solids)
 
     def _placed_obstacles(self) -> list[tuple[Obstacle, Float64]]:
         """Each and its (4, 4) pose: rows on either side of the ego's way, before and beyond the other."""
-        lower_m, upper_m = _extent_m(self.other.box, math.radians(self.encounter.other.yaw_deg))
-        ego_m, backwards = self.ego.box, self.encounter.ego.speed_kmh < 0
+        lower_m, upper_m = _extent_m(self.other.bounding_box, math.radians(self.encounter.other.yaw_deg))
+        ego_m, backwards = self.ego.bounding_box, self.encounter.ego.speed_kmh < 0
         found = list[tuple[Obstacle, Float64]]()
         rows = sorted(self.encounter.obstacles, key=lambda one: (one.side, one.where))
         for (side, where), row in groupby(rows, key=lambda one: (one.side, one.where)):
@@ -97,7 +97,7 @@ class Staged:
             ahead = (where == "beyond") != backwards
             end_m = upper_m[0] if ahead else -lower_m[0]
             for one in row:
-                low_m, high_m = _extent_m(solid_of(one.body).box, math.radians(one.yaw_deg))
+                low_m, high_m = _extent_m(solid_of(one.body).bounding_box, math.radians(one.yaw_deg))
                 end_m += one.gap_m
                 x_m = end_m - low_m[0] if ahead else -end_m - high_m[0]
                 end_m += high_m[0] - low_m[0]
@@ -136,7 +136,9 @@ class Staged:
         there = self.vehicle_T_other(times_s)
         velocity_mps = np.diff(there[:, :2, 3], axis=0) / np.diff(times_s)[:, None]
         return compute_contact_time_s(
-            self.ego.box.outline_m, transform_outline(self.other.box.outline_m, there[:-1]), velocity_mps
+            self.ego.bounding_box.outline_m,
+            transform_outline(self.other.bounding_box.outline_m, there[:-1]),
+            velocity_mps,
         )
 
     def _check_ways(self) -> None:
@@ -144,7 +146,7 @@ class Staged:
         for (one, pose), (other, there) in combinations(self.obstacles, 2):
             if _inside(solid_of(other.body), (np.linalg.inv(pose) @ there)[None], solid_of(one.body)).any():
                 raise ValueError(
-                    f"{self.encounter.words}: the obstacles {called(one.body)!r} and {called(other.body)!r} are inside "
+                    f"{self.encounter.words}: the obstacles {get_shape_name(one.body)!r} and {get_shape_name(other.body)!r} are inside "
                     "one another; change their gap_m or beside_m"
                 )
         times_s = np.append(np.arange(0.0, self.contact_s, BEND_S), self.contact_s)
@@ -156,16 +158,16 @@ class Staged:
                 if on_way.any():
                     at_s = times_s[on_way.argmax()] - self.contact_s
                     raise ValueError(
-                        f"{self.encounter.words}: the obstacle {called(obstacle.body)!r} is in the way of {who}, "
+                        f"{self.encounter.words}: the obstacle {get_shape_name(obstacle.body)!r} is in the way of {who}, "
                         f"{-at_s:.2f} s before the two touch; change its beside_m or gap_m, or let the encounter begin "
                         "later (from_m, seconds)"
                     )
 
 
-def _inside(solid: Solid, there: Float64, other: Solid) -> Bools:
+def _inside(solid: BodyGeometry, there: Float64, other: BodyGeometry) -> Bools:
     """(P,) whether the box of a body at (P, 4, 4) poses is inside that of another, by more than a touch."""
-    corners_m = other.box.corners_m
-    return find_overlaps(solid.box, there, corners_m - TOUCH_M * np.sign(corners_m - corners_m.mean(axis=0)))
+    corners_m = other.bounding_box.corners_m
+    return find_overlaps(solid.bounding_box, there, corners_m - TOUCH_M * np.sign(corners_m - corners_m.mean(axis=0)))
 
 
 def _along(way: Way, before_s: Float64, at_m: tuple[float, float], heading: float) -> Float64:

@@ -17,10 +17,10 @@ from torchcover.recordings.in_vehicle import transform_to_vehicle
 from torchcover.recordings.objects import Track, extract_objects, find_vehicle_class
 from torchcover.recordings.recording import Recording
 from torchcover.simulation.lidar import Lidar
-from torchcover.simulation.rays import Balls
+from torchcover.simulation.rays import SearchSpheres
 from torchcover.simulation.simulator import Simulator
 from torchcover.simulation.traffic.fleet import REAR_OF
-from torchcover.simulation.world import World
+from torchcover.simulation.world import Scene
 
 Clouds = Sequence[NDArray[np.floating]]
 
@@ -59,9 +59,9 @@ class Drive(NamedTuple):
     tracks: Sequence[Track]
 
     @classmethod
-    def of_world(cls, name: str, world: World) -> Self:
+    def of_world(cls, name: str, world: Scene) -> Self:
         """That of a world: all of its actors, who are no parked vehicles."""
-        times_s = world.time_step_s * np.arange(world.steps, dtype=np.float64)
+        times_s = world.time_step_s * np.arange(world.num_time_steps, dtype=np.float64)
         tracks = []
         for actor in world.actors:
             size_m = BoundingBox.from_points(actor.mesh.vertices_m).size_m
@@ -167,23 +167,25 @@ class Eyes(NamedTuple):
     enough: Sequence[int]
     counts_as: Sequence[int]
     every: Sequence[int]
-    clouds: Callable[[int, Balls], Clouds]
+    clouds: Callable[[int, SearchSpheres], Clouds]
 
     @classmethod
     def of_world(cls, simulator: Simulator, first: int, criterion: Criterion) -> Self:
         """Those of a simulator's only rig, whose frames of a world begin with one; its points are those of frames."""
         (rig,) = simulator.rigs.values()
 
-        def clouds(step: int, balls: Balls) -> Clouds:
-            (scans,) = simulator.scans(first + step, balls).values()
+        def clouds(step: int, balls: SearchSpheres) -> Clouds:
+            (scans,) = simulator.simulate_scans(first + step, balls).values()
             return [
-                scan.points if scan.error_m is None else scan.points[np.abs(scan.error_m) <= MEASURED_WITHIN_M]
+                scan.points
+                if scan.range_error_m is None
+                else scan.points[np.abs(scan.range_error_m) <= MEASURED_WITHIN_M]
                 for scan in scans
             ]
 
         sensors = rig.sensors
         every = [max(1, round(1 / (one.rate_hz * simulator.frame_interval_s))) for one in sensors]
-        enough, counts_as = [enough_of(criterion, one) for one in sensors], [one.counts_as for one in sensors]
+        enough, counts_as = [enough_of(criterion, one) for one in sensors], [one.pixels_per_sample for one in sensors]
         periods = [steps if isinstance(one, Lidar) else None for one, steps in zip(sensors, every, strict=True)]
         return cls(periods, enough, counts_as, every, clouds)
 
@@ -222,7 +224,7 @@ class Watch:
             return np.zeros(len(self._eyes.periods), dtype=np.int64)
         pose = invert(self._drive.world_T_ego[step]) @ way.interpolate(time_s)
         middle_m = pose[:3, 3] + size_m[2] / 2 * pose[:3, 2]
-        clouds = self._eyes.clouds(step, Balls(middle_m[None], float(np.linalg.norm(size_m / 2 + SKIN_M))))
+        clouds = self._eyes.clouds(step, SearchSpheres(middle_m[None], float(np.linalg.norm(size_m / 2 + SKIN_M))))
         counts = []
         for cloud_m, counts_as in zip(clouds, self._eyes.counts_as, strict=True):
             off_m = (cloud_m - pose[:3, 3]) @ pose[:3, :3]

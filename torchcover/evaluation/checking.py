@@ -39,9 +39,9 @@ from torchcover.evaluation.task import (
 )
 from torchcover.files import AtomicOutput
 from torchcover.report import PageTable, TextCell, to_json_record
-from torchcover.simulation import Rig, Scenario, with_ego
+from torchcover.simulation import Rig, Scenario, set_ego
 from torchcover.simulation.camera_sensor import CameraSensor
-from torchcover.simulation.moving import Solid
+from torchcover.simulation.moving import BodyGeometry
 from torchcover.targets import Target, survey_places
 from torchcover.targets.survey import THRESHOLD_M
 
@@ -182,7 +182,7 @@ def check(
         if isinstance(one, TargetRequirement):
             one.group_sensors(rig.sensors)
         if isinstance(one, EncounterRequirement):
-            _check_lasts(one, with_ego(build_flat_ground(), {rig.name: rig}, vehicle))
+            _check_lasts(one, set_ego(build_flat_ground(), {rig.name: rig}, vehicle))
     own: dict[str, Any] = {"vehicle": vehicle, "sensor_model": sensor_model, "seed": seed}
     world, found = scenario or asked.scenario, dict[str, list[Verdict]]()
     for rig in called:
@@ -207,7 +207,7 @@ def check(
 
 
 def _check_lasts(one: EncounterRequirement, world: Scenario) -> None:
-    ego = Solid(world.ego_mesh())
+    ego = BodyGeometry(world.build_ego_mesh())
     for case in one.encounters.encounters:
         if one.ttc_s and one.ttc_s > (lasts_s := Staged(case, ego).contact_s):
             raise ValueError(
@@ -275,7 +275,7 @@ def _of_target(
     steps: int | None, vehicle: str | Path | None, sensor_model: Literal["ideal", "real"] | None, seed: int,
 ) -> dict[str, Readings]:  # fmt: skip
     rig, world, usual_steps = load_rig_and_scenario(given, scenario, vehicle, sensor_model)
-    at_m, groups = place.compute_positions_m(world.ego_box()), one.group_sensors(rig.sensors)
+    at_m, groups = place.compute_positions_m(world.compute_ego_box()), one.group_sensors(rig.sensors)
     own_steps = (usual_steps > 1 and steps) or usual_steps
     of_survey: dict[str, Any] = {
         "num_frames": own_steps,
@@ -298,9 +298,11 @@ def _of_target(
             numbers[key] = np.where(seen.state == 0, 0.0, np.nan)
         for k in group if one.pixels or one.visual_angle_deg else ():  # of each sensor alone
             points, sensor = survey(counting=[k]).least_points, rig.sensors[k]
-            x_m, y_m, z_m = sensor.mount.matrix()[:3, 3]
+            x_m, y_m, z_m = sensor.mount.to_matrix()[:3, 3]
             away_m = np.hypot(*(at_m - (x_m, y_m)).T)
-            low_m, high_m = (end_m[2] - z_m for end_m in (target.solid.box.lower_m, target.solid.box.upper_m))
+            low_m, high_m = (
+                end_m[2] - z_m for end_m in (target.solid.bounding_box.lower_m, target.solid.bounding_box.upper_m)
+            )
             angle = np.arctan2(high_m, away_m) - np.arctan2(low_m, away_m)
             angle_deg = np.where(points >= one.detection_points, np.rad2deg(angle), 0.0)
             numbers["visual_angle_deg"] = np.fmax(numbers["visual_angle_deg"], angle_deg)

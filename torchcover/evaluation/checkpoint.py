@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchcover.evaluation.observers import CoverageObserver, Stateful
-from torchcover.files import check_dtype_kind, check_memory, parse_json, read_npz, guard_reader, write_atomically
+from torchcover.files import check_dtype_kind, check_memory, guard_reader, parse_json, read_npz, write_atomically
 
 EVERY_S = 60.0
 # Writing takes at most this share of the time, though it may take seconds.

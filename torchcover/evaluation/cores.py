@@ -9,7 +9,7 @@ from functools import cache
 from pathlib import Path
 
 from torchcover.evaluation.settings import BYTES_PER_WORKER
-from torchcover.simulation.memory import machine_bytes
+from torchcover.simulation.memory import find_memory_limit_bytes
 
 # What a container may take, where the system tells: microseconds of processor time, and of the time that they are for.
 # Of cgroups of version 2 in one file, of version 1 in two.
@@ -72,7 +72,10 @@ def compute_num_workers(num_frames: int, num_scenes: int, *, sends_frames: bool)
     if get_start_method() != "fork" or multiprocessing.current_process().daemon:  # which may start none
         return 0
     workers = min(
-        count_cores(), num_scenes, num_frames // LEAST_FRAMES, int(MOST_MEMORY * machine_bytes() / BYTES_PER_WORKER)
+        count_cores(),
+        num_scenes,
+        num_frames // LEAST_FRAMES,
+        int(MOST_MEMORY * find_memory_limit_bytes() / BYTES_PER_WORKER),
     )
     if sends_frames and os.path.isdir(SHARED_MEMORY):
         room = os.statvfs(SHARED_MEMORY)

@@ -24,8 +24,8 @@ from torchcover.files import AtomicOutput
 from torchcover.geometry import invert, transform_outline
 from torchcover.recordings import Recording, open_recording
 from torchcover.report import ActorMark, Page, PagePicture, StaticFaces, plot_scene, render_page
-from torchcover.simulation import Draws, PaperReference, Rig, Scenario, Simulator, with_ego
-from torchcover.simulation.bodies import called
+from torchcover.simulation import PaperReference, Rig, Scenario, SensorNoise, Simulator, set_ego
+from torchcover.simulation.bodies import get_shape_name
 
 # Of a film: seconds, steps between two pictures, and what they show around all bodies.
 FILM_S, FILM_STEPS, FILM_AROUND_M = 3.0, 100, 3.0
@@ -70,7 +70,7 @@ def evaluate_encounters(
     criterion = Criterion() if criterion is None else criterion
     sensing = _sensing(rigs, sensor_model)
     these = encounters if isinstance(encounters, EncounterSet) else EncounterSet.load(encounters)
-    mounted = [MountedRig(rig, with_ego(build_flat_ground(), {name: rig}, vehicle)) for name, rig in sensing.items()]
+    mounted = [MountedRig(rig, set_ego(build_flat_ground(), {name: rig}, vehicle)) for name, rig in sensing.items()]
     # Their mistakes are told before the first look.
     staged = [(rig, Staged(one, rig.ego)) for rig in mounted for one in these.encounters]
     sightings = []
@@ -83,7 +83,7 @@ def evaluate_encounters(
 
 def _sensing(rigs: AnyRig | Sequence[AnyRig], sensor_model: Literal["ideal", "real"] | None) -> dict[str, Rig]:
     called = [load_named_rig(rig) for rig in ([rigs] if isinstance(rigs, str | Path | Rig) else rigs)]
-    sensing = {rig.name: rig.sensing(sensor_model) for rig in called}
+    sensing = {rig.name: rig.apply_sensor_model(sensor_model) for rig in called}
     if not called or len(sensing) < len(called):
         raise ValueError(f"rigs with different names are needed; got {', '.join(rig.name for rig in called) or 'none'}")
     return sensing
@@ -123,18 +123,18 @@ def evaluate_traffic_encounters(
     if num_scenes < 1:
         raise ValueError(f"worlds: a number >= 1 is needed; got {num_scenes}")
     criterion, sensing = Criterion() if criterion is None else criterion, _sensing(rigs, sensor_model)
-    world = with_ego(scenario if isinstance(scenario, Scenario) else Scenario.load(scenario), sensing, vehicle)
-    if world.instants == 1:
+    world = set_ego(scenario if isinstance(scenario, Scenario) else Scenario.load(scenario), sensing, vehicle)
+    if world.num_distinct_time_steps == 1:
         raise ValueError(f"scenario {world.name!r}: nothing ever moves in it, so nobody is met")
-    num_scenes = 1 if world.repeats else num_scenes
+    num_scenes = 1 if world.is_repeating else num_scenes
     nobody = Simulator(world, {}, PaperReference(rows=2, columns=2), seed=seed)
-    alone = {name: nobody.with_rigs({name: rig}) for name, rig in sensing.items()}
+    alone = {name: nobody.replace_rigs({name: rig}) for name, rig in sensing.items()}
     sightings, hours = [], {}
     with Progress(num_scenes, "worlds", is_shown=progress) as bar:
         for number in range(num_scenes):
-            first = number * world.steps
-            drive = Drive.of_world(f"{world.name} {number}", nobody.scene_of(first)[0].world)
-            hours[drive.name] = world.steps * world.step_s / 3600
+            first = number * world.num_time_steps
+            drive = Drive.of_world(f"{world.name} {number}", nobody.get_scene_geometry(first)[0].scene)
+            hours[drive.name] = world.num_time_steps * world.effective_time_step_s / 3600
             met = approaches(drive, criterion)
             for name, simulator in alone.items():
                 eyes = Eyes.of_world(simulator, first, criterion)
@@ -184,7 +184,7 @@ def plot_encounter_animation(
         (one for one in encounter_results.sightings if one.rig == name), key=lambda one: one.ttc_s.min() - one.needed_s
     )
     case, without_s = cast(Encounter, latest.encounter), latest.without_ttc_s.min(axis=1)
-    mounted = MountedRig(sensing, with_ego(build_flat_ground(), {name: sensing}, vehicle))
+    mounted = MountedRig(sensing, set_ego(build_flat_ground(), {name: sensing}, vehicle))
     staged = Staged(case, mounted.ego)
     scene, looks = staged.scene(mounted.solids, whole=True), Looks(mounted, staged, encounter_results.seed)
     sensors, names = mounted.mounted(case, scene), encounter_results.sensors[name]
@@ -199,19 +199,21 @@ def plot_encounter_animation(
     vehicle_T_world = invert(staged.world_T_ego(times_s))
     bodies = [(one.body, vehicle_T_world @ pose) for one, pose in staged.obstacles]
     bodies.append((case.other.body, staged.vehicle_T_other(times_s)))
-    outlines_m = np.stack([transform_outline(solid_of(body).box.outline_m, there) for body, there in bodies], axis=1)
-    ego_m = mounted.ego.box.outline_m
+    outlines_m = np.stack(
+        [transform_outline(solid_of(body).bounding_box.outline_m, there) for body, there in bodies], axis=1
+    )
+    ego_m = mounted.ego.bounding_box.outline_m
     all_m = np.concatenate([outlines_m.reshape(-1, 2), ego_m])
     low_m, high_m = all_m.min(axis=0) - FILM_AROUND_M, all_m.max(axis=0) + FILM_AROUND_M
     for step, now_m in zip(steps.tolist(), outlines_m, strict=True):
-        instant, at = scene.at(step), np.array([step])
-        scans = [one.scan(instant, Draws(np.random.default_rng(step), one.sensor.rays)) for one in sensors]
+        instant, at = scene.get_snapshot(step), np.array([step])
+        scans = [one.scan(instant, SensorNoise(np.random.default_rng(step), one.sensor.num_rays)) for one in sensors]
         seen = ", ".join(f"{sensor} {looks.points([k], at)[0]}" for k, sensor in enumerate(names))
         yield plot_scene(
             *zip(low_m.tolist(), high_m.tolist(), strict=True),
             static_faces=StaticFaces(np.empty((0, 3, 2)), np.empty(0)),
             ego_outline_m=ego_m,
-            actors=[ActorMark(called(body), there) for (body, _), there in zip(bodies, now_m, strict=True)],
+            actors=[ActorMark(get_shape_name(body), there) for (body, _), there in zip(bodies, now_m, strict=True)],
             sensor_points=np.concatenate([scan.points for scan in scans]),
             title=f"{staged.contact_s - STEP_S * step:.2f} s to the collision; points on it: {seen}",
             subtitle=told,

@@ -20,8 +20,8 @@ from torchcover.evaluation.target_error import TargetErrorRule
 from torchcover.evaluation.task import CALLER, Task, build_run_identity, find_ray_device, get_device
 from torchcover.files import lock_folder
 from torchcover.frames import BadFrameError, FrameSource
-from torchcover.simulation import Asked, SimulatedFrames
-from torchcover.simulation.memory import check_fits
+from torchcover.simulation import QueryPlan, SimulatedFrames
+from torchcover.simulation.memory import check_memory_fits
 from torchcover.targets import Probes, Target
 
 Observers = Mapping[str, AnyObserver]
@@ -56,7 +56,7 @@ def measure_coverage(task: Task[FrameSource], settings: Settings, stopping_rule:
     report = None
     if metrics is not None:
         after = metrics.update_from(seen)
-        report = load_contrib().compare_metrics(after, coverages, task.query_plan.awaited, settings.seed)
+        report = load_contrib().compare_metrics(after, coverages, task.query_plan.target_regions, settings.seed)
     result = Result(
         coverages=coverages,
         regions=task.query_plan.regions,
@@ -66,7 +66,7 @@ def measure_coverage(task: Task[FrameSource], settings: Settings, stopping_rule:
         reference_record=frames.reference_record,
         device=settings.device,
         target_error=settings.target_error,
-        target_regions=task.query_plan.awaited,
+        target_regions=task.query_plan.target_regions,
         sensors=task.sensors,
         ego_outline_m=frames.ego_outline_m,
         observer_results={name: seen[name].compute() for name in settings.observers},
@@ -147,7 +147,7 @@ def _observed(
         for name in task.rigs
     }
     target = settings.target_error
-    watch = TargetErrorRule(target, coverage, task.query_plan.awaited) if target else None
+    watch = TargetErrorRule(target, coverage, task.query_plan.target_regions) if target else None
     observers: Sequence[AnyObserver] = [*coverage.values(), *others.values()]
     identity = (
         build_run_identity(task, settings, others, ranks.num_ranks if ranks else 1) if ranks or checkpoint else {}
@@ -215,7 +215,7 @@ def _states(coverage: Observers, others: Observers, watch: TargetErrorRule | Non
 
 def build_metric(
     settings: Settings,
-    query_plan: Asked,
+    query_plan: QueryPlan,
     sensors: Sequence[str] = (),
     *,
     has_area_weights: bool,
@@ -243,7 +243,7 @@ def build_metric(
         needs_radii=not settings.only_detection,
         has_area_weights=has_area_weights and settings.average != "cells",
     )
-    check_fits(
+    check_memory_fits(
         f"maps of {grid.num_cells:,} cells", BYTES_A_CELL * grid.num_cells, "use larger cells, or a smaller grid"
     )
     return metric.to(device)

@@ -38,7 +38,7 @@ from torchcover.report import (
     render_page,
 )
 from torchcover.simulation import Rig
-from torchcover.simulation.scenario import Mover
+from torchcover.simulation.scenario import ActorDescription
 from torchcover.targets import Target, TargetMap, write_arrays, write_csv
 
 # As many as anybody compares on a page.
@@ -228,7 +228,7 @@ def report(
     body = target if isinstance(target, Target) else Target.load(target)
     carrier = task.frames.scenario.ego
     assert carrier is not None  # simulated
-    ground = build_flat_ground().model_copy(update={"ego": Mover(shape=carrier.shape)})
+    ground = build_flat_ground().model_copy(update={"ego": ActorDescription(shape=carrier.shape)})
     whole = len(called) + (encounters is not None) + (requirements is not None) + num_frames
     with Progress(whole, "report", is_shown=show_progress) as bar:
         seen = {}

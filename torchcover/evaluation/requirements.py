@@ -33,8 +33,17 @@ from torchcover.coverage.quantity import (
 from torchcover.encounters import Criterion, EncounterSet
 from torchcover.encounters.criterion import MOST_LATENCY_S
 from torchcover.geometry import BoundingBox
-from torchcover.simulation import RegionsOfInterest, Sensor, builtin_names
-from torchcover.simulation.documents import SEVERAL, Bounds, BuiltIn, Coordinate, Document, NameOrFile, beside, by_name
+from torchcover.simulation import RegionsOfInterest, Sensor, list_builtin_names
+from torchcover.simulation.documents import (
+    SEVERAL,
+    Bounds,
+    BuiltInDocument,
+    Coordinate,
+    Document,
+    NameOrFile,
+    build_name_validator,
+    resolve_path,
+)
 from torchcover.simulation.kinds import SENSORS
 from torchcover.targets import SIDES, TARGETS
 from torchcover.targets.placing import side_of
@@ -257,8 +266,8 @@ class _Requirement(Document):
 
 def _target(given: str, info: ValidationInfo) -> str:
     if Path(given).suffix:
-        return str(beside(Path(given), info))
-    _check_called("target", [given], [*TARGETS, *builtin_names("vehicles")])
+        return str(resolve_path(Path(given), info))
+    _check_called("target", [given], [*TARGETS, *list_builtin_names("vehicles")])
     return given
 
 
@@ -409,7 +418,7 @@ class EncounterRequirement(_Requirement):
         consecutive_scans: In a row.
     """
 
-    encounters: Annotated[EncounterSet, by_name(EncounterSet)]
+    encounters: Annotated[EncounterSet, build_name_validator(EncounterSet)]
     ttc_s: PositiveFloat | None = None
     braking: BrakingModel | None = None
     points: PositiveInt = Criterion.points
@@ -451,7 +460,7 @@ AnyRequirement = Annotated[
 ]
 
 
-class Requirements(BuiltIn, RegionsOfInterest):
+class Requirements(BuiltInDocument, RegionsOfInterest):
     """Requirements of a rig on any vehicle; `regions`, `heights` and `grid` are those of `RegionsOfInterest`.
 
     Args:
@@ -474,7 +483,7 @@ class Requirements(BuiltIn, RegionsOfInterest):
     @model_validator(mode="after")
     def _check_names(self) -> Self:
         with warnings.catch_warnings(action="ignore"):  # of what lies within a vehicle, which is not known yet
-            asked = self.around(SOME_VEHICLE.outline_m)
+            asked = self.build_query_plan(SOME_VEHICLE.outline_m)
         for one in self.requirements:
             if isinstance(one, TargetRequirement) and isinstance(one.positions, str):
                 _check_called("place", [one.positions], self.position_sets)

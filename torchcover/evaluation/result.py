@@ -48,7 +48,7 @@ from torchcover.report.map_subjects import list_map_quantities
 from torchcover.report.records import build_records
 from torchcover.report.remarks import get_main_quantity
 from torchcover.simulation import CameraSensor, Sensor
-from torchcover.simulation.memory import check_fits
+from torchcover.simulation.memory import check_memory_fits
 from torchcover.simulation.sensor import ScanTimes
 
 if TYPE_CHECKING:
@@ -327,7 +327,7 @@ class Result:
         """
         advice = "the numbers are saved; leave the others out by `--files numbers`, or compare fewer rigs"
         needed_bytes, _ = self.estimate_pictures(file_kinds)
-        check_fits(f"page and maps of {len(self.coverages)} rigs", needed_bytes, advice)
+        check_memory_fits(f"page and maps of {len(self.coverages)} rigs", needed_bytes, advice)
         if "page" in file_kinds:
             output.add_text(f"{folder}report.html", render_page(self.page))
         for stem, figure in self.plot_maps() if "maps" in file_kinds else ():
@@ -490,7 +490,11 @@ def describe_perfect_depth(sensors: Mapping[str, Sequence[Sensor]]) -> list[str]
         []
     """
     cameras = {
-        rig: [one.name for one in of_rig if isinstance(one, CameraSensor) and not np.any(one.noise_m(np.ones(1)))]
+        rig: [
+            one.name
+            for one in of_rig
+            if isinstance(one, CameraSensor) and not np.any(one.compute_noise_std_m(np.ones(1)))
+        ]
         for rig, of_rig in sensors.items()
     }
     exact = [f"{rig} ({', '.join(names)})" for rig, names in cameras.items() if names]

@@ -15,7 +15,7 @@ from torchcover.files import to_yaml
 from torchcover.report import BOLD_MARKS, MapLine, PageTable, SensorView, TextCell, build_page_tables
 from torchcover.report.remarks import explain_marks, list_notes
 from torchcover.report.table import CoverageTable
-from torchcover.simulation import CameraSensor, Sensor, vertical_fov_deg
+from torchcover.simulation import CameraSensor, Sensor, compute_vertical_fov_deg
 
 # What decides about the numbers, with this package.
 PACKAGES = ("torch", "numpy", "embreex", "trimesh", "pykdtree", "kornia")
@@ -107,9 +107,9 @@ def build_sensor_views(sensors: Sequence[Sensor]) -> list[SensorView]:
     return [
         SensorView(
             name=sensor.name,
-            vehicle_T_sensor=sensor.mount.matrix(),
+            vehicle_T_sensor=sensor.mount.to_matrix(),
             horizontal_fov_deg=sensor.horizontal_fov_deg,
-            vertical_fov_deg=vertical_fov_deg(sensor),
+            vertical_fov_deg=compute_vertical_fov_deg(sensor),
             range_m=sensor.max_range_m,
         )
         for sensor in sensors

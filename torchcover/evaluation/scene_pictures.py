@@ -13,8 +13,8 @@ from torchcover.report import ActorMark, SkinPatch, StaticFaces, plot_depth_imag
 from torchcover.simulation import GRID_X_M, GRID_Y_M, CameraSensor, PaperReference, Rig, Scenario, SimulatedFrames
 from torchcover.simulation.bodies import Vehicle
 from torchcover.simulation.mount_regions import MountRegion, Skin
-from torchcover.simulation.rig import is_roadside, with_ego
-from torchcover.simulation.world import World
+from torchcover.simulation.rig import is_roadside, set_ego
+from torchcover.simulation.world import Scene
 
 PATCH_PLACES = 12  # along each side of a mount region
 FLAT = 0.9  # the least cosine between a face's normal and z
@@ -43,20 +43,20 @@ def plot_rig_figures(
         What to add to the name of the rig, ``""`` or ``"_depth"``, and the figure.
     """
     frames = _frames(scenario, rig, vehicle, frame_index, seed)
-    scene, step_of_world = frames.simulator.scene_of(frame_index)
-    ego = scene.world.ego.mesh
+    scene, step_of_world = frames.simulator.get_scene_geometry(frame_index)
+    ego = scene.scene.ego.mesh
     length, width, height = scene.ego_box.size_m
     subtitle = f"on {frames.scenario.ego_name} in {scenario.name}, {length:.2f} x {width:.2f} x {height:.2f} m"
     yield "", plot_rig(ego.vertices_m, ego.faces, build_sensor_views(rig.sensors), title=rig.name, subtitle=subtitle)
     if cameras := list_cameras(rig):
-        instant = scene.at(step_of_world)
+        instant = scene.get_snapshot(step_of_world)
         images = {
-            camera.name: instant.range_image(
-                camera.mount.matrix(), camera.directions(), max_range_m=scenario.reach_m(camera)
+            camera.name: instant.render_range_image(
+                camera.mount.to_matrix(), camera.compute_directions(), max_range_m=scenario.compute_max_range_m(camera)
             )
             for camera in cameras
         }
-        time_s = step_of_world * scene.world.time_step_s
+        time_s = step_of_world * scene.scene.time_step_s
         when = f"on {frames.scenario.ego_name} in {scenario.name}, step {frame_index}, t = {time_s:g} s, seed {seed}"
         yield "_depth", plot_depth_images(images, title=f"{rig.name}: distance along the ray", subtitle=when)
 
@@ -74,17 +74,17 @@ def plot_scenario(
         seed: Seed of the simulation.
     """
     frames = _frames(scenario, rig, vehicle, max(frame_indices), seed)
-    x_m, y_m = frames.scenario.room_m() or (GRID_X_M, GRID_Y_M)
+    x_m, y_m = frames.scenario.find_room_bounds_m() or (GRID_X_M, GRID_Y_M)
     for step in frame_indices:
         frame = frames[step]
-        scene, step_of_world = frames.simulator.scene_of(step)
-        time_s, ego = step_of_world * scene.world.time_step_s, scene.world.ego.trajectory
+        scene, step_of_world = frames.simulator.get_scene_geometry(step)
+        time_s, ego = step_of_world * scene.scene.time_step_s, scene.scene.ego.trajectory
         yield plot_scene(
             x_m,
             y_m,
-            static_faces=_standing(scene.world, time_s),
+            static_faces=_standing(scene.scene, time_s),
             ego_outline_m=scene.ego_box.outline_m,
-            actors=_actor_marks(scene.world, time_s),
+            actors=_actor_marks(scene.scene, time_s),
             sensor_points=frame.sensor.numpy(),
             reference_points=frame.reference.numpy(),
             title=f"{scenario.name}, step {step}",
@@ -99,7 +99,7 @@ def plot_vehicle_figure(vehicle: Vehicle) -> Figure:
     Raises:
         ValueError: Nothing of the vehicle is seen in a part of a region.
     """
-    mesh = vehicle.mesh()
+    mesh = vehicle.build_mesh()
     skin, size_m = Skin(mesh), BoundingBox.from_points(mesh.vertices_m).size_m
     patches = [_patch(name, region, skin) for name, region in vehicle.mount_regions.items()]
     subtitle = f"{' x '.join(f'{extent:.2f}' for extent in size_m)} m; {len(patches) or 'no'} mount regions"
@@ -109,24 +109,24 @@ def plot_vehicle_figure(vehicle: Vehicle) -> Figure:
 def _patch(name: str, region: MountRegion, skin: Skin) -> SkinPatch:
     shares = np.linspace(0.0, 1.0, PATCH_PLACES).tolist()
     try:
-        places_m = [[region.on(skin, u, v).place_m for v in shares] for u in shares]
+        places_m = [[region.find_mount_point(skin, u, v).position_m for v in shares] for u in shares]
     except ValueError as error:
         raise ValueError(f"mount region {name!r}: {error}") from error
-    return SkinPatch(name, region.seen_from, np.array(places_m))
+    return SkinPatch(name, region.side, np.array(places_m))
 
 
 def _frames(scenario: Scenario, rig: Rig, vehicle: str | None, step: int, seed: int) -> SimulatedFrames:
-    ego = with_ego(scenario, {rig.name: rig}, vehicle).ego_box()
+    ego = set_ego(scenario, {rig.name: rig}, vehicle).compute_ego_box()
     reference = None if is_roadside([rig], ego) else REFERENCE
-    return SimulatedFrames(scenario, rig, steps=step + 1, seed=seed, vehicle=vehicle, reference_sensor=reference)
+    return SimulatedFrames(scenario, rig, num_frames=step + 1, seed=seed, vehicle=vehicle, reference_sensor=reference)
 
 
-def _standing(world: World, time_s: float) -> StaticFaces:
+def _standing(world: Scene, time_s: float) -> StaticFaces:
     """The scenery within the picture, from above, by its height over the ground below it."""
     vehicle_T_world = invert(world.ego.trajectory.interpolate(time_s))
     low, high = np.array([(GRID_X_M[end], GRID_Y_M[end]) for end in (0, 1)])
     standing, terrain = [np.empty((0, 3, 3))], [np.empty((0, 3, 3))]
-    for mesh in world.static:
+    for mesh in world.static_meshes:
         corners = transform_points(vehicle_T_world, mesh.vertices_m)[mesh.faces]
         # What faces up everywhere is the ground, and no body on it.
         lies = (_normals(corners)[:, 2] > 0).all()
@@ -161,7 +161,7 @@ def _heights_m(corners_m: Matrix) -> Matrix:
     return np.asarray(np.where(flat, corners_m[..., 2].mean(axis=1), corners_m[..., 2].max(axis=1)))
 
 
-def _actor_marks(world: World, time_s: float) -> list[ActorMark]:
+def _actor_marks(world: Scene, time_s: float) -> list[ActorMark]:
     vehicle_T_world = invert(world.ego.trajectory.interpolate(time_s))
     there = [
         actor

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias, cast
 
 from torchcover.evaluation.arguments import ConvertedField
 from torchcover.evaluation.config import EvaluateConfig
-from torchcover.simulation.memory import check_fits
+from torchcover.simulation.memory import check_memory_fits
 
 if TYPE_CHECKING:
     import torch
@@ -104,9 +104,9 @@ def _named(scenario: object) -> str:
         raise ValueError("scenario: one of several has no name")
     if Path(scenario).is_dir():
         raise ValueError(f"scenario {scenario}: a folder; a recording is no scenario: measure it apart, by `frames`")
-    from torchcover.simulation.documents import found
+    from torchcover.simulation.documents import find_document
 
-    return found("scenarios", scenario).stem
+    return find_document("scenarios", scenario).stem
 
 
 def _thresholds(given: "float | Iterable[float]") -> tuple[float, ...]:
@@ -253,7 +253,7 @@ class Settings:
     def __post_init__(self) -> None:
         if self.num_frames is not None and self.num_frames < 1:
             raise ValueError(f"steps: at least 1 is needed; got {self.num_frames}")
-        check_fits(f"{self.num_workers or 0:,} workers", BYTES_PER_WORKER * (self.num_workers or 0), "use fewer")
+        check_memory_fits(f"{self.num_workers or 0:,} workers", BYTES_PER_WORKER * (self.num_workers or 0), "use fewer")
         if self.average not in (None, "area", "cells"):
             raise ValueError(f"estimate {self.average}: `area` or `known` is needed")
         if self.band_frame not in (None, "ground", "vehicle"):

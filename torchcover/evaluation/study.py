@@ -360,7 +360,7 @@ def _tried(options: str, settings: Settings, first: Coverage | None) -> tuple[Tr
     processor_s = sum(os.times()[:4]) - before_s
     assert result.run is not None  # it was not loaded
     result.run.raise_failure()
-    coverage, awaited = result.coverage, task.query_plan.awaited
+    coverage, awaited = result.coverage, task.query_plan.target_regions
     places = list_region_bands(result.regions, coverage.grid)
     count, steps, worlds = len(places) * len(coverage.quantities), coverage.counts["num_frames"], math.inf
     numbers = []

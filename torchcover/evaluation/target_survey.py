@@ -31,9 +31,9 @@ from torchcover.report import (
     render_page,
     to_json_record,
 )
-from torchcover.simulation import Rig, Scenario, Sensor, with_ego
+from torchcover.simulation import Rig, Scenario, Sensor, set_ego
 from torchcover.simulation.bodies import Body
-from torchcover.simulation.scenario import Mover
+from torchcover.simulation.scenario import ActorDescription
 from torchcover.simulation.shapes import Plane
 from torchcover.targets import Place, Target, TargetMap, survey, write_arrays, write_csv
 
@@ -100,10 +100,10 @@ def load_rig_and_scenario(
     rig: AnyRig, scenario: AnyScenario | None, vehicle: str | Path | None, sensor_model: Literal["ideal", "real"] | None
 ) -> tuple[Rig, Scenario, int]:
     """The rig, the world whose ego carries it, and how many steps are usual; as `map_target_visibility` is asked."""
-    rig = load_named_rig(rig).sensing(sensor_model)
+    rig = load_named_rig(rig).apply_sensor_model(sensor_model)
     world = build_flat_ground() if scenario is None else scenario
-    world = with_ego(world if isinstance(world, Scenario) else Scenario.load(world), {rig.name: rig}, vehicle)
-    alike = world.instants == 1 and all(sensor.is_exact for sensor in rig.sensors)
+    world = set_ego(world if isinstance(world, Scenario) else Scenario.load(world), {rig.name: rig}, vehicle)
+    alike = world.num_distinct_time_steps == 1 and all(sensor.is_exact for sensor in rig.sensors)
     return rig, world, 1 if alike else DEFAULT_STEPS
 
 
@@ -115,7 +115,7 @@ def build_flat_ground() -> Scenario:
         1
     """
     ground = Body(name="ground", shape=Plane(type="plane", size_m=(GROUND_M, GROUND_M)))
-    return Scenario(name="free space", ego=Mover(), bodies=(ground,))
+    return Scenario(name="free space", ego=ActorDescription(), bodies=(ground,))
 
 
 def save_target_map(

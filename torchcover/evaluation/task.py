@@ -21,18 +21,18 @@ from torchcover.evaluation.settings import DEFAULT_STEPS, MAX_STEPS, Settings
 from torchcover.frames import FrameSource, RigSubset
 from torchcover.recordings import RecordedFrames, open_recording
 from torchcover.simulation import (
-    Asked,
+    QueryPlan,
     RegionsOfInterest,
     Rig,
     Scenario,
     Sensor,
     SimulatedFrames,
     Weather,
-    builtin_names,
-    reference_called,
-    with_ego,
+    create_reference_sensor,
+    list_builtin_names,
+    set_ego,
 )
-from torchcover.simulation.recorded_rig import recorded_body
+from torchcover.simulation.recorded_rig import build_ego_box
 from torchcover.simulation.regions_of_interest import DEFAULT_BAND_FRAME
 from torchcover.simulation.scenario import ROOM_M
 from torchcover.simulation.simulated_frames import DEFAULT_REFERENCE
@@ -85,7 +85,7 @@ class Task(NamedTuple, Generic[SourceT]):
     rig_sources: Mapping[str, str | None]
     sensors: Mapping[str, Sequence[Sensor]]
     description: Mapping[str, object]
-    query_plan: Asked
+    query_plan: QueryPlan
     num_frames: int | None = None
 
     @property
@@ -126,7 +126,7 @@ def build_task(settings: Settings) -> Task[FrameSource]:
     if isinstance(frames, str | Path):
         recording = open_recording(frames)
         if settings.vehicle is not None:
-            recording.ego_box = recorded_body(recording, settings.vehicle)
+            recording.ego_box = build_ego_box(recording, settings.vehicle)
         source: FrameSource = RecordedFrames(recording, use_ground_model=settings.band_frame != "vehicle")
     else:
         source = frames
@@ -158,15 +158,15 @@ def build_simulation_task(settings: Settings, *, needs_boxes: bool = False) -> T
         raise ValueError("which rig? Give a built-in name (see `torchcover list`) or a YAML file, or a recording")
     names = make_rig_names(rigs)
     sensor_model = settings.sensor_model or ("ideal" if settings.reference == "paper" else None)
-    carried = {name: load_rig(rig).sensing(sensor_model) for name, rig in zip(names, rigs, strict=True)}
+    carried = {name: load_rig(rig).apply_sensor_model(sensor_model) for name, rig in zip(names, rigs, strict=True)}
     given = {name: format_rig_source(rig) for name, rig in zip(names, rigs, strict=True)}
     if settings.weather:
         carried, given = _in_weather(carried, given, settings.weather)
     loaded_world = scenario if isinstance(scenario, Scenario) else Scenario.load(scenario)
-    world = with_ego(loaded_world, carried, settings.vehicle)
+    world = set_ego(loaded_world, carried, settings.vehicle)
     band_frame = settings.band_frame or ("vehicle" if settings.reference == "paper" else DEFAULT_BAND_FRAME)
-    asked = (settings.regions or RegionsOfInterest()).around(
-        world.ego_box().outline_m, settings.cell_m, band_frame, _within(world, carried)
+    asked = (settings.regions or RegionsOfInterest()).build_query_plan(
+        world.compute_ego_box().outline_m, settings.cell_m, band_frame, _within(world, carried)
     )
     few = settings.only_detection and settings.reference in (None, DEFAULT_REFERENCE)
     rays = FEW_RAYS if few and settings.num_rays is None else settings.num_rays
@@ -174,17 +174,17 @@ def build_simulation_task(settings: Settings, *, needs_boxes: bool = False) -> T
     frames = SimulatedFrames(
         world,
         rigs=carried,
-        steps=most if settings.num_frames is None else settings.num_frames,
+        num_frames=most if settings.num_frames is None else settings.num_frames,
         seed=settings.seed,
         frame_interval_s=compute_frame_interval_s(world, settings.frame_interval_s),
-        reference_sensor=reference_called(settings.reference, rays, asked),
+        reference_sensor=create_reference_sensor(settings.reference, rays, asked),
         boxes=needs_boxes or settings.needs_boxes,
-        within_m=max(settings.thresholds_m) if settings.only_detection else None,
-        kept_bytes=0.0,  # steps come in order: no world is needed again
+        search_radius_m=max(settings.thresholds_m) if settings.only_detection else None,
+        max_cached_bytes=0.0,  # steps come in order: no world is needed again
         no_cache=settings.no_cache,
         device=find_ray_device(settings),
     )
-    frames.simulator.check_run(frames.steps)
+    frames.simulator.check_run(frames.num_frames)
     # A path says more than the name within the file.
     description = {**frames.description, "scenario": world.name if loaded_world is scenario else str(scenario)}
     description |= {"config": settings.config_record} if settings.config_record else {}
@@ -226,7 +226,7 @@ def _in_weather(
 
 def _most_steps(frames: SimulatedFrames, settings: Settings) -> int | None:
     """Where a target error ends a run at the latest: what repeats and moves has no more to say than its instants."""
-    distinct = frames.simulator.distinct_steps
+    distinct = frames.simulator.num_distinct_frames
     if settings.num_frames is not None or settings.target_error is None or distinct in (None, 1):
         return None
     return max(DEFAULT_STEPS, distinct)
@@ -243,7 +243,9 @@ def _recording(frames: FrameSource, settings: Settings) -> Task[FrameSource]:
     documents = {name: rig for name, rig in named.items() if is_rig_document(rig) or name not in frames.rigs}
     sensors = {**chosen.sensors, **{name: load_rig(rig).sensors for name, rig in documents.items()}}
     band_frame = settings.band_frame or ("ground" if frames.has_heights() else "vehicle")
-    asked = (settings.regions or RegionsOfInterest()).around(frames.ego_outline_m, settings.cell_m, band_frame)
+    asked = (settings.regions or RegionsOfInterest()).build_query_plan(
+        frames.ego_outline_m, settings.cell_m, band_frame
+    )
     description = {**frames.description, **({"config": settings.config_record} if settings.config_record else {})}
     return Task(chosen, given, sensors, description, asked, settings.num_frames)
 
@@ -251,11 +253,11 @@ def _recording(frames: FrameSource, settings: Settings) -> Task[FrameSource]:
 def _within(world: Scenario, rigs: Mapping[str, Rig]) -> Region | None:
     """The room that the ego is in, or what its sensors reach; None if both are large."""
     reach_m = max(
-        world.reach_m(sensor, rig.weather) + float(np.linalg.norm(sensor.mount.matrix()[:2, 3]))
+        world.compute_max_range_m(sensor, rig.weather) + float(np.linalg.norm(sensor.mount.to_matrix()[:2, 3]))
         for rig in rigs.values()
         for sensor in rig.sensors
     )
-    room = world.room_m()
+    room = world.find_room_bounds_m()
     if reach_m > ROOM_M:
         return Region("room", *room) if room else None
     (x0, x1), (y0, y1) = room or ((-reach_m, reach_m), (-reach_m, reach_m))
@@ -271,11 +273,15 @@ def compute_frame_interval_s(scenario: Scenario, frame_interval_s: float | None)
     """
     if frame_interval_s is not None:
         return frame_interval_s
-    if scenario.instants is None:
+    if scenario.num_distinct_time_steps is None:
         return EVERY_S_IN_TRAFFIC
-    share = (math.sqrt(5) - 1) / 2 * scenario.instants
-    each_once = (steps for steps in range(1, scenario.instants + 1) if math.gcd(steps, scenario.instants) == 1)
-    return min(each_once, key=lambda steps: abs(steps - share)) * scenario.step_s
+    share = (math.sqrt(5) - 1) / 2 * scenario.num_distinct_time_steps
+    each_once = (
+        steps
+        for steps in range(1, scenario.num_distinct_time_steps + 1)
+        if math.gcd(steps, scenario.num_distinct_time_steps) == 1
+    )
+    return min(each_once, key=lambda steps: abs(steps - share)) * scenario.effective_time_step_s
 
 
 def make_rig_names(rigs: Sequence[AnyRig]) -> list[str]:
@@ -314,7 +320,7 @@ def load_named_rig(rig: AnyRig) -> Rig:
 
 def is_rig_document(rig: AnyRig) -> bool:
     """Whether there is more to it than a name: a rig, the path of one, or the name of a built-in one."""
-    return isinstance(rig, Rig) or _is_file(rig) or str(rig) in builtin_names("rigs")
+    return isinstance(rig, Rig) or _is_file(rig) or str(rig) in list_builtin_names("rigs")
 
 
 def format_rig_source(rig: AnyRig) -> str:
@@ -350,7 +356,7 @@ def build_run_identity(
     return {name: _told(value) for name, value in everything.items()}
 
 
-def _asked(asked: Asked) -> dict[str, object]:
+def _asked(asked: QueryPlan) -> dict[str, object]:
     grid = asked.grid
     return {
         "cell_m": grid.cell_m,

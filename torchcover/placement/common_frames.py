@@ -16,9 +16,9 @@ from torchcover.frames import Frame
 from torchcover.placement.host_vehicle import HostVehicle
 from torchcover.placement.objective import Objective
 from torchcover.placement.queries import Queries
-from torchcover.simulation import Rig, Scenario, SimulatedFrames, Simulator, with_ego
-from torchcover.simulation.rays import Balls
-from torchcover.simulation.simulated_frames import of_rigs
+from torchcover.simulation import Rig, Scenario, SimulatedFrames, Simulator, set_ego
+from torchcover.simulation.rays import SearchSpheres
+from torchcover.simulation.simulated_frames import build_rig_fields
 
 WORLDS = 6
 FRAMES_PER_WORLD = 3
@@ -78,7 +78,7 @@ class CachedFrames(Dataset[Frame | MeasuredFrame]):
         average: Average,
     ) -> None:
         self._simulations, self._indices, self._queries, self._estimate = simulations, indices, queries, average
-        self._held: dict[int, tuple[Frame, Balls | None]] = {}
+        self._held: dict[int, tuple[Frame, SearchSpheres | None]] = {}
         self._rig: Rig | None = None
         self._mounted: dict[int, Simulator] = {}
         self._observer: CoverageObserver | None = None
@@ -97,13 +97,13 @@ class CachedFrames(Dataset[Frame | MeasuredFrame]):
             built, within_m = self._build(index, number), self._queries.search_radius_m
             # The memory of a tensor that travels to another process is given up.
             points = built.reference.numpy().copy()
-            self._held[number] = built, None if within_m is None else Balls.around(points, within_m)
+            self._held[number] = built, None if within_m is None else SearchSpheres.from_points(points, within_m)
         held, within = self._held[number]
         if rig is None:
             return held
-        scans = self._mount(rig, index.scenario_index).scans(index.frame_index, within)[rig.name]
-        counts = {"rays": sum(scan.rays for scan in scans), "self_hits": sum(scan.self_hits for scan in scans)}
-        return replace(held, **of_rigs({rig.name: rig}, {rig.name: scans}), counts=counts)
+        scans = self._mount(rig, index.scenario_index).simulate_scans(index.frame_index, within)[rig.name]
+        counts = {"rays": sum(scan.num_rays for scan in scans), "self_hits": sum(scan.self_hits for scan in scans)}
+        return replace(held, **build_rig_fields({rig.name: rig}, {rig.name: scans}), counts=counts)
 
     def _build(self, index: FrameIndex, number: int) -> Frame:
         frames = self._simulations[index.scenario_index]
@@ -118,7 +118,7 @@ class CachedFrames(Dataset[Frame | MeasuredFrame]):
             reference_heights_m=None if heights_m is None else heights_m[mask],
             index=number,
             block_index=index.scene_id,
-            counts={"world_bytes": frames.simulator.scene_of(index.frame_index)[0].bytes},
+            counts={"world_bytes": frames.simulator.get_scene_geometry(index.frame_index)[0].num_bytes},
         )
 
     def _mount(self, rig: Rig, scenario: int) -> Simulator:
@@ -126,7 +126,7 @@ class CachedFrames(Dataset[Frame | MeasuredFrame]):
         if rig != self._rig:
             self._rig, self._mounted, self._observer = rig, {}, None
         if scenario not in self._mounted:
-            self._mounted[scenario] = self._simulations[scenario].simulator.with_rigs({rig.name: rig})
+            self._mounted[scenario] = self._simulations[scenario].simulator.replace_rigs({rig.name: rig})
         return self._mounted[scenario]
 
 
@@ -207,13 +207,13 @@ class CommonFrames:
         self._settings |= {"estimate": average, "sensor_model": sensor_model}
         self._settings |= {"budget_bytes": budget_bytes, "workers": workers}
         self._vehicles: set[str | None] = {None}  # that were found to be that of these worlds
-        self._worlds = [with_ego(one, {}, vehicle) for one in self.scenarios]
+        self._worlds = [set_ego(one, {}, vehicle) for one in self.scenarios]
         self.queries = Queries.from_objectives(HostVehicle.from_scenarios(self._worlds).outline_m, objectives)
         shown: dict[str, Any] = {
-            "steps": MANY,
+            "num_frames": MANY,
             "seed": seed,
             "frame_interval_s": frame_interval_s,
-            "kept_bytes": float("inf"),
+            "max_cached_bytes": float("inf"),
         }
         shown |= {"reference_sensor": self.queries.build_reference_sensor(rays)}
         simulations = [SimulatedFrames(one, rigs={}, **shown) for one in self._worlds]
@@ -263,7 +263,7 @@ class CommonFrames:
         """
         if seed == self.seed:
             raise ValueError(f"seed: another one than that of these worlds is needed; got {seed} for both")
-        if not (fresh := [one for one in self.scenarios if not one.repeats]):
+        if not (fresh := [one for one in self.scenarios if not one.is_repeating]):
             names = ", ".join(repr(one.name) for one in self.scenarios)
             raise ValueError(f"scenarios: one whose worlds are drawn is needed; {names} is the same for any seed")
         return CommonFrames(
@@ -300,7 +300,7 @@ class CommonFrames:
 
     def _as_requested(self, rig: Rig) -> Rig:
         self._check_vehicle(rig)
-        return rig.sensing("ideal") if self.sensor_model == "ideal" else rig
+        return rig.apply_sensor_model("ideal") if self.sensor_model == "ideal" else rig
 
     def _compute(self, rig: Rig | None, numbers: Sequence[int], *, is_measured: bool = False) -> list[Any]:
         shares: list[list[int]] = [[] for _ in range(max(self._processes, 1))]
@@ -328,7 +328,7 @@ class CommonFrames:
         if rig.vehicle in self._vehicles or self._settings["vehicle"] is not None:
             return
         for scenario, world in zip(self.scenarios, self._worlds, strict=True):
-            if with_ego(scenario, {rig.name: rig}).ego != world.ego:
+            if set_ego(scenario, {rig.name: rig}).ego != world.ego:
                 raise ValueError(
                     f"rig {rig.name!r} is for the vehicle {rig.vehicle}, and these frames have {world.ego_name}: say "
                     "which by vehicle="
@@ -354,13 +354,13 @@ def _index_frames(simulators: Sequence[Simulator], worlds: int, per_world: int) 
 
 def _steps(simulator: Simulator, worlds: int, per_world: int) -> list[list[int]]:
     """Numbers of the steps of each world."""
-    if simulator.scenario.repeats:
+    if simulator.scenario.is_repeating:
         # Where nothing moves every step draws another reference.
-        distinct = simulator.distinct_steps
+        distinct = simulator.num_distinct_frames
         return [list(range(per_world if distinct in (None, 1) else min(per_world, distinct or 0)))]
     of_worlds: list[list[int]] = [[] for _ in range(worlds)]
     index = 0
-    while (world := simulator.run_of(index)) < worlds:
+    while (world := simulator.get_run_index(index)) < worlds:
         if len(of_worlds[world]) < per_world:
             of_worlds[world].append(index)
         index += 1

@@ -9,7 +9,7 @@ from pydantic import Field, NonNegativeFloat
 
 from torchcover.geometry.rigid import Matrix
 from torchcover.placement.free_sensor import FreeSensor
-from torchcover.simulation import Document, Rig, Sensor, builtin_names
+from torchcover.simulation import Document, Rig, Sensor, list_builtin_names
 from torchcover.simulation.mount_regions import Skin
 
 # Sensors whose poses differ by less are each other's mirror images.
@@ -47,7 +47,7 @@ class Constraints(Document):
         for one, other in combinations(rig.sensors, 2):
             if one.name not in free and other.name not in free:
                 continue
-            apart_m = float(np.linalg.norm(one.mount.matrix()[:3, 3] - other.mount.matrix()[:3, 3]))
+            apart_m = float(np.linalg.norm(one.mount.to_matrix()[:3, 3] - other.mount.to_matrix()[:3, 3]))
             if apart_m < self.min_distance_m:
                 yield (
                     f"{one.name} and {other.name} are {apart_m:.3f} m apart; min_distance_m is {self.min_distance_m:g}"
@@ -56,7 +56,7 @@ class Constraints(Document):
     def _lopsided(self, rig: Rig) -> Iterator[str]:
         if not self.symmetric:
             return
-        poses = [sensor.mount.matrix() for sensor in rig.sensors]
+        poses = [sensor.mount.to_matrix() for sensor in rig.sensors]
         for sensor, pose in zip(rig.sensors, poses, strict=True):
             mirrored = MIRROR @ pose @ MIRROR
             if not any(np.allclose(mirrored, other, rtol=0.0, atol=MIRRORED_M) for other in poses):
@@ -69,10 +69,10 @@ class Constraints(Document):
 
 def find_placement_error(sensor: Sensor, skin: Skin) -> str | None:
     """Why a sensor cannot be where it is: below the ground, or inside the vehicle; None if it can."""
-    place_m: Matrix = sensor.mount.matrix()[:3, 3]
+    place_m: Matrix = sensor.mount.to_matrix()[:3, 3]
     if place_m[2] <= 0.0:
         return f"{sensor.name} at {place_m.round(3).tolist()} m is not above the ground"
-    if skin.encloses(place_m):
+    if skin.is_inside(place_m):
         return f"{sensor.name} at {place_m.round(3).tolist()} m is inside the vehicle's body"
     return None
 
@@ -102,7 +102,7 @@ def check_prices(
             raise ValueError("constraints.max_cost_eur: nothing has a price; give them as cost")
         return
     models = {model for one in free_sensors.values() for model in one.model or ()}
-    known = {MOUNT, *models, *builtin_names("lidars"), *(sensor.name for sensor in sensors)}
+    known = {MOUNT, *models, *list_builtin_names("lidars"), *(sensor.name for sensor in sensors)}
     if unknown := [key for key in prices_eur if key not in known]:
         raise ValueError(f"cost: {', '.join(unknown)}: no LiDAR model, no sensor of the rig, and not {MOUNT!r}")
     cheapest = sum(min(_prices(prices_eur, sensor, sensors, free_sensors)) for sensor in sensors)

@@ -208,8 +208,8 @@ class FreeSensor(Document):
                 mount = update_pose(mount, {"z_m": find_vehicle_top_m(host, mount) + own["z_above_body_m"]})
             return mount
         region = host.get_mount_region(own["region"])
-        point = region.on(host.skin, own["u"], own["v"])
-        x, y, z = (point.place_m + own["height_m"] * point.outward).tolist()
+        point = region.find_mount_point(host.skin, own["u"], own["v"])
+        x, y, z = (point.position_m + own["height_m"] * point.normal).tolist()
         return build_pose(x, y, z, region.heading_deg + own["yaw_deg"], own["pitch_deg"], own["roll_deg"])
 
     def get_start_values(self, start_sensor: Sensor, host: HostVehicle) -> dict[str, VariableValue]:
@@ -255,7 +255,7 @@ def get_pose_values(pose: Pose) -> dict[str, float]:
     if pose.quaternion_wxyz is None:
         angles = (pose.yaw_deg, pose.pitch_deg, pose.roll_deg)
     else:
-        angles = tuple(convert_rotation_to_euler(pose.matrix()[:3, :3]).round(DECIMALS).tolist())
+        angles = tuple(convert_rotation_to_euler(pose.to_matrix()[:3, :3]).round(DECIMALS).tolist())
     return dict(zip((*PLACES[:3], *ANGLES), (pose.x_m, pose.y_m, pose.z_m, *angles), strict=True))
 
 
@@ -268,9 +268,9 @@ def build_pose(x_m: float, y_m: float, z_m: float, yaw_deg: float, pitch_deg: fl
 
 def find_vehicle_top_m(host: HostVehicle, mount: Pose) -> float:
     """How high the vehicle's body is where a sensor is mounted. ValueError: the body is not below it."""
-    below = host.skin.seen_from("above", (mount.x_m, mount.y_m))
+    below = host.skin.find_surface_point("above", (mount.x_m, mount.y_m))
     if below is None:
         raise ValueError(
             f"z_above_body_m: nothing of {host.name} is below x = {mount.x_m:.3f} m, y = {mount.y_m:.3f} m"
         )
-    return float(below.place_m[2])
+    return float(below.position_m[2])

@@ -12,9 +12,9 @@ from torchcover.evaluation.requirements import RegionRequirement, Requirements
 from torchcover.geometry import BoundingBox
 from torchcover.geometry.arrays import Float64
 from torchcover.placement.objective import NonEmptyName, Objective
-from torchcover.simulation import Rig, Scenario, with_ego
-from torchcover.simulation.bodies import mount_regions_of
-from torchcover.simulation.documents import SEVERAL, NameOrFile, Readable, by_name, is_file_name
+from torchcover.simulation import Rig, Scenario, set_ego
+from torchcover.simulation.bodies import get_mount_regions
+from torchcover.simulation.documents import SEVERAL, FileDocument, NameOrFile, build_name_validator, is_file_name
 from torchcover.simulation.mount_regions import MountRegion, Skin
 
 MAX_OBJECTIVES = 3  # a front of more cannot be plotted
@@ -29,7 +29,7 @@ def _vehicle(given: str) -> str:
 
 
 # A rig, or the name or the file of one.
-NamedRig = Annotated[Rig, by_name(Rig)]
+NamedRig = Annotated[Rig, build_name_validator(Rig)]
 # One name or file, or several.
 NamesOrFiles = Annotated[tuple[NameOrFile, ...], SEVERAL, Field(min_length=1)]
 # A vehicle's.
@@ -59,7 +59,7 @@ class HostVehicle(NamedTuple):
         if any((other.ego.shape if other.ego else None) != shape for other in others):
             egos = ", ".join(f"{each.name} {each.ego_name}" for each in scenarios)
             raise ValueError(f"scenario: their egos differ ({egos}), but a rig is mounted on one; say which by vehicle")
-        return cls(first.ego_name, Skin(first.ego_mesh()), mount_regions_of(shape))
+        return cls(first.ego_name, Skin(first.build_ego_mesh()), get_mount_regions(shape))
 
     def get_mount_region(self, name: str) -> MountRegion:
         """Return a mount region. ValueError: there is none of this name; the message lists the others."""
@@ -69,7 +69,7 @@ class HostVehicle(NamedTuple):
         return self.mount_regions[name]
 
 
-class PlacementSpace(Readable):
+class PlacementSpace(FileDocument):
     """Base of a search space and a selection: the scenarios, the host vehicle, objectives and requirements."""
 
     kind: ClassVar[str] = "a search space"
@@ -79,7 +79,7 @@ class PlacementSpace(Readable):
     vehicle: VehicleNameOrFile | None = None
     objectives: dict[NonEmptyName, Objective] = Field(min_length=1, max_length=MAX_OBJECTIVES)
     not_worse: tuple[NonEmptyName | Objective, ...] = ()
-    requirements: Annotated[Requirements, by_name(Requirements)] | None = None
+    requirements: Annotated[Requirements, build_name_validator(Requirements)] | None = None
 
     @property
     def base_rig(self) -> Rig | None:
@@ -128,7 +128,7 @@ class PlacementSpace(Readable):
     def scenarios(self) -> tuple[Scenario, ...]:
         """The scenarios, each with the host vehicle as its ego."""
         rigs = {self.base_rig.name: self.base_rig} if self.base_rig else {}
-        return tuple(with_ego(Scenario.load(each), rigs, self.vehicle) for each in self.scenario)
+        return tuple(set_ego(Scenario.load(each), rigs, self.vehicle) for each in self.scenario)
 
     @cached_property
     def host(self) -> HostVehicle:

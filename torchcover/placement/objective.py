@@ -179,7 +179,7 @@ class Objective(Document):
         if not self.region_bands:
             raise ValueError("band: at least one is needed")
         if isinstance(self.region, dict):
-            return tuple(region.called(name) for name, region in self.region.items())
+            return tuple(region.build_region(name) for name, region in self.region.items())
         names = dict.fromkeys(region for region, _ in self.region_bands)
         if unknown := [name for name in names if name not in named_regions]:
             raise ValueError(

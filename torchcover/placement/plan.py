@@ -101,7 +101,10 @@ class SearchPlan:
         Raises:
             ValueError: The sensor model is "real", and no sensor of the start has known range limits.
         """
-        content = {"space": space.content(), "scenarios": [scenario.content() for scenario in space.scenarios]}
+        content = {
+            "space": space.collect_content(),
+            "scenarios": [scenario.collect_content() for scenario in space.scenarios],
+        }
         text = json.dumps(content, sort_keys=True, default=str)
         return {
             "torchcover": __version__,
@@ -109,7 +112,7 @@ class SearchPlan:
             "space_sha256": sha256(text.encode()).hexdigest(),
             "optimizer": str(self.optimizer_params),
             "estimate": self.average,
-            "sensor_model": space.start.sensing(self.sensor_model).sensor_model,
+            "sensor_model": space.start.apply_sensor_model(self.sensor_model).sensor_model,
             "band_frame": DEFAULT_BAND_FRAME,
             **{name: getattr(self, name) for name in ("seed", "worlds", "per_world", "frame_interval_s", "rays")},
         }

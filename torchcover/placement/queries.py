@@ -53,7 +53,7 @@ class Queries(NamedTuple):
 
         ValueError: a region or a band that is none; two regions of one name; one that holds no cell centre.
         """
-        usual = {region.name: region for region in RegionsOfInterest().around(ego_outline_m).regions}
+        usual = {region.name: region for region in RegionsOfInterest().build_query_plan(ego_outline_m).regions}
         regions, names = dict[str, Region](), tuple(objectives)
         objectives = {name: one for name, one in objectives.items() if not one.requirement} or FOR_STEPS
         for name, objective in objectives.items():
@@ -66,7 +66,7 @@ class Queries(NamedTuple):
         bands = [band for objective in objectives.values() for _, band in objective.region_bands]
         written = {name: _written(region) for name, region in regions.items()}
         heights = {band: PAPER_HEIGHTS[band] for band in bands}
-        grid = RegionsOfInterest(regions=written, heights=heights).around(ego_outline_m, CELL_M).grid
+        grid = RegionsOfInterest(regions=written, heights=heights).build_query_plan(ego_outline_m, CELL_M).grid
         keys = [objective.key for objective in objectives.values()]
         thresholds = sorted({float(each) for key in keys for each in SEEN_WITHIN.findall(key)})
         within = all(SEEN_WITHIN.match(key) for key in keys) and max(thresholds) > 0

@@ -95,7 +95,9 @@ class _Budget:
         plan, objectives = search.plan, len(search.space.objectives)
         rigs = 3 if objectives == 1 else objectives + 2
         held_out = (
-            plan.num_held_out_scenes * plan.frames_per_scene * sum(not each.repeats for each in search.space.scenarios)
+            plan.num_held_out_scenes
+            * plan.frames_per_scene
+            * sum(not each.is_repeating for each in search.space.scenarios)
         )
         self.evaluation_s = search.evaluations[0].duration_s
         rigs_s = rigs * self.evaluation_s

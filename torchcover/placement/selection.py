@@ -159,7 +159,7 @@ class SelectionResult(ReportMixin):
             tables=[table, *([self.test.table] if self.test else ())],
             csv_tables={"candidates.csv": self._candidate_rows(), "sizes.csv": [SelectionSize._fields, *self._sizes]},
             render_plots=self._pictures,
-            ego_outline_m=self.space.scenarios[0].ego_box().outline_m,
+            ego_outline_m=self.space.scenarios[0].compute_ego_box().outline_m,
         )
 
     def __repr__(self) -> str:
@@ -285,7 +285,7 @@ def run_selection(
     now = now or drawn[len(drawn) // 2].selected
     rig = space.build_rig(tuple(sensors[one] for one in found[0].selected), f"{space.name}_best")
     scored = frames.score(rig).estimate.to_numbers()
-    model = rig.sensing(frames.sensor_model).sensor_model
+    model = rig.apply_sensor_model(frames.sensor_model).sensor_model
     choice = tuple(found), scored, tuple(drawn), now
     chosen = SelectionResult(space, frames.average, model, sensors, refused, coverage, limits, *choice)
     return _validate(chosen, frames, test_seed, num_held_out_scenes)

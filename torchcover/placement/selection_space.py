@@ -24,7 +24,7 @@ from torchcover.placement.host_vehicle import HostVehicle, NamedRig, PlacementSp
 from torchcover.placement.queries import Queries
 from torchcover.placement.selection_solver import SelectionLimits
 from torchcover.simulation import Document, Pose, Rig, Sensor
-from torchcover.simulation.rig import read_sensor
+from torchcover.simulation.rig import parse_sensor
 
 MOST_CANDIDATES = 2000
 
@@ -33,7 +33,7 @@ def _sensor(given: Any, info: ValidationInfo) -> Sensor:  # noqa: ANN401  (whate
     """A sensor as a rig has it, without a name and a mount."""
     if isinstance(given, dict) and (own := [key for key in ("name", "mount") if key in given]):
         raise ValueError(f"{' and '.join(own)}: the places make them; leave them out")
-    return read_sensor({"name": "sensor", **given} if isinstance(given, dict) else given, info)
+    return parse_sensor({"name": "sensor", **given} if isinstance(given, dict) else given, info)
 
 
 class MountGrid(Document):
@@ -65,10 +65,10 @@ class MountGrid(Document):
             shares = [((np.arange(count) + 0.5) / count).tolist() for count in counts]
             for number, (u, v) in enumerate(product(*shares)):
                 try:
-                    point = region.on(host.skin, u, v)
+                    point = region.find_mount_point(host.skin, u, v)
                 except ValueError:
                     continue
-                x, y, z = (point.place_m + self.height_m * point.outward).tolist()
+                x, y, z = (point.position_m + self.height_m * point.normal).tolist()
                 for yaw, pitch in product(self.yaw_deg, self.pitch_deg):
                     turned = f"_yaw{yaw:g}" * (len(self.yaw_deg) > 1) + f"_pitch{pitch:g}" * (len(self.pitch_deg) > 1)
                     yield f"{name}_{number}{turned}", build_pose(x, y, z, region.heading_deg + yaw, pitch, 0.0)
@@ -259,7 +259,7 @@ class SelectionSpace(PlacementSpace):
         Args:
             indices: Numbers of the candidates that can be mounted.
         """
-        places_m = np.array([self.sensors[one].mount.matrix()[:3, 3] for one in indices]).reshape(-1, 3)
+        places_m = np.array([self.sensors[one].mount.to_matrix()[:3, 3] for one in indices]).reshape(-1, 3)
         apart_m = np.linalg.norm(places_m[:, None] - places_m[None], axis=2)
         most_to_pay = self.constraints.max_cost_eur
         return SelectionLimits(
@@ -271,9 +271,9 @@ class SelectionSpace(PlacementSpace):
 
     def is_too_close(self, sensor: Sensor) -> bool:
         """Whether a candidate would be where a sensor is that is always there."""
-        place_m = sensor.mount.matrix()[:3, 3]
+        place_m = sensor.mount.to_matrix()[:3, 3]
         others: list[Float64] = [
-            other.mount.matrix()[:3, 3] for other in (self.fixed_rig.sensors if self.fixed_rig else ())
+            other.mount.to_matrix()[:3, 3] for other in (self.fixed_rig.sensors if self.fixed_rig else ())
         ]
         return any(np.linalg.norm(place_m - other) < self.constraints.min_distance_m for other in others)
 

@@ -18,7 +18,7 @@ from torchcover.placement.host_vehicle import NOT_WORSE
 from torchcover.placement.objective import THRESHOLD_M, Objective
 from torchcover.report import PageTable, TextCell
 from torchcover.report.wording import format_difference, get_display_unit
-from torchcover.simulation import RegionsOfInterest, Rig, with_ego
+from torchcover.simulation import RegionsOfInterest, Rig, set_ego
 from torchcover.targets import TARGETS, Raster, Target, survey
 
 # Changes that a sentence names.
@@ -240,7 +240,7 @@ def _others(asked: Mapping[str, Objective], *, failures: bool) -> tuple[dict[str
         found, parts[name] = found | each, list(each)
     own = {region for objective in asked.values() if isinstance(objective.region, dict) for region in objective.region}
     plain = make_detection_quantity(THRESHOLD_M).key
-    for region in RegionsOfInterest().around(ANY_OUTLINE_M).regions:
+    for region in RegionsOfInterest().build_query_plan(ANY_OUTLINE_M).regions:
         for band in PAPER_HEIGHTS if region.name not in own else ():
             one = Objective(region=region.name, band=band)
             found[one.description] = one
@@ -257,9 +257,9 @@ def _of_targets(rig: Rig, start: Rig, searched: CommonFrames) -> dict[str, Diffe
     for target in TARGETS:
         ends = []
         for one in (rig, start):
-            empty = with_ego(build_flat_ground().model_copy(update={"ego": searched.scenarios[0].ego}), {one.name: one})
-            raster = Raster.around(empty.ego_box(), WITHIN_M, STEP_M)
-            seen = survey(one.sensing("ideal"), empty, Target.load(target), raster)
+            empty = set_ego(build_flat_ground().model_copy(update={"ego": searched.scenarios[0].ego}), {one.name: one})
+            raster = Raster.around(empty.compute_ego_box(), WITHIN_M, STEP_M)
+            seen = survey(one.apply_sensor_model("ideal"), empty, Target.load(target), raster)
             there = seen.free & (seen.distance_m <= WITHIN_M)
             # Every fourth cell along each axis is a block of its own: by them it is known what the raster leaves open.
             rows, columns = (np.arange(count) % 4 for count in there.shape)

@@ -13,19 +13,19 @@ from torchcover.geometry import BoundingBox, build_transform
 from torchcover.geometry.arrays import Float64
 from torchcover.simulation import shapes
 from torchcover.simulation.documents import (
-    BuiltIn,
+    BuiltInDocument,
     Document,
     NameOrFile,
     Pose,
-    found,
+    find_document,
     is_file_name,
-    named,
     read_mapping,
+    resolve_name_or_file,
 )
 from torchcover.simulation.mount_regions import MountRegion
-from torchcover.simulation.returns import Material, material_number
+from torchcover.simulation.returns import Material, get_material_index
 from torchcover.simulation.shapes import Mesh
-from torchcover.simulation.sound import told
+from torchcover.simulation.sound import check_mesh
 
 # No building, and no terrain within a sensor's range, is higher.
 TALLEST_SCENERY_M = 1000.0
@@ -57,12 +57,12 @@ HIGH = (
     + " if its y points up and its z forward (glTF and GLB), `{roll_deg: 90}` if y points up and x forward"
 )
 UNITS = (
-    "a file in millimetres needs `metres_per_unit: 0.001` beside its `path`, one in centimetres 0.01, one in inches "
+    "a file in millimetres needs `meters_per_unit: 0.001` beside its `path`, one in centimetres 0.01, one in inches "
     "0.0254"
 )
 
 
-def warn_of_mover(owner: str, mesh: Mesh, category: str) -> None:
+def warn_about_actor_size(owner: str, mesh: Mesh, category: str) -> None:
     """Warn if the ego or an actor is as large, as small or as wide as none is."""
     words = set(re.split(r"[^a-z]+", category.lower()))
     on_roads = bool(words & ROAD_VEHICLES) and not words & RAIL_VEHICLES
@@ -71,7 +71,7 @@ def warn_of_mover(owner: str, mesh: Mesh, category: str) -> None:
     if longest_m > (LONGEST_ON_ROADS_M if on_roads else LONGEST_M):
         _warn(owner, (x, y, z), f"far too large{' for a vehicle on a road' if on_roads else ''}; {UNITS}")
     elif on_roads and longest_m < SHORTEST_M:
-        _warn(owner, (x, y, z), "too small for a vehicle: is its `metres_per_unit` that of its file?")
+        _warn(owner, (x, y, z), "too small for a vehicle: is its `meters_per_unit` that of its file?")
     elif on_roads and longest_m > SHORTEST_CAR_M and max(y, z) > x and z < MAST_SLENDERNESS * max(x, y):
         _warn(owner, (x, y, z), f"wider than long; {WIDE}" if y > z else f"higher than long; {HIGH}")
 
@@ -91,17 +91,17 @@ class VehicleShape(Document):
     type: Literal["vehicle"]
     vehicle: NameOrFile
 
-    def mesh(self) -> Mesh:
+    def build_mesh(self) -> Mesh:
         """All parts in one mesh, in the vehicle frame."""
-        return self._read.mesh()
+        return self._read.build_mesh()
 
-    def placed_mesh(self) -> Mesh:
+    def build_placed_mesh(self) -> Mesh:
         """All parts in one mesh, where the document of the vehicle places them."""
-        return self._read.placed_mesh()
+        return self._read.build_placed_mesh()
 
-    def content(self) -> dict[str, Any]:
+    def collect_content(self) -> dict[str, Any]:
         """Its parts, wherever they stand."""
-        return self._read.content()
+        return self._read.collect_content()
 
     @cached_property
     def _read(self) -> "Vehicle":
@@ -115,9 +115,9 @@ Shape = Annotated[
 ]
 
 
-def sound_mesh(shape: Shape, owner: str) -> Mesh:
+def build_checked_mesh(shape: Shape, owner: str) -> Mesh:
     """The form of a body, with warnings if a file has lies in it; see `told`."""
-    return told(owner, shape.mesh()) if isinstance(shape, shapes.MeshFile) else shape.mesh()
+    return check_mesh(owner, shape.build_mesh()) if isinstance(shape, shapes.MeshFile) else shape.build_mesh()
 
 
 class Body(Document):
@@ -144,31 +144,33 @@ class Body(Document):
     def _check_material(self) -> Self:
         if self.material is not None:
             try:
-                material_number(self.material)
+                get_material_index(self.material)
             except FileNotFoundError as error:
                 raise ValueError(f"material: {error}") from error
         return self
 
-    def content(self) -> dict[str, Any]:
+    def collect_content(self) -> dict[str, Any]:
         """Its keys; of a material from a file what stands there."""
         own = self.material is not None and is_file_name(self.material)
-        return super().content() | ({"material": Material.load(str(self.material)).content()} if own else {})
+        return super().collect_content() | (
+            {"material": Material.load(str(self.material)).collect_content()} if own else {}
+        )
 
-    def meshes(self) -> list[Mesh]:
+    def build_meshes(self) -> list[Mesh]:
         """One mesh for each pose."""
-        mesh = sound_mesh(self.shape, f"body {self.name!r}")
+        mesh = build_checked_mesh(self.shape, f"body {self.name!r}")
         if self.material is not None or self.ground:
-            mesh = mesh.made_of(self.material or "road")
+            mesh = mesh.assign_material(self.material or "road")
         x, y, z = np.ptp(mesh.vertices_m, axis=0).tolist()
         if min(x, y, z) > TALLEST_SCENERY_M:  # of what may be a whole city
             _warn(f"body {self.name!r}", (x, y, z), f"far too large; {UNITS}")
-        return [mesh.moved(pose.matrix()) for pose in self.poses]
+        return [mesh.transform(pose.to_matrix()) for pose in self.poses]
 
 
 RegionName = Annotated[str, Field(min_length=1)]
 
 
-class Vehicle(BuiltIn):
+class Vehicle(BuiltInDocument):
     """The body of a vehicle, put together from parts.
 
     Args:
@@ -193,8 +195,8 @@ class Vehicle(BuiltIn):
     def _add_parts_of_base(cls, content: Any, info: ValidationInfo) -> Any:  # noqa: ANN401  (whatever stood in the file)
         if not isinstance(content, dict) or not isinstance(content.get("extends"), str):
             return content
-        name = named(content["extends"], info)
-        further = read_mapping(found(cls.folder, name)).get("extends")
+        name = resolve_name_or_file(content["extends"], info)
+        further = read_mapping(find_document(cls.folder, name)).get("extends")
         if further is not None:  # which may be a ring, too
             raise ValueError(f"extends: {name} extends {further!r} itself; extend that one, and copy the other parts")
         base = cls.load(name)
@@ -218,8 +220,8 @@ class Vehicle(BuiltIn):
     @model_validator(mode="after")
     def _check_origin(self) -> Self:
         if self.extends is not None:
-            base = Vehicle.load(self.extends).placed_mesh().vertices_m
-            shift_m = _middle_m(self.placed_mesh().vertices_m) - _middle_m(base)
+            base = Vehicle.load(self.extends).build_placed_mesh().vertices_m
+            shift_m = _middle_m(self.build_placed_mesh().vertices_m) - _middle_m(base)
             if np.abs(shift_m).max() > LOWERED_M:
                 warnings.warn(
                     f"vehicle {self.name!r}: what it adds to {self.extends} moves the middle of its bounding box, from "
@@ -229,21 +231,25 @@ class Vehicle(BuiltIn):
                 )
         return self
 
-    def mesh(self) -> Mesh:
+    def build_mesh(self) -> Mesh:
         """All parts in one mesh, in the vehicle frame; painted, where they do not say their material."""
-        return in_vehicle_frame(self.placed_mesh())
+        return move_to_vehicle_frame(self.build_placed_mesh())
 
-    def placed_mesh(self) -> Mesh:
+    def build_placed_mesh(self) -> Mesh:
         """All parts in one mesh, where the document places them."""
-        meshes = [mesh for part in self.parts for mesh in part.meshes()]
-        return merge([mesh.made_of("car_paint") if mesh.material is None else mesh for mesh in meshes])
+        meshes = [mesh for part in self.parts for mesh in part.build_meshes()]
+        return merge_meshes(
+            [mesh.assign_material("car_paint") if mesh.material_indices is None else mesh for mesh in meshes]
+        )
 
-    def content(self) -> dict[str, Any]:
+    def collect_content(self) -> dict[str, Any]:
         """Its body; where sensors may be mounted on it means nothing to those that are."""
-        return {key: value for key, value in super().content().items() if key not in ("mount_regions", "extends")}
+        return {
+            key: value for key, value in super().collect_content().items() if key not in ("mount_regions", "extends")
+        }
 
 
-def mount_regions_of(shape: Shape | None) -> dict[str, MountRegion]:
+def get_mount_regions(shape: Shape | None) -> dict[str, MountRegion]:
     """Where sensors can be mounted on a body: on a vehicle that says it."""
     if not isinstance(shape, VehicleShape):
         return {}
@@ -254,7 +260,7 @@ def describe_windows(shape: Shape | None) -> str:
     """Say which materials of a body look transparent and stop rays, and how to let these pass; empty if none does."""
     parts: tuple[Body, ...] = Vehicle.load(shape.vehicle).parts if isinstance(shape, VehicleShape) else ()
     for mesh in (shape, *(part.shape for part in parts)):
-        if isinstance(mesh, shapes.MeshFile) and (names := mesh.clear_materials()):
+        if isinstance(mesh, shapes.MeshFile) and (names := mesh.list_transparent_materials()):
             return (
                 f"{mesh.path.name}: {', '.join(map(repr, names))} look transparent and stop rays; to let rays pass, "
                 f"give its shape `transparent: [{', '.join(names)}]` in a vehicle file"
@@ -267,7 +273,7 @@ def _middle_m(vertices_m: Float64) -> Float64:
     return np.asarray((vertices_m.min(axis=0) + vertices_m.max(axis=0))[:2] / 2)
 
 
-def in_vehicle_frame(mesh: Mesh, *, keep_height: bool = False) -> Mesh:
+def move_to_vehicle_frame(mesh: Mesh, *, keep_height: bool = False) -> Mesh:
     """Move a mesh so that the origin lies on the ground under the center of its bounding box.
 
     Args:
@@ -277,30 +283,30 @@ def in_vehicle_frame(mesh: Mesh, *, keep_height: bool = False) -> Mesh:
     box = BoundingBox.from_points(mesh.vertices_m)
     (x0, y0, z0), (x1, y1, _) = box.lower_m, box.upper_m
     z_m = -min(z0, 0.0) if keep_height else -z0
-    return mesh.moved(build_transform(np.eye(3), [-(x0 + x1) / 2, -(y0 + y1) / 2, z_m]))
+    return mesh.transform(build_transform(np.eye(3), [-(x0 + x1) / 2, -(y0 + y1) / 2, z_m]))
 
 
-def mover_mesh(name: str, shape: Shape, category: str = "ego", *, keep_height: bool = False) -> Mesh:
+def build_actor_mesh(name: str, shape: Shape, category: str = "ego", *, keep_height: bool = False) -> Mesh:
     """The body of the ego or of an actor in its vehicle frame; a warning if it is too large, too small or turned.
 
-    `keep_height` is that of `in_vehicle_frame`.
+    `keep_height` is that of `move_to_vehicle_frame`.
     """
-    mesh = shape.placed_mesh() if isinstance(shape, VehicleShape) else sound_mesh(shape, name)
+    mesh = shape.build_placed_mesh() if isinstance(shape, VehicleShape) else build_checked_mesh(shape, name)
     bottom_m = float(mesh.vertices_m[:, 2].min())
     if isinstance(shape, VehicleShape) and category != "ego" and bottom_m > LOWERED_M and not keep_height:
         warnings.warn(
-            f"{name}: all parts of {called(shape)} are {bottom_m:.3g} m or more above z = 0, and it is put on the "
+            f"{name}: all parts of {get_shape_name(shape)} are {bottom_m:.3g} m or more above z = 0, and it is put on the "
             "ground; give it a part that stands on the ground, or the z_m of its lowest point in the pose",
             stacklevel=3,
         )
-    mesh = in_vehicle_frame(mesh, keep_height=keep_height)
-    if mesh.material is None:
-        mesh = mesh.made_of("clothing" if category in ON_FOOT else "car_paint")
-    warn_of_mover(name, mesh, category)
+    mesh = move_to_vehicle_frame(mesh, keep_height=keep_height)
+    if mesh.material_indices is None:
+        mesh = mesh.assign_material("clothing" if category in ON_FOOT else "car_paint")
+    warn_about_actor_size(name, mesh, category)
     return mesh
 
 
-def called(shape: Shape) -> str:
+def get_shape_name(shape: Shape) -> str:
     """What a picture or a table calls a body: the name of a built-in vehicle, the name of a file, or the kind of shape.
 
     Example:
@@ -312,11 +318,11 @@ def called(shape: Shape) -> str:
     return shape.path.name if isinstance(shape, shapes.MeshFile) else shape.type
 
 
-def body_called(name_or_path: str | Path) -> VehicleShape | shapes.MeshFile:
+def create_body_shape(name_or_path: str | Path) -> VehicleShape | shapes.MeshFile:
     """The shape that a name or a path means: a vehicle's, unless it is a file that is no YAML.
 
     Example:
-        >>> body_called("suv").type, body_called("robot.stl").type
+        >>> create_body_shape("suv").type, create_body_shape("robot.stl").type
         ('vehicle', 'mesh')
     """
     path = Path(name_or_path)
@@ -325,14 +331,14 @@ def body_called(name_or_path: str | Path) -> VehicleShape | shapes.MeshFile:
     return shapes.MeshFile(type="mesh", path=path)
 
 
-def merge(meshes: list[Mesh]) -> Mesh:
+def merge_meshes(meshes: list[Mesh]) -> Mesh:
     """One mesh with the vertices and faces of all."""
     offsets = np.cumsum([0, *(len(mesh.vertices_m) for mesh in meshes[:-1])])
-    outward = [mesh.outward for mesh in meshes if mesh.outward is not None]
+    outward = [mesh.is_outward for mesh in meshes if mesh.is_outward is not None]
     return Mesh(
         np.concatenate([mesh.vertices_m for mesh in meshes]),
         np.concatenate([mesh.faces + offset for mesh, offset in zip(meshes, offsets, strict=True)]),
-        np.concatenate([mesh.materials for mesh in meshes]),
+        np.concatenate([mesh.filled_material_indices for mesh in meshes]),
         # Those of surfaces that share edges, all of them closed and turned outwards, are one that is.
         np.concatenate(outward) if len(outward) == len(meshes) and all(one.all() for one in outward) else None,
     )

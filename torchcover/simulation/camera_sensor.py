@@ -12,7 +12,7 @@ from torchcover.cameras import Camera
 from torchcover.geometry import build_transform
 from torchcover.geometry.arrays import Float64
 from torchcover.simulation.documents import Document, Pose
-from torchcover.simulation.sensor import Ranging, ScanTimes
+from torchcover.simulation.sensor import RangeSensor, ScanTimes
 
 # The camera frame is x right, y down, z forward; a mount looks along its x, with y left and z up.
 MOUNT_T_CAMERA = build_transform(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3))
@@ -20,7 +20,7 @@ ROWS_AT_ONCE = 64
 # Ten times the sides of the largest images that there are.
 MAX_PIXELS = 200_000
 
-Side = Annotated[int, Field(gt=0, le=MAX_PIXELS)]
+PixelCount = Annotated[int, Field(gt=0, le=MAX_PIXELS)]
 
 
 class Stereo(Document):
@@ -35,7 +35,7 @@ class Stereo(Document):
     subpixel_px: PositiveFloat
 
 
-class CameraSensor(Ranging):
+class CameraSensor(RangeSensor):
     """A camera as a depth sensor: every pixel that has a ray gives the point that it sees.
 
     What it takes for the range has a standard deviation of `range_noise_m`, `range_noise_share` of the range, and that
@@ -66,8 +66,8 @@ class CameraSensor(Ranging):
     type: Literal["camera"] = "camera"
     name: str
     mount: Pose = Pose()
-    width: Side
-    height: Side
+    width: PixelCount
+    height: PixelCount
     fov_deg: Annotated[float, Field(gt=0.0, lt=180.0)] | None = None
     fx: PositiveFloat | None = None
     fy: PositiveFloat | None = None
@@ -87,27 +87,27 @@ class CameraSensor(Ranging):
             raise ValueError("the intrinsics are missing: give fx, fy, cx and cy, or fov_deg")
         if self.fov_deg is not None and (any(given) or self.lens != "pinhole"):
             raise ValueError("fov_deg is for a pinhole without fx, fy, cx, cy; give one or the other")
-        self.camera()
+        self.build_camera()
         return self
 
-    def noise_m(self, range_m: NDArray[np.floating]) -> float | NDArray[np.floating]:
+    def compute_noise_std_m(self, range_m: NDArray[np.floating]) -> float | NDArray[np.floating]:
         """Standard deviation of measured ranges, of each of (N,) or of all; 0 if they are exact."""
         if self.stereo is None and not self.range_noise_share:
             return self.range_noise_m
         squared = self.range_noise_m**2 + (self.range_noise_share * range_m) ** 2
         if self.stereo is not None:
-            focal_px = float(self.camera().intrinsics[0])
+            focal_px = float(self.build_camera().intrinsics[0])
             per_m2 = self.stereo.subpixel_px / (focal_px * self.stereo.baseline_m)
             squared = squared + (per_m2 * range_m**2) ** 2
         return np.asarray(np.sqrt(squared))
 
     @property
-    def counts_as(self) -> int:
+    def pixels_per_sample(self) -> int:
         """The pixels of the full image that each one in use stands for."""
         return self.stride**2
 
     @property
-    def rays(self) -> int:
+    def num_rays(self) -> int:
         """How many pixels are used, those without a ray included."""
         return -(-self.width // self.stride) * -(-self.height // self.stride)
 
@@ -126,35 +126,35 @@ class CameraSensor(Ranging):
         angle = angle[~np.isnan(angle)]
         return float(np.ptp(angle)) if len(angle) else np.nan
 
-    def camera(self) -> Camera:
+    def build_camera(self) -> Camera:
         """The camera with its lens, at its place on the vehicle.
 
         Raises:
             ValueError: The lens model is unknown or takes another number of coefficients.
         """
-        own: dict[str, Any] = {"vehicle_T_camera": self.mount.matrix() @ MOUNT_T_CAMERA, "name": self.name}
+        own: dict[str, Any] = {"vehicle_T_camera": self.mount.to_matrix() @ MOUNT_T_CAMERA, "name": self.name}
         if self.fov_deg is not None:
             return Camera.from_fov(self.width, self.height, self.fov_deg, **own)
         own |= {key: getattr(self, key) for key in ("fx", "fy", "cx", "cy", "coefficients")}
         return Camera(self.width, self.height, model=self.lens, **own)
 
-    def directions(self) -> Float64:
+    def compute_directions(self) -> Float64:
         """(3, rows, columns) unit directions in the frame of the mount; NaN where a pixel has no ray."""
         rows, columns = (
             torch.arange(0, size, self.stride, dtype=torch.float64, device="cpu") for size in (self.height, self.width)
         )
         return self._directions(torch.stack(torch.meshgrid(columns, rows, indexing="xy"), dim=2))
 
-    def times_s(self) -> Float64 | None:
+    def compute_ray_times_s(self) -> Float64 | None:
         """(rows, columns) when each ray is cast, after the time of the frame; None if all are at that time."""
         if self.scan is None:
             return None
-        of_rows_s = self.scan.times_s(self.height)[:: self.stride]
+        of_rows_s = self.scan.compute_times_s(self.height)[:: self.stride]
         return np.repeat(of_rows_s[:, None], -(-self.width // self.stride), axis=1)
 
     def _directions(self, pixels: Tensor) -> Float64:
         """(3, rows, columns) of (rows, columns, 2) pixels."""
-        camera = self.camera()
+        camera = self.build_camera()
         # Only the pixels that are used, and not all at once: the solver needs many times their memory.
         rays = torch.cat([camera.rays(band)[0] for band in torch.split(pixels, ROWS_AT_ONCE)])
         right, down, forward = np.moveaxis(rays.numpy(), 2, 0)

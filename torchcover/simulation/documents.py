@@ -28,7 +28,7 @@ from torchcover.geometry import build_transform, convert_euler_to_rotation, conv
 from torchcover.geometry.arrays import Float64
 from torchcover.geometry.rigid import warn_about_radians
 from torchcover.recordings.other_formats import find_remedy
-from torchcover.simulation.builtin import builtin_names, get_builtin_folder
+from torchcover.simulation.builtin import get_builtin_folder, list_builtin_names
 
 # Mistakes of one document that a message tells, and characters of what arrived.
 MAX_TOLD = 5
@@ -68,7 +68,7 @@ MAX_QUOTED = 60
 # Keys of angles that people measure in radians, too.
 ANGLES = ("yaw_deg", "pitch_deg", "roll_deg", "fov_deg", "horizontal_fov_deg", "vertical_fov_deg", "facing_deg")
 # Keys and numbers, from the document on.
-Place = tuple[int | str, ...]
+KeyPath = tuple[int | str, ...]
 # Looks at no more of a value than it writes: a list of lists of lists may be endless.
 _QUOTE = Repr()
 _QUOTE.maxlevel, _QUOTE.maxstring, _QUOTE.maxlong, _QUOTE.maxother = 2, MAX_QUOTED, MAX_QUOTED, MAX_QUOTED
@@ -90,10 +90,10 @@ class Document(BaseModel):
         if not isinstance(content, dict):
             return content
         kept = {key: _kept(value) for key, value in content.items()}
-        warn_about_radians({key: kept[key] for key in ANGLES if is_numbers(kept.get(key))})
+        warn_about_radians({key: kept[key] for key in ANGLES if has_only_numbers(kept.get(key))})
         return kept
 
-    def content(self) -> dict[str, Any]:
+    def collect_content(self) -> dict[str, Any]:
         """All that it means to a simulation, for JSON: its keys, and hashes of the files that they name.
 
         Raises:
@@ -153,7 +153,7 @@ class Pose(Document):
             convert_quaternion_to_rotation(self.quaternion_wxyz)
         return self
 
-    def matrix(self) -> Float64:
+    def to_matrix(self) -> Float64:
         """The (4, 4) transform."""
         if self.quaternion_wxyz is not None:
             rotation = convert_quaternion_to_rotation(self.quaternion_wxyz)
@@ -165,14 +165,14 @@ class Pose(Document):
 DocumentT = TypeVar("DocumentT", bound=Document)
 
 
-def read_document(model: type[DocumentT], path: Path) -> DocumentT:
+def read_document(document_type: type[DocumentT], path: Path) -> DocumentT:
     """Read a YAML file into a model of which none is built in."""
     content = read_mapping(path)
     try:
-        return model.model_validate(content, context={"folder": path.parent})
+        return document_type.model_validate(content, context={"folder": path.parent})
     except ValidationError as error:
-        other = find_other_kind(model.kind, content)
-        words = f"this is {other}; {model.kind} is needed" if other else explain(error)
+        other = find_other_kind(document_type.kind, content)
+        words = f"this is {other}; {document_type.kind} is needed" if other else format_validation_error(error)
         raise BadFileError(f"{path}: {words}") from error
 
 
@@ -201,7 +201,7 @@ def find_other_kind(kind: str, content: Mapping[str, Any]) -> str:
     return best if has_own_keys or (keys and not mistakes[best]) else ""
 
 
-class Readable(Document):
+class FileDocument(Document):
     """A document that fills a file of its own."""
 
     @classmethod
@@ -214,7 +214,7 @@ class Readable(Document):
         return read_document(cls, Path(path))
 
 
-class BuiltIn(Document):
+class BuiltInDocument(Document):
     """A document that has a name if it comes with torchcover, in a folder of its kind."""
 
     folder: ClassVar[str]
@@ -231,7 +231,7 @@ class BuiltIn(Document):
             BadFileError: Not YAML, or a key is unknown, missing, doubled or has a wrong value; the message names the
                 file and the key.
         """
-        return read_document(cls, found(cls.folder, path_or_name))
+        return read_document(cls, find_document(cls.folder, path_or_name))
 
 
 @guard_reader("a YAML document")
@@ -243,7 +243,7 @@ def read_mapping(path: Path) -> dict[str, Any]:
     return content
 
 
-def explain(error: ValidationError) -> str:
+def format_validation_error(error: ValidationError) -> str:
     """What pydantic found, in one line: the key, what is wrong, what arrived."""
     details = [detail for detail in error.errors(include_url=False) if not _follows_from_another(detail)]
     meant = _misspelt(details)
@@ -253,10 +253,10 @@ def explain(error: ValidationError) -> str:
     return "; ".join([*told, f"and {more} more mistakes"] if more else told)
 
 
-def _misspelt(details: Sequence[ErrorDetails]) -> dict[Place, Place]:
+def _misspelt(details: Sequence[ErrorDetails]) -> dict[KeyPath, KeyPath]:
     """Unknown keys -> those that are missing at the same place and look like them."""
     missing = [detail["loc"] for detail in details if detail["type"] == "missing"]
-    meant: dict[Place, Place] = {}
+    meant: dict[KeyPath, KeyPath] = {}
     for detail in details:
         if detail["type"] != "extra_forbidden":
             continue
@@ -268,7 +268,7 @@ def _misspelt(details: Sequence[ErrorDetails]) -> dict[Place, Place]:
     return meant
 
 
-def _told(detail: ErrorDetails, meant: Place | None = None) -> str:
+def _told(detail: ErrorDetails, meant: KeyPath | None = None) -> str:
     if meant:
         return f"{'.'.join(map(str, detail['loc']))}: unknown key; {meant[-1]} is meant, which is missing"
     # None of what is about the whole document; which of several forms was tried is in brackets.
@@ -304,10 +304,10 @@ def _follows_from_another(detail: ErrorDetails) -> bool:
 
 
 def _beside(path: Any, info: ValidationInfo) -> Any:  # noqa: ANN401  (whatever stood in the file)
-    return beside(Path(path), info) if isinstance(path, str) else path
+    return resolve_path(Path(path), info) if isinstance(path, str) else path
 
 
-def beside(path: Path, info: ValidationInfo) -> Path:
+def resolve_path(path: Path, info: ValidationInfo) -> Path:
     """A relative path is meant from the folder of the document that holds it."""
     folder = (info.context or {}).get("folder")
     return folder / path if folder and not path.is_absolute() else path
@@ -320,16 +320,20 @@ def _from_anywhere(path_or_name: str | Path) -> str:
 
 _WRITTEN = PlainSerializer(_from_anywhere, when_used="json")
 
-PathBeside = Annotated[Path, BeforeValidator(_beside), _WRITTEN]
+RelativePath = Annotated[Path, BeforeValidator(_beside), _WRITTEN]
 """A path in a document; a relative one is meant from the document's folder."""
 
 
-def named(given: Any, info: ValidationInfo) -> Any:  # noqa: ANN401  (whatever stood in the file)
+def resolve_name_or_file(path_or_name: Any, info: ValidationInfo) -> Any:  # noqa: ANN401  (whatever stood in the file)
     """The name of a built-in document, or the path of a YAML file, from the folder of the document that has it."""
-    return str(beside(Path(given), info)) if isinstance(given, str) and is_file_name(given) else given
+    return (
+        str(resolve_path(Path(path_or_name), info))
+        if isinstance(path_or_name, str) and is_file_name(path_or_name)
+        else path_or_name
+    )
 
 
-NameOrFile = Annotated[str, BeforeValidator(named), _WRITTEN]
+NameOrFile = Annotated[str, BeforeValidator(resolve_name_or_file), _WRITTEN]
 """The name of a built-in document, or the path of a YAML file, which is meant from the folder of the document."""
 
 
@@ -337,12 +341,12 @@ SEVERAL = BeforeValidator(lambda given: (given,) if isinstance(given, str) else 
 """Of a list of words: one stands for a list of one."""
 
 
-def by_name(of: type[BuiltIn]) -> BeforeValidator:
+def build_name_validator(document_type: type[BuiltInDocument]) -> BeforeValidator:
     """Of a document within another: its name, if it is built in, or its file stand for it."""
 
     def read(given: Any, info: ValidationInfo) -> Any:  # noqa: ANN401  (whatever stood in the file)
         try:
-            return of.load(named(given, info)) if isinstance(given, str) else given
+            return document_type.load(resolve_name_or_file(given, info)) if isinstance(given, str) else given
         except FileNotFoundError as error:
             raise ValueError(str(error)) from error
 
@@ -354,18 +358,18 @@ def is_file_name(path_or_name: str | Path) -> bool:
     return Path(path_or_name).suffix in (".yaml", ".yml")
 
 
-def nearest(name: str, known: Sequence[str]) -> str:
+def suggest_names(name: str, known_names: Sequence[str]) -> str:
     """What may be meant by a name that is not known: at most three that are like it, or the nearest three.
 
     Example:
         >>> nearest("urbn", ["courtyard", "highway", "parking", "urban"])
         "is 'urban' meant? `torchcover list` has all 4"
     """
-    alike = get_close_matches(name, known, n=3) or get_close_matches(name, known, n=3, cutoff=0.0)
-    return f"is {' or '.join(map(repr, alike))} meant? `torchcover list` has all {len(known)}"
+    alike = get_close_matches(name, known_names, n=3) or get_close_matches(name, known_names, n=3, cutoff=0.0)
+    return f"is {' or '.join(map(repr, alike))} meant? `torchcover list` has all {len(known_names)}"
 
 
-def found(kind: str, path_or_name: str | Path) -> Path:
+def find_document(kind: str, path_or_name: str | Path) -> Path:
     """Where a document is: a path that ends in .yaml or .yml, or a built-in one of a kind by its name.
 
     FileNotFoundError: no built-in one of this name; the message says the nearest. BadFileError: a file of another
@@ -379,22 +383,22 @@ def found(kind: str, path_or_name: str | Path) -> Path:
     builtin = get_builtin_folder(kind) / f"{path_or_name}.yaml"
     if path.name != str(path_or_name) or not builtin.is_file():
         kinds = [other for other in ("rigs", "scenarios", "vehicles", "encounters", "requirements") if other != kind]
-        if of := [other for other in kinds if path.name in builtin_names(other)]:
+        if of := [other for other in kinds if path.name in list_builtin_names(other)]:
             raise FileNotFoundError(f"{path.name!r} is one of the built-in {of[0]}; one of the {kind} is needed")
         raise FileNotFoundError(
             f"{str(path_or_name)!r} is neither a .yaml file nor one of the built-in {kind}; "
-            + nearest(str(path_or_name), builtin_names(kind))
+            + suggest_names(str(path_or_name), list_builtin_names(kind))
         )
     return builtin
 
 
-def builtin_hashes(kind: str) -> dict[str, str]:
+def hash_builtin_documents(kind: str) -> dict[str, str]:
     """The hash of every built-in document of a kind, by its name."""
-    return {path.stem: file_hash(path) for path in sorted(get_builtin_folder(kind).glob("*.yaml"))}
+    return {path.stem: hash_file(path) for path in sorted(get_builtin_folder(kind).glob("*.yaml"))}
 
 
 @guard_reader("a file")
-def file_hash(path: Path) -> str:
+def hash_file(path: Path) -> str:
     """SHA-256 of what is in a file."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
@@ -402,9 +406,9 @@ def file_hash(path: Path) -> str:
 
 def _content(value: Any) -> Any:  # noqa: ANN401  (whatever a document holds)
     if isinstance(value, Document):
-        return value.content()
+        return value.collect_content()
     if isinstance(value, Path):
-        return file_hash(value)
+        return hash_file(value)
     if isinstance(value, dict):
         return {key: _content(each) for key, each in value.items()}
     return list(map(_content, value)) if isinstance(value, tuple | list) else value
@@ -415,7 +419,7 @@ def _shorten(value: Any) -> str:  # noqa: ANN401  (whatever stood in the file)
     return text if len(text) <= MAX_QUOTED else f"{text[: MAX_QUOTED - 3]}..."
 
 
-def is_numbers(value: object) -> TypeGuard[float | tuple[float, ...]]:
+def has_only_numbers(value: object) -> TypeGuard[float | tuple[float, ...]]:
     """Return whether it is a number, or a tuple of numbers."""
     return all(type(each) in (int, float) for each in (value if isinstance(value, tuple) else (value,)))
 

@@ -30,24 +30,24 @@ PLUGIN_SETTINGS = re.compile(
 
 
 class PlacedSensor(NamedTuple):
-    """A sensor of a robot: its `keys` in a rig, and its (4, 4) pose in the vehicle frame."""
+    """A sensor of a robot: its `sensor_keys` in a rig, and its (4, 4) pose in the vehicle frame."""
 
-    keys: dict[str, Any]
+    sensor_keys: dict[str, Any]
     vehicle_T_sensor: Float64
 
 
-def read_numbers(text: str | None, count: int, what: str) -> list[float]:
+def read_numbers(text: str | None, count: int, description: str) -> list[float]:
     """Read a fixed number of finite numbers.
 
     Raises:
-        ValueError: Other text, with `what` in the message.
+        ValueError: Other text, with `description` in the message.
     """
     try:
         numbers = [float(word) for word in (text or "").split()]
     except ValueError:
         numbers = []
     if len(numbers) != count or not all(map(math.isfinite, numbers)):
-        raise ValueError(f"{what}: {count} number{'s' * (count > 1)} needed; got {text!r}")
+        raise ValueError(f"{description}: {count} number{'s' * (count > 1)} needed; got {text!r}")
     return numbers
 
 

@@ -7,10 +7,16 @@ from numpy.typing import NDArray
 from pydantic import Field, PositiveFloat, ValidationInfo, model_validator
 
 from torchcover.geometry.arrays import Float32, Float64
-from torchcover.simulation.documents import BuiltIn, Pose, named
-from torchcover.simulation.rays import unit_directions
-from torchcover.simulation.returns import log_excess, material_number, materials, return_probability, tone
-from torchcover.simulation.sensor import Draws, Elevation, Ranging, RayHits, Returns, ScanTimes
+from torchcover.simulation.documents import BuiltInDocument, Pose, resolve_name_or_file
+from torchcover.simulation.rays import compute_unit_directions
+from torchcover.simulation.returns import (
+    compute_brightness_offsets,
+    compute_log_excess,
+    compute_return_probability,
+    get_material_index,
+    load_materials,
+)
+from torchcover.simulation.sensor import Elevation, RangeSensor, RayHits, Returns, ScanTimes, SensorNoise
 
 # Two ways to write rows: a sensor that chooses one of them takes nothing of the other from its model.
 SPACED_ROWS = ("channels", "vertical_fov_deg")
@@ -19,7 +25,7 @@ ROW_TABLE = ("elevations_deg", "azimuth_offsets_deg", "range_factors")
 MAX_ROWS, MAX_COLUMNS = 100_000, 1_000_000
 
 
-class ScanPattern(Ranging):
+class ScanPattern(RangeSensor):
     """Where the rays of a LiDAR point, and which of their hits become points.
 
     The ray of row i in column j points to elevation `E[i]` and azimuth `A[j] + D[i]`, where the rows' elevations E are
@@ -35,7 +41,7 @@ class ScanPattern(Ranging):
         columns: Number of columns.
         range_at_10_percent_m: Range at which a surface of reflectivity 10 %, met head-on, returns every other ray; see
             `log_excess`. None: every hit within `max_range_m` returns.
-        spread: Standard deviation of ln of that range between one ray and the next.
+        log_range_std: Standard deviation of ln of that range between one ray and the next.
         range_factors: Of each row, what its range at 10 % is multiplied with; 1 if not given.
         scan: When its columns are cast; all at once if not given.
         min_range_m, max_range_m, range_noise_m, dropout: As in `Ranging`.
@@ -48,7 +54,7 @@ class ScanPattern(Ranging):
     horizontal_fov_deg: Annotated[float, Field(gt=0.0, le=360.0)]
     columns: Annotated[int, Field(gt=0, le=MAX_COLUMNS)]
     range_at_10_percent_m: PositiveFloat | None = None
-    spread: PositiveFloat = 0.3
+    log_range_std: PositiveFloat = 0.3
     range_factors: tuple[PositiveFloat, ...] | None = None
     scan: ScanTimes | None = None
 
@@ -61,7 +67,7 @@ class ScanPattern(Ranging):
             raise ValueError("the rows are missing: give channels and vertical_fov_deg, or elevations_deg")
         if self.vertical_fov_deg is not None and self.vertical_fov_deg[0] > self.vertical_fov_deg[1]:
             raise ValueError(f"vertical_fov_deg: the lower elevation comes first; got {self.vertical_fov_deg}")
-        rows = len(self.rows_deg())
+        rows = len(self.compute_elevations_deg())
         for key in ("azimuth_offsets_deg", "range_factors"):
             given = getattr(self, key)
             if given is not None and len(given) != rows:
@@ -73,39 +79,41 @@ class ScanPattern(Ranging):
         """Whether it has neither noise nor drop-out, and every hit returns."""
         return self.range_at_10_percent_m is None and super().is_exact
 
-    def measure(self, hits: RayHits, draws: Draws) -> Returns:
+    def measure(self, hits: RayHits, noise: SensorNoise) -> Returns:
         """A point for each hit that returns enough light and is not too close; see `Ranging.measure`."""
         if self.range_at_10_percent_m is None:
-            return super().measure(hits, draws)
-        returned = draws.chance(hits.ray) < self._return_probability(hits, self.range_at_10_percent_m)
-        return self.erring(hits, np.flatnonzero(returned & (hits.range_m >= self.min_range_m)), draws)
+            return super().measure(hits, noise)
+        returned = noise.sample_return_uniform(hits.ray_indices) < self._return_probability(
+            hits, self.range_at_10_percent_m
+        )
+        return self.sample_returns(hits, np.flatnonzero(returned & (hits.range_m >= self.min_range_m)), noise)
 
     def _return_probability(self, hits: RayHits, range_at_10_percent_m: float) -> NDArray[np.floating]:
-        material, weather = hits.struck.material, hits.weather
+        material, weather = hits.attributes.material_indices, hits.weather
         if weather.road == "wet":
-            material = np.where(material == material_number("road"), material_number("wet_road"), material)
-        known = materials()
+            material = np.where(material == get_material_index("road"), get_material_index("wet_road"), material)
+        known = load_materials()
         reach_m: float | Float32 = range_at_10_percent_m
         if self.range_factors is not None:
             of_rows_m = range_at_10_percent_m * np.array(self.range_factors, dtype=np.float32)
-            reach_m = of_rows_m[hits.pixel // self.columns]
-        excess = log_excess(
+            reach_m = of_rows_m[hits.pixel_indices // self.columns]
+        excess = compute_log_excess(
             hits.range_m,
-            hits.struck.cos_incidence,
+            hits.attributes.cos_incidence,
             known.reflectivity[material],
-            known.exponent[material],
+            known.incidence_exponent[material],
             reach_m,
             weather.extinction_per_m,
         )
-        excess += known.spread_of_bodies[material] * tone(hits.struck.body)
-        return return_probability(excess, self.spread, known.spread_of_places[material])
+        excess += known.body_log_std[material] * compute_brightness_offsets(hits.attributes.body_indices)
+        return compute_return_probability(excess, self.log_range_std, known.point_log_std[material])
 
     @property
-    def rays(self) -> int:
+    def num_rays(self) -> int:
         """How many rays there are: rows times columns."""
         return (self.channels or len(self.elevations_deg or ())) * self.columns
 
-    def rows_deg(self) -> Float64:
+    def compute_elevations_deg(self) -> Float64:
         """(rows,) elevation of each row."""
         if self.elevations_deg is not None:
             return np.array(self.elevations_deg)
@@ -113,20 +121,24 @@ class ScanPattern(Ranging):
         assert self.vertical_fov_deg is not None
         return np.linspace(*self.vertical_fov_deg, self.channels)
 
-    def times_s(self) -> Float64 | None:
+    def compute_ray_times_s(self) -> Float64 | None:
         """(rows, columns) when each ray is cast, after the time of the frame; None if all are at that time."""
-        rows = len(self.rows_deg())
-        return None if self.scan is None else np.tile(self.scan.times_s(self.columns), (rows, 1))
+        rows = len(self.compute_elevations_deg())
+        return None if self.scan is None else np.tile(self.scan.compute_times_s(self.columns), (rows, 1))
 
-    def directions(self) -> Float64:
+    def compute_directions(self) -> Float64:
         """(3, rows, columns) unit directions in the LiDAR's frame."""
         middle = (np.arange(self.columns) + 0.5) / self.columns - 0.5
-        offsets = np.zeros(len(self.rows_deg())) if self.azimuth_offsets_deg is None else self.azimuth_offsets_deg
+        offsets = (
+            np.zeros(len(self.compute_elevations_deg()))
+            if self.azimuth_offsets_deg is None
+            else self.azimuth_offsets_deg
+        )
         azimuths_deg = np.add.outer(offsets, self.horizontal_fov_deg * middle)
-        return unit_directions(self.rows_deg()[:, None], azimuths_deg)
+        return compute_unit_directions(self.compute_elevations_deg()[:, None], azimuths_deg)
 
 
-class LidarModel(ScanPattern, BuiltIn):
+class LidarModel(ScanPattern, BuiltInDocument):
     """What is known of a LiDAR on the market: the scan pattern that a sensor starts from.
 
     Args:
@@ -143,20 +155,20 @@ class LidarModel(ScanPattern, BuiltIn):
     name: str
     description: str = ""
 
-    def completing(self, given: dict[str, Any]) -> dict[str, Any]:
+    def complete_keys(self, sensor_keys: dict[str, Any]) -> dict[str, Any]:
         """The keys of a sensor, and those of the model that it does not give.
 
         Args:
-            given: The sensor's keys. One with evenly spaced rows takes no table from the model; one with a table of its
+            sensor_keys: The sensor's keys. One with evenly spaced rows takes no table from the model; one with a table of its
                 own takes neither spacing nor offsets.
         """
         pattern = self.model_dump(exclude={"name", "description"}, exclude_unset=True)
         left_out: tuple[str, ...] = ()
-        if any(given.get(key) is not None for key in SPACED_ROWS):
+        if any(sensor_keys.get(key) is not None for key in SPACED_ROWS):
             left_out = ROW_TABLE
-        elif given.get("elevations_deg") is not None:
+        elif sensor_keys.get("elevations_deg") is not None:
             left_out = SPACED_ROWS + ROW_TABLE
-        return {key: value for key, value in pattern.items() if key not in left_out} | given
+        return {key: value for key, value in pattern.items() if key not in left_out} | sensor_keys
 
 
 class Lidar(ScanPattern):
@@ -189,6 +201,6 @@ class Lidar(ScanPattern):
         if not isinstance(content, dict) or not isinstance(content.get("model"), str):
             return content
         try:
-            return LidarModel.load(named(content["model"], info)).completing(content)
+            return LidarModel.load(resolve_name_or_file(content["model"], info)).complete_keys(content)
         except FileNotFoundError as error:
             raise ValueError(f"model: {error}") from error

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from torchcover.geometry import transform_points
 from torchcover.geometry.arrays import Bools, Float32, Float64, Int64
-from torchcover.simulation.patches import connected, edges_of, outward_faces
+from torchcover.simulation.patches import find_face_edges, find_outward_faces, label_connected_faces
 from torchcover.simulation.raycaster import RayCaster
-from torchcover.simulation.shapes import Mesh, parts_of
+from torchcover.simulation.shapes import Mesh, iterate_mesh_parts
 
 # Nothing steeper is driven or walked on, but for what rounding makes of it.
 STEEPEST_DEG = 45.0 + 1e-6
@@ -41,29 +41,29 @@ ROUNDING = 1e-6
 SLACK_M = 1e-3
 
 
-def level_faces(mesh: Mesh, outward: Bools | None = None) -> Bools:
+def find_level_faces(mesh: Mesh, outward_mask: Bools | None = None) -> Bools:
     """(F,) whether one could stand on each face: it is not too steep, and of a closed body it is an upper side."""
-    level, down = _looks(mesh, 1.0), looks_down(mesh)
+    level, down = _looks(mesh, 1.0), find_downward_faces(mesh)
     if down.any():
-        level |= down & ~(outward_faces(mesh) if outward is None else outward)
+        level |= down & ~(find_outward_faces(mesh) if outward_mask is None else outward_mask)
     return level
 
 
-def looks_down(mesh: Mesh) -> Bools:
+def find_downward_faces(mesh: Mesh) -> Bools:
     """(F,) whether the normal of each face points downwards, and the face is not too steep to stand on."""
     return _looks(mesh, -1.0)
 
 
 def _looks(mesh: Mesh, way: float) -> Bools:
     looks = np.empty(len(mesh.faces), dtype=bool)
-    for part, (first, second, third) in mesh.parts():
+    for part, (first, second, third) in mesh.iterate_parts():
         normals = np.cross(second - first, third - first, axis=0)
         least = np.cos(np.deg2rad(STEEPEST_DEG)) * np.linalg.norm(normals, axis=0)
         looks[part] = (way * normals[2] >= least) & (least > 0)
     return looks
 
 
-def ground_under(meshes: Sequence[Mesh], places_m: Float64) -> list[Bools]:
+def find_ground_faces(meshes: Sequence[Mesh], positions_m: Float64) -> list[Bools]:
     """Which faces of some meshes are ground: the level ones below some places, and all connected with them by steps.
 
     Two level surfaces are connected that share an edge, or of which one goes on where the other ends, at most 0.3 m
@@ -71,23 +71,23 @@ def ground_under(meshes: Sequence[Mesh], places_m: Float64) -> list[Bools]:
 
     Returns one (F,) mask for each mesh.
     """
-    outward = [outward_faces(mesh) for mesh in meshes]
-    level = [level_faces(mesh, known) for mesh, known in zip(meshes, outward, strict=True)]
+    outward = [find_outward_faces(mesh) for mesh in meshes]
+    level = [find_level_faces(mesh, known) for mesh, known in zip(meshes, outward, strict=True)]
     if not any(mask.any() for mask in level):
         return level
     corners_m = np.concatenate([mesh.vertices_m[mesh.faces[mask]] for mesh, mask in zip(meshes, level, strict=True)])
     together = Mesh(corners_m.reshape(-1, 3), np.arange(3 * len(corners_m)).reshape(-1, 3))
-    edge, face = edges_of(together)[0], np.repeat(np.arange(len(corners_m)), 3)
-    _, surface = np.unique(connected(edge, face, len(corners_m)), return_inverse=True)
+    edge, face = find_face_edges(together)[0], np.repeat(np.arange(len(corners_m)), 3)
+    _, surface = np.unique(label_connected_faces(edge, face, len(corners_m)), return_inverse=True)
     parts = np.split(np.argsort(surface, kind="stable"), np.cumsum(np.bincount(surface))[:-1])
     caster = RayCaster([Mesh(corners_m[part].reshape(-1, 3), together.faces[: len(part)]) for part in parts])
     border = np.flatnonzero(np.bincount(edge)[edge] == 1)
     one, other = surface[face[border]].repeat(len(PROBES)), _met(caster, _probes_m(corners_m, border), STEP_M)
     joined = np.stack([one, other])[:, other >= 0]
-    root = connected(np.tile(np.arange(joined.shape[1]), 2), joined.ravel(), surface.max() + 1)
+    root = label_connected_faces(np.tile(np.arange(joined.shape[1]), 2), joined.ravel(), surface.max() + 1)
     of_level = np.concatenate([known[mask] for known, mask in zip(outward, level, strict=True)])
     is_sheet = np.bincount(surface, weights=of_level) == 0
-    is_ground = np.isin(root, root[_stood_on(caster, places_m, is_sheet)])[surface]
+    is_ground = np.isin(root, root[_stood_on(caster, positions_m, is_sheet)])[surface]
     ends = np.cumsum([np.count_nonzero(mask) for mask in level])[:-1]
     for mask, found in zip(level, np.split(is_ground, ends), strict=True):
         mask[mask] = found
@@ -101,7 +101,7 @@ def _stood_on(caster: RayCaster, places_m: Float64, is_sheet: Bools) -> Int64:
         return near[near >= 0]
     for up in (-1.0, 1.0):
         limit_m = np.full(len(places_m), np.inf, dtype=np.float32)
-        met = caster.cast_from_each(places_m.astype(np.float32), _vertical(len(places_m), up), limit_m).body
+        met = caster.cast_from_each(places_m.astype(np.float32), _vertical(len(places_m), up), limit_m).body_indices
         met = met[(met >= 0) & ((up < 0) | is_sheet[np.maximum(met, 0)])]
         if len(met):
             return met.astype(np.int64)
@@ -126,7 +126,7 @@ def _met(caster: RayCaster, places_m: Float64, near_m: float) -> Int64:
     near_m += ROUNDING_M
     starts_m = (places_m + np.array([0.0, 0.0, near_m])).astype(np.float32)
     limit_m = np.full(len(starts_m), 2 * near_m, dtype=np.float32)
-    return caster.cast_from_each(starts_m, _vertical(len(starts_m), -1.0), limit_m).body.astype(np.int64)
+    return caster.cast_from_each(starts_m, _vertical(len(starts_m), -1.0), limit_m).body_indices.astype(np.int64)
 
 
 def _vertical(count: int, up: float) -> Float32:
@@ -147,11 +147,11 @@ class LocalGround:
         self._meshes = [Mesh(mesh.vertices_m - origin_m, mesh.faces) for mesh in meshes if len(mesh.faces)]
 
     @property
-    def faces(self) -> int:
+    def num_faces(self) -> int:
         """How many it has."""
         return sum(len(mesh.faces) for mesh in self._meshes)
 
-    def heights_m(self, points_m: NDArray[np.floating], world_T_points: Float64 | None = None) -> Float32:
+    def compute_heights_m(self, points_m: NDArray[np.floating], world_T_points: Float64 | None = None) -> Float32:
         """(N,) how high above the ground (N, 3) points are, in metres; NaN where there is none at or below.
 
         Not less than -0.05, and 0 where rounding alone tells. `world_T_points` is where their frame lies in the world;
@@ -164,9 +164,9 @@ class LocalGround:
         range_m[np.abs(range_m) < ROUNDING_M] = 0.0
         return range_m
 
-    def is_above(self, place_m: Float64, world_T_place: Float64 | None = None) -> bool:
+    def is_below_ground(self, position_m: Float64, world_T_position: Float64 | None = None) -> bool:
         """Whether a (3,) place lies below the ground: some of it above, and none at or below."""
-        (local_m,) = self._local(place_m[None], world_T_place)
+        (local_m,) = self._local(position_m[None], world_T_position)
         starts_m = local_m + np.array([[0.0, 0.0, ON_GROUND_M], [0.0, 0.0, -ON_GROUND_M]])
         return bool(np.isnan(self._cast(starts_m[:1], -1.0)[0]) and np.isfinite(self._cast(starts_m[1:], 1.0)[0]))
 
@@ -182,7 +182,7 @@ class LocalGround:
             return np.full(count, np.nan, dtype=np.float32)
         limit_m = np.full(count, np.inf, dtype=np.float32)
         hits = self._caster.cast_from_each(places_m.astype(np.float32), _vertical(count, up), limit_m)
-        hits.range_m[hits.body < 0] = np.nan
+        hits.range_m[hits.body_indices < 0] = np.nan
         return hits.range_m
 
     @cached_property
@@ -190,26 +190,28 @@ class LocalGround:
         return RayCaster(self._meshes)
 
     @cached_property
-    def squares(self) -> "GroundSquares":
+    def height_pyramid(self) -> "GroundHeightPyramid":
         """Between which heights it lies, roughly, in its own frame: that of the world less the origin."""
-        return GroundSquares.of(self._meshes, self.origin_m)
+        return GroundHeightPyramid.from_meshes(self._meshes, self.origin_m)
 
 
-class GroundSquares(NamedTuple):
+class GroundHeightPyramid(NamedTuple):
     """The lowest and the highest ground in the squares of a raster, and of rasters with squares twice as large.
 
-    `lower_m` (2,) the first corner; `square_m` the side of a square, infinite if there is but one; `levels` for each
+    `origin_m` (2,) the first corner; `cell_m` the side of a square, infinite if there is but one; `levels` for each
     raster (2, columns, rows) of the lowest and the highest, infinite and minus infinite where there is none.
     """
 
-    lower_m: Float64
-    square_m: float
+    origin_m: Float64
+    cell_m: float
     levels: Sequence[Float32]
 
     @classmethod
-    def of(cls, meshes: Sequence[Mesh], origin_m: Float64) -> "GroundSquares":
+    def from_meshes(cls, meshes: Sequence[Mesh], origin_m: Float64) -> "GroundHeightPyramid":
         """Those of triangles, of whose bounding boxes all squares are taken, lest one be overlooked."""
-        parts = [(corners_m.min(axis=(0, 2)), corners_m.max(axis=(0, 2))) for _, corners_m in parts_of(meshes)]
+        parts = [
+            (corners_m.min(axis=(0, 2)), corners_m.max(axis=(0, 2))) for _, corners_m in iterate_mesh_parts(meshes)
+        ]
         if not parts:
             return cls(np.zeros(2), math.inf, [np.array([[[np.inf]], [[-np.inf]]], dtype=np.float32)])
         least_m, most_m = np.min([low for low, _ in parts], axis=0), np.max([high for _, high in parts], axis=0)
@@ -222,7 +224,7 @@ class GroundSquares(NamedTuple):
         first_m = np.floor((least_m[:2] + origin_m[:2]) / square_m) * square_m - origin_m[:2]
         columns, rows = (np.floor((most_m[:2] - first_m) / square_m + ROUNDING).astype(np.int64) + 1).tolist()
         lowest, highest = np.full(columns * rows, np.inf), np.full(columns * rows, -np.inf)
-        for _, corners_m in parts_of(meshes):
+        for _, corners_m in iterate_mesh_parts(meshes):
             lower_m, upper_m = corners_m.min(axis=0), corners_m.max(axis=0)
             from_square = np.floor((lower_m[:2] - first_m[:, None]) / square_m + ROUNDING).astype(np.int64)
             to_square = np.ceil((upper_m[:2] - first_m[:, None]) / square_m - ROUNDING).astype(np.int64) - 1
@@ -242,19 +244,21 @@ class GroundSquares(NamedTuple):
             levels.append(_halved(levels[-1]))
         return cls(first_m, square_m, levels)
 
-    def between_m(self, lower_m: NDArray[np.floating], upper_m: NDArray[np.floating]) -> tuple[Float32, Float32]:
+    def compute_ground_bounds_m(
+        self, lower_m: NDArray[np.floating], upper_m: NDArray[np.floating]
+    ) -> tuple[Float32, Float32]:
         """(N,) lowest and (N,) highest ground in rectangles between (2, N) corners; inf, -inf where there is none."""
-        if math.isinf(self.square_m):
+        if math.isinf(self.cell_m):
             lowest_m, highest_m = (np.full(lower_m.shape[1], bound) for bound in self.levels[0].ravel())
             return lowest_m, highest_m
-        extent = np.max(upper_m - lower_m, axis=0) / self.square_m
+        extent = np.max(upper_m - lower_m, axis=0) / self.cell_m
         level = np.clip(np.ceil(np.log2(np.maximum(extent, 1.0))), 0, len(self.levels) - 1).astype(np.int64)
         lowest_m, highest_m = np.full(len(level), np.inf, np.float32), np.full(len(level), -np.inf, np.float32)
         for number in np.unique(level).tolist():
             raster, some = self.levels[number], np.flatnonzero(level == number)
             sides = np.array(raster.shape[1:])[:, None]
             ends = [
-                (side_m.take(some, axis=1) - self.lower_m[:, None]) / (self.square_m * 2**number)
+                (side_m.take(some, axis=1) - self.origin_m[:, None]) / (self.cell_m * 2**number)
                 for side_m in (lower_m, upper_m)
             ]
             outside = ((ends[1] < 0) | (ends[0] >= sides)).any(axis=0)
@@ -266,20 +270,22 @@ class GroundSquares(NamedTuple):
             lowest_m[some], highest_m[some] = np.where(outside, np.inf, low_m), np.where(outside, -np.inf, high_m)
         return lowest_m, highest_m
 
-    def heights_m(self, triangles_m: NDArray[np.floating]) -> Float32:
+    def compute_height_bounds_m(self, triangles_m: NDArray[np.floating]) -> Float32:
         """(2, N) between which heights above ground points of (3, 3, N) triangles lie that have ground below them.
 
         Triangles are corners, coordinates, triangles, in the frame of the squares; inf and -inf where there is no
         ground.
         """
         lower_m, upper_m = triangles_m.min(axis=0), triangles_m.max(axis=0)
-        lowest_m, highest_m = self.between_m(lower_m[:2], upper_m[:2])
-        return height_bounds(lower_m[2] - highest_m, upper_m[2] - lowest_m)
+        lowest_m, highest_m = self.compute_ground_bounds_m(lower_m[:2], upper_m[:2])
+        return round_height_bounds_m(lower_m[2] - highest_m, upper_m[2] - lowest_m)
 
 
-def height_bounds(low_m: Float64, high_m: Float64) -> Float32:
+def round_height_bounds_m(min_height_m: Float64, max_height_m: Float64) -> Float32:
     """(2, N) bounds of heights that float32 does not break; none is less than what counts as the ground below."""
-    return np.asarray(np.stack([np.maximum(low_m, -TOLERANCE_M) - SLACK_M, high_m + SLACK_M]).astype(np.float32))
+    return np.asarray(
+        np.stack([np.maximum(min_height_m, -TOLERANCE_M) - SLACK_M, max_height_m + SLACK_M]).astype(np.float32)
+    )
 
 
 def _squares_of(first: Int64, count: Int64, at_once: int = 2_000_000) -> list[tuple[Int64, Int64, Int64]]:

@@ -13,7 +13,7 @@ BYTES_PER_RAY = 300
 
 
 @lru_cache
-def machine_bytes() -> float:
+def find_memory_limit_bytes() -> float:
     """The memory that this process may take at most."""
     limits = []
     for path in CGROUP_LIMITS:
@@ -28,10 +28,10 @@ def machine_bytes() -> float:
     return min(limits)
 
 
-def check_fits(what: str, needed_bytes: float, advice: str) -> None:
+def check_memory_fits(description: str, needed_bytes: float, remedy: str) -> None:
     """Refuse what this machine has no memory for, before any of it is reserved."""
-    if needed_bytes > machine_bytes():
+    if needed_bytes > find_memory_limit_bytes():
         raise ValueError(
-            f"{what}: {needed_bytes / 1e9:.3g} GB of memory are needed, and this machine has "
-            f"{machine_bytes() / 1e9:.3g} GB; {advice}"
+            f"{description}: {needed_bytes / 1e9:.3g} GB of memory are needed, and this machine has "
+            f"{find_memory_limit_bytes() / 1e9:.3g} GB; {remedy}"
         )

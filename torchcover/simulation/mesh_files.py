@@ -142,7 +142,7 @@ PACKAGES = {"collada": "'torchcover[urdf]'", "openctm": "python-openctm"}
 
 
 @run_isolated
-def mesh_arrays(path: Path) -> dict[str, NDArray[Any]]:
+def read_mesh_arrays(path: Path) -> dict[str, NDArray[Any]]:
     """All meshes of a file of any format of trimesh's.
 
     Returns:

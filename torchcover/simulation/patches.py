@@ -24,41 +24,43 @@ SURE_M2 = 1e-4
 VOLUME_ROUNDING = 1e-9
 
 
-def outward_faces(mesh: Mesh) -> Bools:
+def find_outward_faces(mesh: Mesh) -> Bools:
     """(F,) whether each face belongs to a closed surface that is turned outwards: nobody outside sees its back.
 
     Faces that share an edge belong to one surface. It is closed if every edge is run through as often one way as the
     other, and turned outwards if it encloses a volume that is not negative. A face of any other surface, such as a
     plane, an open mesh, or a ball that is turned inside out, may be seen from both sides.
     """
-    if mesh.outward is not None:
-        return mesh.outward
+    if mesh.is_outward is not None:
+        return mesh.is_outward
     if len(mesh.faces) == 0:
         return np.empty(0, dtype=bool)
-    edge, way = edges_of(mesh)
-    return outward_by(mesh, edge, way, surfaces_of(edge))
+    edge, way = find_face_edges(mesh)
+    return find_outward_faces_from_edges(mesh, edge, way, label_surfaces(edge))
 
 
-def surfaces_of(edge: Int64) -> Int64:
+def label_surfaces(edge_indices: Int64) -> Int64:
     """(F,) number of the surface of each face by (3 F,) numbers of edges; see `connected`."""
-    return connected(edge, np.arange(len(edge)) // 3, len(edge) // 3)
+    return label_connected_faces(edge_indices, np.arange(len(edge_indices)) // 3, len(edge_indices) // 3)
 
 
-def outward_by(mesh: Mesh, edge: Int64, way: Int8, surface: Int64) -> Bools:
-    """`outward_faces` of a mesh of which `edges_of` and `surfaces_of` are known."""
-    face = np.arange(len(edge)) // 3
-    turns = np.bincount(edge, weights=way)
-    open_edges = np.bincount(surface[face], weights=turns[edge] != 0, minlength=len(mesh.faces))
+def find_outward_faces_from_edges(
+    mesh: Mesh, edge_indices: Int64, edge_directions: Int8, surface_labels: Int64
+) -> Bools:
+    """`find_outward_faces` of a mesh of which `find_face_edges` and `label_surfaces` are known."""
+    face = np.arange(len(edge_indices)) // 3
+    turns = np.bincount(edge_indices, weights=edge_directions)
+    open_edges = np.bincount(surface_labels[face], weights=turns[edge_indices] != 0, minlength=len(mesh.faces))
     centred = mesh._replace(vertices_m=mesh.vertices_m - mesh.vertices_m.mean(axis=0))
     volumes = np.empty(len(mesh.faces))
-    for part, (first, second, third) in centred.parts():
+    for part, (first, second, third) in centred.iterate_parts():
         volumes[part] = (first * np.cross(second, third, axis=0)).sum(axis=0)
-    volume = np.bincount(surface, weights=volumes, minlength=len(mesh.faces))
-    rounding = VOLUME_ROUNDING * np.bincount(surface, weights=np.abs(volumes), minlength=len(mesh.faces))
-    return np.asarray(((open_edges == 0) & (volume >= -rounding))[surface])
+    volume = np.bincount(surface_labels, weights=volumes, minlength=len(mesh.faces))
+    rounding = VOLUME_ROUNDING * np.bincount(surface_labels, weights=np.abs(volumes), minlength=len(mesh.faces))
+    return np.asarray(((open_edges == 0) & (volume >= -rounding))[surface_labels])
 
 
-def edges_of(mesh: Mesh) -> tuple[Int64, Int8]:
+def find_face_edges(mesh: Mesh) -> tuple[Int64, Int8]:
     """(3 F,) the number of each edge of each face, shared by the faces that it borders, and (3 F,) which way it runs.
 
     The ways are 1 and -1, and 0 from a corner to itself. Vertices at the same place are one.
@@ -86,13 +88,13 @@ def _welded(vertices_m: Float64) -> Int64:
     return number
 
 
-def connected(edge: Int64, face: Int64, faces: int) -> Int64:
+def label_connected_faces(edge_indices: Int64, face_indices: Int64, num_faces: int) -> Int64:
     """(faces,) number of the surface of each face, of those that share edges: the smallest number of a face of it."""
-    order = np.argsort(edge)
-    ordered = edge[order]
+    order = np.argsort(edge_indices)
+    ordered = edge_indices[order]
     shared = np.flatnonzero(ordered[1:] == ordered[:-1])
-    one, other = face[order[shared]], face[order[shared + 1]]
-    surface = np.arange(faces)
+    one, other = face_indices[order[shared]], face_indices[order[shared + 1]]
+    surface = np.arange(num_faces)
     while (surface[one] != surface[other]).any():
         smaller = np.minimum(surface[one], surface[other])
         np.minimum.at(surface, surface[one], smaller)
@@ -102,13 +104,13 @@ def connected(edge: Int64, face: Int64, faces: int) -> Int64:
     return surface
 
 
-class Bounds(NamedTuple):
+class UprightBoxes(NamedTuple):
     """K upright boxes: `lower_m` (K, 3) and `upper_m` (K, 3)."""
 
     lower_m: Float64
     upper_m: Float64
 
-    def meet(self, lower_m: Float64, upper_m: Float64) -> Bools:
+    def mask_overlaps(self, lower_m: Float64, upper_m: Float64) -> Bools:
         """(N,) whether each of N boxes, (N, 3) and (N, 3), meets any of these."""
         met = np.zeros(len(lower_m), dtype=bool)
         for low, high in zip(self.lower_m, self.upper_m, strict=True):
@@ -122,101 +124,111 @@ class Bounds(NamedTuple):
 class Patches(NamedTuple):
     """N triangles in one frame.
 
-    `corner_m`, `first_m` and `second_m` (3, N) float32: one corner, and the edges from there to the other two; float64
-    would say no more, for rays meet float32 triangles. `outward` (N,): whether they are seen from the side only to
-    which first x second points. `of_object` (N,) int32: number of the object that they belong to, -1 for none.
-    `heights_m` (2, N) float32: between which heights above the local ground all of their points lie; (0, N) where that
-    was not asked. `face` (1, N) int32: of which of all faces that never move each is a part, if that coincides with
+    `corner_m`, `first_edge_m` and `second_edge_m` (3, N) float32: one corner, and the edges from there to the other two; float64
+    would say no more, for rays meet float32 triangles. `is_outward` (N,): whether they are seen from the side only to
+    which first x second points. `object_indices` (N,) int32: number of the object that they belong to, -1 for none.
+    `height_bounds_m` (2, N) float32: between which heights above the local ground all of their points lie; (0, N) where that
+    was not asked. `coincident_faces` (1, N) int32: of which of all faces that never move each is a part, if that coincides with
     another, else -1; (0, N) where none does.
     """
 
     corner_m: Float32
-    first_m: Float32
-    second_m: Float32
-    outward: Bools
-    of_object: Int32
-    heights_m: Float32
-    face: Int32
+    first_edge_m: Float32
+    second_edge_m: Float32
+    is_outward: Bools
+    object_indices: Int32
+    height_bounds_m: Float32
+    coincident_faces: Int32
 
     @classmethod
-    def cut(
+    def from_mesh(
         cls,
         mesh: Mesh,
-        bounds: Bounds | None = None,
-        heights: Callable[[Float64, Int64], tuple[Float32, Bools]] | None = None,
-        coincident: Int32 | None = None,
-        outward: Bools | None = None,
+        bounds: UprightBoxes | None = None,
+        compute_heights: Callable[[Float64, Int64], tuple[Float32, Bools]] | None = None,
+        coincident_faces: Int32 | None = None,
+        outward_mask: Bools | None = None,
     ) -> Self:
         """Cut a mesh of no object, or what is wanted of it: what lies in some boxes, and has an area.
 
-        `heights` gives of (3, 3, N) corners, coordinates, triangles and (N,) the faces that they are parts of their
-        `heights_m`, and (N,) whether any of that is wanted. `coincident` (F,) is what patches of each face have as
-        `face`, `outward` (F,) what `outward_faces` says of it, if that is known.
+        `compute_heights` gives of (3, 3, N) corners, coordinates, triangles and (N,) the faces that they are parts of their
+        `heights_m`, and (N,) whether any of that is wanted. `coincident_faces` (F,) is what patches of each face have as
+        `face`, `outward_mask` (F,) what `find_outward_faces` says of it, if that is known.
         """
         extent_m = 0.0 if bounds is not None else float(np.ptp(mesh.vertices_m, axis=0).max())
         longest_m = max(LONGEST_M, LONGEST_SHARE * extent_m)
-        none = np.empty((3, 3, 0)), np.empty(0, dtype=np.int64), np.empty((0 if heights is None else 2, 0), np.float32)
-        parts = [_cut(corners, part.start, bounds, longest_m, heights) for part, corners in mesh.parts()]
+        none = (
+            np.empty((3, 3, 0)),
+            np.empty(0, dtype=np.int64),
+            np.empty((0 if compute_heights is None else 2, 0), np.float32),
+        )
+        parts = [
+            _cut(corners, part.start, bounds, longest_m, compute_heights) for part, corners in mesh.iterate_parts()
+        ]
         triangles, faces, all_heights_m = zip(none, *parts, strict=True)
         (corner, second, third), face = np.concatenate(triangles, axis=2), np.concatenate(faces)
         heights_m = np.concatenate(all_heights_m, axis=1)
         first_m, second_m = (second - corner).astype(np.float32), (third - corner).astype(np.float32)
         nobodys = np.full(len(face), -1, dtype=np.int32)
-        of_face = np.empty((0, len(face)), dtype=np.int32) if coincident is None else coincident[None, face]
-        is_outward = (outward_faces(mesh) if outward is None else outward)[face]
+        of_face = np.empty((0, len(face)), dtype=np.int32) if coincident_faces is None else coincident_faces[None, face]
+        is_outward = (find_outward_faces(mesh) if outward_mask is None else outward_mask)[face]
         return cls(corner.astype(np.float32), first_m, second_m, is_outward, nobodys, heights_m, of_face)
 
     @classmethod
-    def joined(cls, parts: "list[Patches]") -> Self:
+    def concatenate(cls, parts: "list[Patches]") -> Self:
         """Those of several, one after the other."""
-        none, rows = np.empty((3, 0), dtype=np.float32), len(parts[0].heights_m) if parts else 0
+        none, rows = np.empty((3, 0), dtype=np.float32), len(parts[0].height_bounds_m) if parts else 0
         nobodys = np.empty(0, dtype=np.int32)
         # What moves has no faces that coincide.
-        faces = max((len(part.face) for part in parts), default=0)
-        of_none = (part._replace(face=np.full((faces, len(part.outward)), -1, dtype=np.int32)) for part in parts)
-        parts = [part if len(part.face) == faces else other for part, other in zip(parts, of_none, strict=True)]
+        faces = max((len(part.coincident_faces) for part in parts), default=0)
+        of_none = (
+            part._replace(coincident_faces=np.full((faces, len(part.is_outward)), -1, dtype=np.int32)) for part in parts
+        )
+        parts = [
+            part if len(part.coincident_faces) == faces else other for part, other in zip(parts, of_none, strict=True)
+        ]
         no_face = np.empty((faces, 0), dtype=np.int32)
         parts = [Patches(none, none, none, np.empty(0, dtype=bool), nobodys, none[:rows], no_face), *parts]
         return cls._make(np.concatenate(column, axis=-1) for column in zip(*parts, strict=True))
 
-    def taken(self, numbers: Int64) -> Self:
+    def select(self, indices: Int64) -> Self:
         """Some of them."""
-        return type(self)._make(column.take(numbers, axis=-1) for column in self)
+        return type(self)._make(column.take(indices, axis=-1) for column in self)
 
-    def moved(self, destination_T_source: Float64) -> Self:
+    def transform(self, destination_T_source: Float64) -> Self:
         """Them in another frame. What becomes of one does not depend on the others."""
         rotation = destination_T_source[:3, :3]
         # The corner may be a kilometre away, in either frame.
         corner_m = np.einsum("ij,jn->in", rotation, self.corner_m.astype(np.float64)) + destination_T_source[:3, 3:]
-        first_m, second_m = rotate(rotation, self.first_m), rotate(rotation, self.second_m)
-        return self._replace(corner_m=corner_m.astype(np.float32), first_m=first_m, second_m=second_m)
+        first_m, second_m = rotate(rotation, self.first_edge_m), rotate(rotation, self.second_edge_m)
+        return self._replace(corner_m=corner_m.astype(np.float32), first_edge_m=first_m, second_edge_m=second_m)
 
     @property
     def corners_m(self) -> Float32:
         """(3, 3, N) corners, coordinates, patches."""
-        return np.stack([self.corner_m, self.corner_m + self.first_m, self.corner_m + self.second_m])
+        return np.stack([self.corner_m, self.corner_m + self.first_edge_m, self.corner_m + self.second_edge_m])
 
     @property
     def lower_m(self) -> Float32:
         """(3, N) smallest coordinates."""
-        return np.asarray(self.corner_m + np.minimum(np.minimum(self.first_m, self.second_m), 0))
+        return np.asarray(self.corner_m + np.minimum(np.minimum(self.first_edge_m, self.second_edge_m), 0))
 
     @property
     def upper_m(self) -> Float32:
         """(3, N) largest coordinates."""
-        return np.asarray(self.corner_m + np.maximum(np.maximum(self.first_m, self.second_m), 0))
+        return np.asarray(self.corner_m + np.maximum(np.maximum(self.first_edge_m, self.second_edge_m), 0))
 
     @property
     def normals_m2(self) -> Float32:
         """(3, N) normals, as long as twice the area."""
-        (ax, ay, az), (bx, by, bz) = self.first_m, self.second_m
+        (ax, ay, az), (bx, by, bz) = self.first_edge_m, self.second_edge_m
         return np.asarray(np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx]))
 
 
 def _cut(
     triangles: Float64,
     first: int,
-    bounds: Bounds | None,
+    bounds: UprightBoxes | None,
     longest_m: float,
     heights: Callable[[Float64, Int64], tuple[Float32, Bools]] | None,
 ) -> tuple[Float64, Int64, Float32]:
@@ -231,7 +243,7 @@ def _cut(
     while len(face):
         kept = area_m2 >= SMALLEST_M2
         if bounds is not None:
-            kept &= bounds.meet(triangles.min(axis=0).T, triangles.max(axis=0).T)
+            kept &= bounds.mask_overlaps(triangles.min(axis=0).T, triangles.max(axis=0).T)
         heights_m = np.empty((0, len(face)), dtype=np.float32)
         if heights is not None:
             if not kept.all():

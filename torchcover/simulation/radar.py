@@ -8,8 +8,8 @@ from pydantic import Field, model_validator
 
 from torchcover.geometry.arrays import Float64, Int64
 from torchcover.simulation.documents import Pose
-from torchcover.simulation.rays import unit_directions
-from torchcover.simulation.sensor import Draws, Elevation, Ranging, RayHits, Returns
+from torchcover.simulation.rays import compute_unit_directions
+from torchcover.simulation.sensor import Elevation, RangeSensor, RayHits, Returns, SensorNoise
 
 # What rounding adds to a quotient makes no cell more.
 ROUNDING = 1e-9
@@ -17,7 +17,7 @@ ROUNDING = 1e-9
 Resolution = Annotated[float, Field(ge=1e-3)]
 
 
-class Radar(Ranging):
+class Radar(RangeSensor):
     """A radar that tells apart range and azimuth, and no elevation. Its frame is x forward, y left, z up.
 
     The opening is cut into equal cells of azimuth, none wider than `azimuth_cell_deg`, and the range into cells of
@@ -73,43 +73,43 @@ class Radar(Ranging):
         return self
 
     @property
-    def azimuth_cells(self) -> int:
+    def num_azimuth_cells(self) -> int:
         """How many cells there are side by side."""
         return math.ceil(self.horizontal_fov_deg / self.azimuth_cell_deg - ROUNDING)
 
     @property
-    def rays(self) -> int:
+    def num_rays(self) -> int:
         """How many rays there are, of all cells."""
         rows, columns = self._raster()
-        return rows * self.azimuth_cells * columns
+        return rows * self.num_azimuth_cells * columns
 
     def _raster(self) -> tuple[int, int]:
         spacing_deg = math.degrees(self.ray_spacing_m / self.max_range_m)
         low_deg, high_deg = self.vertical_fov_deg
-        cell_deg = self.horizontal_fov_deg / self.azimuth_cells
+        cell_deg = self.horizontal_fov_deg / self.num_azimuth_cells
         rows, columns = (math.ceil(opening / spacing_deg - ROUNDING) for opening in (high_deg - low_deg, cell_deg))
         return max(rows, 1), max(columns, 1)
 
-    def directions(self) -> Float64:
+    def compute_directions(self) -> Float64:
         """(3, rows, columns) unit directions in the radar's frame."""
         rows, in_a_cell = self._raster()
-        columns = self.azimuth_cells * in_a_cell
+        columns = self.num_azimuth_cells * in_a_cell
         (low_deg, high_deg), (up, left) = self.vertical_fov_deg, ((np.arange(n) + 0.5) / n for n in (rows, columns))
-        return unit_directions(
+        return compute_unit_directions(
             low_deg + (high_deg - low_deg) * up[:, None], self.horizontal_fov_deg * (left - 0.5)[None]
         )
 
-    def beams(self) -> Int64:
+    def compute_beam_indices(self) -> Int64:
         """(rows, columns) the cell of azimuth of each ray: rays with the same share the cells behind each other."""
         rows, in_a_cell = self._raster()
-        return np.tile(np.arange(self.azimuth_cells).repeat(in_a_cell), (rows, 1))
+        return np.tile(np.arange(self.num_azimuth_cells).repeat(in_a_cell), (rows, 1))
 
-    def measure(self, hits: RayHits, draws: Draws) -> Returns:
+    def measure(self, hits: RayHits, noise: SensorNoise) -> Returns:
         """A point for each cell that has a hit which is not too close, unless it drops out."""
         _, in_a_cell = self._raster()
-        beam = hits.pixel // in_a_cell % self.azimuth_cells
-        if hits.place is not None:
-            beam = beam + self.azimuth_cells * hits.place
+        beam = hits.pixel_indices // in_a_cell % self.num_azimuth_cells
+        if hits.position_indices is not None:
+            beam = beam + self.num_azimuth_cells * hits.position_indices
         seen = np.flatnonzero(hits.range_m >= self.min_range_m)
         # By beam, then by range, which lets the cells of a beam follow each other; of equals the first.
         seen = seen[np.lexsort((hits.range_m[seen], beam[seen]))]
@@ -117,4 +117,4 @@ class Radar(Ranging):
         first = np.flatnonzero((np.diff(cell, prepend=-1) != 0) | (np.diff(beam[seen], prepend=-1) != 0))
         last = np.append(first[1:], len(seen)) - 1
         middle = seen[(first + last) // 2]
-        return self.erring(hits, np.sort(middle), draws)
+        return self.sample_returns(hits, np.sort(middle), noise)

@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 from torchcover.geometry import transform_points
 from torchcover.geometry.arrays import Bools, Float32, Float64, Int32, Int64
 from torchcover.geometry.rigid import Matrix
-from torchcover.simulation.patches import outward_faces
+from torchcover.simulation.patches import find_outward_faces
 from torchcover.simulation.rays import rotate
-from torchcover.simulation.shapes import PART, Mesh, corners_of, normals_of, parts_of
+from torchcover.simulation.shapes import PART, Mesh, compute_normals, get_corners_m, iterate_mesh_parts
 
 # Farther from the origin float32 resolves no better than 64 m, and at 2e18 Embree drops faces without a word.
 MAX_M = 1e9
@@ -81,7 +81,7 @@ def _warp(bodies: Sequence[Mesh], device: str) -> Any:  # noqa: ANN401  (answers
     return WarpScene(bodies, device)
 
 
-class Faces:
+class FaceGeometry:
     """The faces of all bodies, one after the other, and how far from each a place counts as on it.
 
     `normals` (3, F) are of length one, or 0 where a face has no area. What is kept of all is float32, for there may be
@@ -114,40 +114,42 @@ class Faces:
     def normals(self) -> Float32:
         """Asked where light returns."""
         normals = np.empty((3, self._count), dtype=np.float32)
-        for faces, corners_m in parts_of(self._bodies):
-            normals[:, faces] = normals_of(corners_m)
+        for faces, corners_m in iterate_mesh_parts(self._bodies):
+            normals[:, faces] = compute_normals(corners_m)
         return normals
 
-    def holding(self, place_m: NDArray[np.floating]) -> Int64:
+    def find_containing_faces(self, position_m: NDArray[np.floating]) -> Int64:
         """Numbers of those that a (3,) place lies on."""
-        if ((place_m < self._least_m) | (place_m > self._most_m)).any():
+        if ((position_m < self._least_m) | (position_m > self._most_m)).any():
             return np.empty(0, dtype=np.int64)
-        x, y, z = place_m
+        x, y, z = position_m
         # One axis after the other: the first, which asks all faces, leaves few to the second. Most are near the ground.
         near = np.flatnonzero((self._lower_m[0] <= x) & (x <= self._upper_m[0]))
         for axis, coordinate_m in ((1, y), (2, z)):
             near = near[(self._lower_m[axis, near] <= coordinate_m) & (coordinate_m <= self._upper_m[axis, near])]
         if len(near) == 0:
             return near
-        corners_m, within_m = corners_of(self._bodies, near), 2 * self.contact_m(near)
-        apart_m = np.maximum(corners_m.min(axis=0) - place_m[:, None], place_m[:, None] - corners_m.max(axis=0))
-        return np.asarray(near[(apart_m <= within_m).all(axis=0) & (self.from_plane_m(place_m, near) <= within_m)])
+        corners_m, within_m = get_corners_m(self._bodies, near), 2 * self.compute_contact_distances_m(near)
+        apart_m = np.maximum(corners_m.min(axis=0) - position_m[:, None], position_m[:, None] - corners_m.max(axis=0))
+        return np.asarray(
+            near[(apart_m <= within_m).all(axis=0) & (self.compute_plane_distances_m(position_m, near) <= within_m)]
+        )
 
-    def above(self, place_m: NDArray[np.floating]) -> Int64:
+    def find_faces_above(self, position_m: NDArray[np.floating]) -> Int64:
         """Numbers of those that a line upwards from a (3,) place may meet."""
-        x, y, z = place_m
+        x, y, z = position_m
         near = np.flatnonzero((self._lower_m[0] <= x) & (x <= self._upper_m[0]))
         near = near[(self._lower_m[1, near] <= y) & (y <= self._upper_m[1, near])]
         return np.asarray(near[z <= self._upper_m[2, near]])
 
-    def contact_m(self, faces: Int64) -> Float64:
+    def compute_contact_distances_m(self, face_indices: Int64) -> Float64:
         """(N,) from the planes of some of them, as far as float32 may find a place that lies on it, but of slivers."""
-        return np.maximum(_contact_m(corners_of(self._bodies, faces)), self._least_contact_m)
+        return np.maximum(_contact_m(get_corners_m(self._bodies, face_indices)), self._least_contact_m)
 
-    def from_plane_m(self, place_m: NDArray[np.floating], faces: Int64) -> Float64:
+    def compute_plane_distances_m(self, position_m: NDArray[np.floating], face_indices: Int64) -> Float64:
         """Distance of a (3,) place from the planes of some of them."""
-        corners_m = corners_of(self._bodies, faces)
-        return np.asarray(np.abs(((place_m[:, None] - corners_m[0]) * normals_of(corners_m)).sum(axis=0)))
+        corners_m = get_corners_m(self._bodies, face_indices)
+        return np.asarray(np.abs(((position_m[:, None] - corners_m[0]) * compute_normals(corners_m)).sum(axis=0)))
 
 
 def _contact_m(corners_m: Matrix) -> Matrix:
@@ -164,26 +166,26 @@ def _contact_m(corners_m: Matrix) -> Matrix:
 
 
 class Hits(NamedTuple):
-    """For each of N rays: `range_m` (N,) float32 where it ended, and `body` (N,) int32, -1 if at its limit.
+    """For each of N rays: `range_m` (N,) float32 where it ended, and `body_indices` (N,) int32, -1 if at its limit.
 
-    `triangle` (N,) int32 is the number of the face among those of its body.
+    `triangle_indices` (N,) int32 is the number of the face among those of its body.
     """
 
     range_m: Float32
-    body: Int32
-    triangle: Int32
+    body_indices: Int32
+    triangle_indices: Int32
 
 
-class Struck(NamedTuple):
+class HitAttributes(NamedTuple):
     """What N rays hit: the number of the body, see `Instant`, or -1, the face of its mesh, and what that is made of.
 
     `cos_incidence` is the cosine of the angle between the ray and the normal of the face, on either side.
     """
 
-    body: Int32
-    triangle: Int32
+    body_indices: Int32
+    triangle_indices: Int32
     cos_incidence: Float32
-    material: NDArray[np.uint8]
+    material_indices: NDArray[np.uint8]
 
 
 class RayCaster:
@@ -210,17 +212,17 @@ class RayCaster:
         self._scene = _embree(bodies) if device is None else _warp(bodies, device)
 
     @cached_property
-    def _faces(self) -> Faces:
+    def _faces(self) -> FaceGeometry:
         """Asked where rays have a common origin, which may lie on a face."""
-        return Faces(self._bodies, self._reach_m)
+        return FaceGeometry(self._bodies, self._reach_m)
 
     @cached_property
     def _materials(self) -> NDArray[np.uint8]:
         """(F,) what each of all faces is made of."""
-        return np.concatenate([body.materials for body in self._bodies])
+        return np.concatenate([body.filled_material_indices for body in self._bodies])
 
     @property
-    def bodies(self) -> int:
+    def num_bodies(self) -> int:
         """How many there are; their numbers begin with 0."""
         return len(self._bodies)
 
@@ -234,7 +236,7 @@ class RayCaster:
             (directions.shape[1], 3), np.float32, origin_m.astype(np.float32).tobytes(), strides=(0, 4)
         )
         hits = self.cast_from_each(origins, directions, limit_m)
-        if len(self.touched(origin_m)):
+        if len(self.find_touched_bodies(origin_m)):
             self._leave_faces(origin_m, directions, limit_m, hits)
         return hits
 
@@ -243,72 +245,80 @@ class RayCaster:
         answer = self._scene.run(origins_m, directions.T, dists=limit_m.copy(), output=True)
         return Hits(answer["tfar"], answer["geomID"], answer["primID"])
 
-    def struck(self, body: Int32, triangle: Int32, directions: Float32) -> Struck:
+    def compute_hit_attributes(
+        self, body_indices: Int32, triangle_indices: Int32, directions: Float32
+    ) -> HitAttributes:
         """What N rays with (3, N) unit directions hit that ended on some faces, as `Hits` has them, none of them -1."""
-        face = self._first_face.take(body) + triangle
+        face = self._first_face.take(body_indices) + triangle_indices
         (nx, ny, nz), (x, y, z) = self._faces.normals.take(face, axis=1), directions
         cosine = np.abs(nx * x + ny * y + nz * z)
-        return Struck(body, triangle, np.minimum(cosine, 1.0, out=cosine), self._materials.take(face))
+        return HitAttributes(
+            body_indices, triangle_indices, np.minimum(cosine, 1.0, out=cosine), self._materials.take(face)
+        )
 
-    def faces_met(self, origins_m: NDArray[np.floating], directions: NDArray[np.floating], limit_m: float) -> Int64:
+    def find_first_faces(
+        self, origins_m: NDArray[np.floating], directions: NDArray[np.floating], limit_m: float
+    ) -> Int64:
         """(N,) which face each ray meets first within a limit, counted through those of all bodies; -1 for none."""
         ends_m = np.full(len(origins_m), limit_m, dtype=np.float32)
         hits = self.cast_from_each(origins_m.astype(np.float32), directions.astype(np.float32).T, ends_m)
-        return np.asarray(np.where(hits.body >= 0, self._numbers(hits), -1))
+        return np.asarray(np.where(hits.body_indices >= 0, self._numbers(hits), -1))
 
     def _numbers(self, hits: Hits) -> Int64:
         """(N,) which of all faces each ray hit; any number where it hit none."""
-        return np.asarray(self._first_face[np.maximum(hits.body, 0)] + np.maximum(hits.triangle, 0))
+        return np.asarray(self._first_face[np.maximum(hits.body_indices, 0)] + np.maximum(hits.triangle_indices, 0))
 
-    def touched(self, place_m: NDArray[np.floating]) -> Int64:
+    def find_touched_bodies(self, position_m: NDArray[np.floating]) -> Int64:
         """Numbers of the bodies on whose faces a place lies: hardly any does, and the faces are sooner asked than rays.
 
         The last answer is kept, for all tiles of a scan start at one place.
         """
         asked, answer = self._last_asked  # read at once: other threads may ask about other places
-        if asked != place_m.tobytes():
-            answer = np.searchsorted(self._first_face, self._faces.holding(place_m), side="right") - 1
-            self._last_asked = (place_m.tobytes(), answer)
+        if asked != position_m.tobytes():
+            answer = np.searchsorted(self._first_face, self._faces.find_containing_faces(position_m), side="right") - 1
+            self._last_asked = (position_m.tobytes(), answer)
         return answer
 
     def _leave_faces(self, origin_m: NDArray[np.floating], directions: Float32, limit_m: Float32, hits: Hits) -> None:
         """Let the rays go on that hit a face whose plane they start on: by rounding alone, as they leave it."""
 
         def starts_on_plane(faces: Int64) -> Bools:
-            return np.asarray(self._faces.from_plane_m(origin_m, faces) <= self._faces.contact_m(faces))
+            return np.asarray(
+                self._faces.compute_plane_distances_m(origin_m, faces) <= self._faces.compute_contact_distances_m(faces)
+            )
 
-        rays, travelled_m, faces = np.flatnonzero(hits.body >= 0), 0.0, self._numbers(hits)
+        rays, travelled_m, faces = np.flatnonzero(hits.body_indices >= 0), 0.0, self._numbers(hits)
         rays = rays[starts_on_plane(faces[rays])]
         range_m, faces = hits.range_m[rays], faces[rays]
         for beyond in CONTACTS_BEYOND:
             if len(rays) == 0:
                 return
             # The hit is the nearest one, so nothing lies before it.
-            travelled_m = travelled_m + range_m + beyond * self._faces.contact_m(faces)
+            travelled_m = travelled_m + range_m + beyond * self._faces.compute_contact_distances_m(faces)
             towards, left_m = directions.T[rays], np.maximum(limit_m[rays] - travelled_m, 0.0)
             starts_m = origin_m + travelled_m[:, None] * towards
             found = self.cast_from_each(starts_m.astype(np.float32), towards.T, left_m.astype(np.float32))
-            hit, range_m, faces = found.body >= 0, found.range_m, self._numbers(found)
+            hit, range_m, faces = found.body_indices >= 0, found.range_m, self._numbers(found)
             hits.range_m[rays] = np.where(hit, travelled_m + range_m, limit_m[rays])
-            hits.body[rays], hits.triangle[rays] = found.body, found.triangle
+            hits.body_indices[rays], hits.triangle_indices[rays] = found.body_indices, found.triangle_indices
             again = hit & starts_on_plane(faces)
             rays, travelled_m, range_m, faces = rays[again], travelled_m[again], range_m[again], faces[again]
 
-    def inside(self, place_m: NDArray[np.floating]) -> Int64:
+    def find_enclosing_bodies(self, position_m: NDArray[np.floating]) -> Int64:
         """Numbers of the bodies that a (3,) place lies inside of; a sheet has no inside.
 
         It is inside a closed surface that is turned outwards if a line upwards leaves that more often than it enters.
         No ray is cast: which of two faces it met first where bodies touch would be up to how the processor rounds.
         """
-        faces = self._faces.above(place_m)
+        faces = self._faces.find_faces_above(position_m)
         body = np.searchsorted(self._first_face, faces, side="right") - 1
         bodies, of = np.unique(body, return_inverse=True)
         is_closed = np.zeros(len(faces), dtype=bool)
         for number in bodies.tolist():
             if number not in self._closed:
-                self._closed[number] = outward_faces(self._bodies[number])
+                self._closed[number] = find_outward_faces(self._bodies[number])
             is_closed[body == number] = self._closed[number][faces[body == number] - self._first_face[number]]
-        corners_m = corners_of(self._bodies, faces) - place_m[:, None]
+        corners_m = get_corners_m(self._bodies, faces) - position_m[:, None]
         for beside_m in BESIDE_M:
             x_m, y_m = corners_m[:, 0] - beside_m[0], corners_m[:, 1] - beside_m[1]
             # Twice the signed areas between the line and each edge: of an edge of two faces the same, to the bit.
@@ -317,12 +327,12 @@ class RayCaster:
             if not ((areas == 0).any(axis=0) & (whole != 0)).any():
                 break
         with np.errstate(divide="ignore", invalid="ignore"):
-            is_above = (areas * corners_m[:, 2]).sum(axis=0) / whole > self._faces.contact_m(faces)
+            is_above = (areas * corners_m[:, 2]).sum(axis=0) / whole > self._faces.compute_contact_distances_m(faces)
         way = (areas > 0).all(axis=0).astype(np.int64) - (areas < 0).all(axis=0)
         return bodies[np.bincount(of, way * (is_above & is_closed), len(bodies)) > 0]
 
 
-def cast_from(
+def cast_from_vehicle(
     caster: RayCaster, part_T_vehicle: Matrix, origin_m: Matrix, directions: Float32, limit_m: Float32
 ) -> Hits:
     """Cast rays of the vehicle frame at a caster in its own frame."""

@@ -50,39 +50,39 @@ class Tile:
     Args:
         directions: (3, n) float32 unit directions in the sensor's frame.
         axis: (3,) float64 middle of the cone that holds them.
-        half_angle: Half the opening of that cone in radians.
-        blocks: (B, m) numbers of the rays in each block; one with fewer rays than others repeats one of them.
-        block_lower: (3, B) float64 smallest x, y, z among the directions of each block.
-        block_upper: (3, B) largest.
+        half_angle_rad: Half the opening of that cone in radians.
+        block_rays: (B, m) numbers of the rays in each block; one with fewer rays than others repeats one of them.
+        min_block_directions: (3, B) float64 smallest x, y, z among the directions of each block.
+        max_block_directions: (3, B) largest.
     """
 
     directions: Float32
     axis: Float64
-    half_angle: float
-    blocks: Int64
-    block_lower: Float64
-    block_upper: Float64
+    half_angle_rad: float
+    block_rays: Int64
+    min_block_directions: Float64
+    max_block_directions: Float64
 
-    def some(self, which: Bools) -> "Tile":
+    def select(self, mask: Bools) -> "Tile":
         """The tile of those of its rays for which (n,) is true, in the same cone."""
-        filled = which[self.blocks]
+        filled = mask[self.block_rays]
         kept = filled.any(axis=1)
         # The others repeat the first one of their block.
-        blocks, filled = self.blocks[kept], filled[kept]
+        blocks, filled = self.block_rays[kept], filled[kept]
         first = np.take_along_axis(blocks, filled.argmax(axis=1)[:, None], axis=1)
-        numbers = (np.cumsum(which) - 1)[np.where(filled, blocks, first)]
-        lower, upper = self.block_lower[:, kept], self.block_upper[:, kept]
-        return Tile(self.directions[:, which], self.axis, self.half_angle, numbers, lower, upper)
+        numbers = (np.cumsum(mask) - 1)[np.where(filled, blocks, first)]
+        lower, upper = self.min_block_directions[:, kept], self.max_block_directions[:, kept]
+        return Tile(self.directions[:, mask], self.axis, self.half_angle_rad, numbers, lower, upper)
 
 
-class Balls(NamedTuple):
-    """Balls in the vehicle frame: (K, 3) `centres_m`, and one `radius_m` of all or (K,) of each, if each holds many."""
+class SearchSpheres(NamedTuple):
+    """Balls in the vehicle frame: (K, 3) `centers_m`, and one `radius_m` of all or (K,) of each, if each holds many."""
 
-    centres_m: NDArray[np.floating]
+    centers_m: NDArray[np.floating]
     radius_m: float | Float64
 
     @classmethod
-    def around(cls, points_m: NDArray[np.floating], radius_m: float) -> Self:
+    def from_points(cls, points_m: NDArray[np.floating], radius_m: float) -> Self:
         """One around each of (N, 3) points; of more than a few, larger ones that hold those of neighbours."""
         if len(points_m) <= FEW:
             return cls(points_m, radius_m)
@@ -99,56 +99,61 @@ class Balls(NamedTuple):
         of_each = np.repeat(centres_m, np.diff(first, append=len(points)), axis=0)
         return cls(centres_m, np.maximum.reduceat(np.linalg.norm(points - of_each, axis=1), first) + radius_m)
 
-    def met_by(self, tile: Tile, vehicle_T_sensor: Float64) -> Bools:
+    def find_rays_through(self, tile: Tile, vehicle_T_sensor: Float64) -> Bools:
         """(n,) whether each ray of a tile may pass through one of them, and of the others some."""
-        ways_m = (self.centres_m - vehicle_T_sensor[:3, 3]) @ vehicle_T_sensor[:3, :3]
+        ways_m = (self.centers_m - vehicle_T_sensor[:3, 3]) @ vehicle_T_sensor[:3, :3]
         distance_m = np.linalg.norm(ways_m, axis=1)
         radius_m = self.radius_m + SLACK_M + SLACK_SHARE * distance_m
         if (distance_m <= radius_m).any():
             return np.ones(tile.directions.shape[1], dtype=bool)
         towards, angle = ways_m / distance_m[:, None], np.arcsin(radius_m / distance_m) + ROUNDING
         off_axis = np.arccos(np.clip(towards @ tile.axis, -1.0, 1.0))
-        near = np.flatnonzero(off_axis <= angle + tile.half_angle + ROUNDING)
+        near = np.flatnonzero(off_axis <= angle + tile.half_angle_rad + ROUNDING)
         met = np.zeros(tile.directions.shape[1], dtype=bool)
-        middle, half = (tile.block_lower + tile.block_upper) / 2, (tile.block_upper - tile.block_lower) / 2
-        for some in np.array_split(near, len(near) * len(tile.blocks) // PAIRS_AT_ONCE + 1):
+        middle, half = (
+            (tile.min_block_directions + tile.max_block_directions) / 2,
+            (tile.max_block_directions - tile.min_block_directions) / 2,
+        )
+        for some in np.array_split(near, len(near) * len(tile.block_rays) // PAIRS_AT_ONCE + 1):
             # By the chords between directions: those of a block are within half of its diagonal of its middle.
             chord = 2 * np.sin(angle[some] / 2)[:, None] + np.linalg.norm(half, axis=0)
             touched = 1 + (middle**2).sum(axis=0) - 2 * towards[some] @ middle <= chord**2 + ROUNDING**2
             if isinstance(self.radius_m, np.ndarray):  # wide ones, next to which a block is small
-                met[tile.blocks[touched.any(axis=0)]] = True
+                met[tile.block_rays[touched.any(axis=0)]] = True
                 continue
             ball, block = np.nonzero(touched)
-            rays = tile.blocks[block]
+            rays = tile.block_rays[block]
             x, y, z = towards[some].astype(np.float32).T[:, ball, None]
             along = x * tile.directions[0][rays] + y * tile.directions[1][rays] + z * tile.directions[2][rays]
             met[rays[along >= (np.cos(angle[some]) - COSINE_ROUNDING).astype(np.float32)[ball, None]]] = True
         return met
 
 
-def unit_directions(elevation_deg: Float64, azimuth_deg: Float64) -> Float64:
+def compute_unit_directions(elevation_deg: Float64, azimuth_deg: Float64) -> Float64:
     """(3, rows, columns) float64 unit vectors, of elevations above x-y and azimuths from x towards y, in degrees."""
     elevation, azimuth = np.broadcast_arrays(np.deg2rad(elevation_deg), np.deg2rad(azimuth_deg))
     horizontal = np.cos(elevation)
     return np.stack([horizontal * np.cos(azimuth), horizontal * np.sin(azimuth), np.sin(elevation)])
 
 
-def into_tiles(directions: Float64, tile_rows: int = TILE_ROWS, tile_columns: int = TILE_COLUMNS) -> tuple[Tile, ...]:
+def split_into_tiles(
+    directions: Float64, max_rows: int = TILE_ROWS, max_columns: int = TILE_COLUMNS
+) -> tuple[Tile, ...]:
     """Cut a sensor's rows and columns into tiles.
 
     Args:
         directions: (3, rows, columns) unit vectors; NaN for a pixel that has no ray.
-        tile_rows: Most rows in a tile.
-        tile_columns: Most columns in a tile.
+        max_rows: Most rows in a tile.
+        max_columns: Most columns in a tile.
 
     Returns:
         The tiles, row by row; together they hold every ray once; a pixel without one is left out.
     """
-    return tuple(_tile(directions[:, *cut]) for cut in _cuts(directions.shape, tile_rows, tile_columns))
+    return tuple(_tile(directions[:, *cut]) for cut in _cuts(directions.shape, max_rows, max_columns))
 
 
-def pixels_in_tiles(directions: Float64) -> Int64:
-    """(rays,) where each ray, counted over the tiles of `into_tiles`, stands in (3, rows, columns), row by row."""
+def compute_ray_pixel_indices(directions: Float64) -> Int64:
+    """(rays,) where each ray, counted over the tiles of `split_into_tiles`, stands in (3, rows, columns), row by row."""
     has_ray = ~np.isnan(directions[0])
     pixel = np.arange(has_ray.size).reshape(has_ray.shape)
     return np.concatenate([pixel[cut][has_ray[cut]] for cut in _cuts(directions.shape, TILE_ROWS, TILE_COLUMNS)])
@@ -210,22 +215,22 @@ def rotate_each(rotations: NDArray[AnyFloat], directions: NDArray[AnyFloat]) -> 
     return np.stack([row[:, 0] * x + row[:, 1] * y + row[:, 2] * z for row in rows])
 
 
-class Outlines(NamedTuple):
+class BoxOutlines(NamedTuple):
     """P boxes as one place sees them.
 
     `normals` (P, 4, 3) of planes through the place with the box on the inner side, zeros where there is none;
-    `nearest_m` (P,) is a distance that no point of the box falls below.
+    `min_distance_m` (P,) is a distance that no point of the box falls below.
     """
 
     normals: Float64
-    nearest_m: Float64
+    min_distance_m: Float64
 
-    def kept(self, boxes: NDArray[np.intp]) -> "Outlines":
+    def select(self, box_indices: NDArray[np.intp]) -> "BoxOutlines":
         """Some of them."""
-        return Outlines(self.normals[boxes], self.nearest_m[boxes])
+        return BoxOutlines(self.normals[box_indices], self.min_distance_m[box_indices])
 
 
-def outlines(corners_m: Float64, origin_m: Float64) -> Outlines:
+def compute_outlines(corners_m: Float64, origin_m: Float64) -> BoxOutlines:
     """How boxes with (P, 8, 3) corners, or (P, C, 3) at several times, look from a (3,) place in their frame."""
     ways_m = corners_m - origin_m
     forward = _unit(ways_m.mean(axis=1))
@@ -246,7 +251,7 @@ def outlines(corners_m: Float64, origin_m: Float64) -> Outlines:
         normals += [slope.min(axis=1, keepdims=True) * forward - side]
     planes = _unit(np.stack(normals, axis=1))
     planes[too_close] = _faces_towards(ways_m[too_close]) if corners_m.shape[1] == CORNERS else 0.0
-    return Outlines(planes, np.where(too_close, 0.0, nearest_m) - RANGE_SLACK_M)
+    return BoxOutlines(planes, np.where(too_close, 0.0, nearest_m) - RANGE_SLACK_M)
 
 
 def _faces_towards(ways_m: Float64) -> Float64:
@@ -263,40 +268,40 @@ def _faces_towards(ways_m: Float64) -> Float64:
     return normals
 
 
-def boxes_in_cone(outlines: Outlines, axis: Float64, half_angle: float, range_m: float) -> NDArray[np.intp]:
-    """Numbers of the boxes that a ray of a cone, `half_angle` radians about its axis, may meet before it ends.
+def find_boxes_in_cone(outlines: BoxOutlines, axis: Float64, half_angle_rad: float, range_m: float) -> NDArray[np.intp]:
+    """Numbers of the boxes that a ray of a cone, `half_angle_rad` radians about its axis, may meet before it ends.
 
     The boxes are seen from its tip, in whose frame the axis is.
     """
-    wider = half_angle + ROUNDING
+    wider = half_angle_rad + ROUNDING
     # Beyond a right angle no plane has a cone on one side of it.
     outside = (outlines.normals @ axis).max(axis=1) > (np.sin(wider) if wider < np.pi / 2 else np.inf)
-    return np.flatnonzero(~outside & (outlines.nearest_m <= range_m))
+    return np.flatnonzero(~outside & (outlines.min_distance_m <= range_m))
 
 
-def blocks_towards(outlines: Outlines, tile: Tile, vehicle_R_sensor: Float64, range_m: Float32) -> Bools:
+def find_blocks_towards_boxes(outlines: BoxOutlines, tile: Tile, vehicle_R_sensor: Float64, range_m: Float32) -> Bools:
     """(P, B) whether a ray of each block of a tile may meet each box, seen from the sensor, before its (n,) range."""
-    ends_m = range_m.take(tile.blocks).max(axis=1)
+    ends_m = range_m.take(tile.block_rays).max(axis=1)
     normals = (outlines.normals @ vehicle_R_sensor).reshape(-1, 3)
     # No direction between the lower and the upper bounds of a block has a smaller product with a normal.
-    bounds = np.vstack([tile.block_lower, tile.block_upper]).astype(np.float32)
+    bounds = np.vstack([tile.min_block_directions, tile.max_block_directions]).astype(np.float32)
     towards = np.hstack([np.maximum(normals, 0.0), np.minimum(normals, 0.0)]).astype(np.float32)
     least = (towards @ bounds).reshape(len(outlines.normals), 4, bounds.shape[1])
-    return np.asarray((least.max(axis=1) <= ROUNDING) & (outlines.nearest_m[:, None] <= ends_m))
+    return np.asarray((least.max(axis=1) <= ROUNDING) & (outlines.min_distance_m[:, None] <= ends_m))
 
 
-def rays_towards(
-    outlines: Outlines, box: NDArray[np.intp], rays: Int64, directions: Float32, range_m: Float32
+def find_rays_towards_boxes(
+    outlines: BoxOutlines, box_indices: NDArray[np.intp], block_rays: Int64, directions: Float32, range_m: Float32
 ) -> tuple[NDArray[np.intp], Int64]:
     """Which rays of some blocks may meet a box before they end: (L,) boxes and (L,) rays, in the order of the blocks.
 
-    `box` (K,) is the box of each block, `rays` (K, m) those in it; `directions` (3, n) of all are in the frame of the
+    `box_indices` (K,) is the box of each block, `block_rays` (K, m) those in it; `directions` (3, n) of all are in the frame of the
     boxes, and `range_m` (n,) is where they end.
     """
-    normals, nearest_m = outlines.normals.astype(np.float32), outlines.nearest_m.astype(np.float32)
-    across = normals[box] @ directions.take(rays, axis=1).swapaxes(0, 1)
-    within = (across.max(axis=1) <= ROUNDING) & (range_m.take(rays) >= nearest_m[box][:, None])
-    return box.repeat(within.sum(axis=1)), rays[within]
+    normals, nearest_m = outlines.normals.astype(np.float32), outlines.min_distance_m.astype(np.float32)
+    across = normals[box_indices] @ directions.take(block_rays, axis=1).swapaxes(0, 1)
+    within = (across.max(axis=1) <= ROUNDING) & (range_m.take(block_rays) >= nearest_m[box_indices][:, None])
+    return box_indices.repeat(within.sum(axis=1)), block_rays[within]
 
 
 def _cross(a: Float64, b: Float64) -> Float64:

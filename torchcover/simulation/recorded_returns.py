@@ -11,7 +11,7 @@ from torchcover.geometry.arrays import Bools, Float32, Float64, Int64
 from torchcover.recordings.in_vehicle import transform_to_vehicle
 from torchcover.recordings.recording import Recording
 from torchcover.simulation.lidar import Lidar
-from torchcover.simulation.returns import SURE, Material, log_excess
+from torchcover.simulation.returns import SURE, Material, compute_log_excess
 from torchcover.simulation.rig import Rig
 
 # Of a road that is straight ahead; beside it there are kerbs and grass. Its height is fitted to the inner part.
@@ -48,14 +48,14 @@ class GroundRays(NamedTuple):
 
     range_m: Float64
     cos_incidence: Float64
-    rays: Float64
-    returned: Float64
+    ray_counts: Float64
+    return_counts: Float64
     azimuth_deg: Float64
-    sweep: Int64
+    sweep_indices: Int64
 
-    def some(self, which: Bools) -> "GroundRays":
+    def select(self, mask: Bools) -> "GroundRays":
         """Those of some cells."""
-        return GroundRays._make(column[which] for column in self)
+        return GroundRays._make(column[mask] for column in self)
 
 
 class RoadProfile(NamedTuple):
@@ -63,7 +63,7 @@ class RoadProfile(NamedTuple):
 
     coefficients: Float64
 
-    def height_m(self, points_m: Float64) -> Float64:
+    def compute_heights_m(self, points_m: Float64) -> Float64:
         """(N,) z of the road below N points."""
         return np.asarray(_terms(points_m) @ self.coefficients)
 
@@ -74,7 +74,7 @@ def _terms(points_m: Float64) -> Float64:
     return np.column_stack([np.ones(len(x)), x, y, squared * (x > 0), squared * (x < 0)])
 
 
-def road_profile(points_m: Float64) -> RoadProfile:
+def fit_road_profile(points_m: Float64) -> RoadProfile:
     """Fit the road under a sweep, (N, 3) points in the vehicle frame, from near to far."""
     range_m = np.hypot(points_m[:, 0], points_m[:, 1])
     chosen = (np.abs(points_m[:, 1]) < HALF_LANES_M) & (range_m < 90.0) & (range_m > 3.5)
@@ -95,7 +95,7 @@ def road_profile(points_m: Float64) -> RoadProfile:
     return RoadProfile(coefficients)
 
 
-def ground_rays(sweeps: Sequence[NDArray[np.floating]], lidar: Lidar) -> GroundRays:
+def count_ground_rays(sweeps: Sequence[NDArray[np.floating]], lidar: Lidar) -> GroundRays:
     """The rays of a LiDAR that point at the road, and how many of them returned.
 
     Which rays there were is known from its scan pattern: the row of a return is the nearest one, and each row has
@@ -106,14 +106,14 @@ def ground_rays(sweeps: Sequence[NDArray[np.floating]], lidar: Lidar) -> GroundR
 
 
 def _of_sweep(points_m: Float64, lidar: Lidar, number: int) -> GroundRays:
-    vehicle_T_sensor, rows_deg = lidar.mount.matrix(), np.sort(lidar.rows_deg())
-    road, sectors = road_profile(points_m), round(360.0 / SECTOR_DEG)
+    vehicle_T_sensor, rows_deg = lidar.mount.to_matrix(), np.sort(lidar.compute_elevations_deg())
+    road, sectors = fit_road_profile(points_m), round(360.0 / SECTOR_DEG)
     row, azimuth_deg, range_m = _in_rows(points_m, lidar)
     sector = np.floor((azimuth_deg + 180.0) / SECTOR_DEG).astype(np.int64) % sectors
-    above_m = points_m[:, 2] - road.height_m(points_m)
+    above_m = points_m[:, 2] - road.compute_heights_m(points_m)
     middle_deg: Float64 = (np.arange(sectors, dtype=np.float64) + 0.5) * SECTOR_DEG - 180.0
     expected_m, place_m = _expected(vehicle_T_sensor, rows_deg, middle_deg, road)
-    height_m = vehicle_T_sensor[2, 3] - road.height_m(vehicle_T_sensor[None, :3, 3])[0]
+    height_m = vehicle_T_sensor[2, 3] - road.compute_heights_m(vehicle_T_sensor[None, :3, 3])[0]
     stands = (above_m > OFF_GROUND_M + OFF_GROUND_SHARE * range_m) & (above_m < OVERHEAD_M) & (range_m > 2.0)
     order = np.flatnonzero(stands)[np.argsort(sector[stands], kind="stable")]
     of_sector = np.split(order, np.searchsorted(sector[order], np.arange(1, sectors)))
@@ -147,9 +147,9 @@ def _of_sweep(points_m: Float64, lidar: Lidar, number: int) -> GroundRays:
 
 def _in_rows(points_m: Float64, lidar: Lidar) -> tuple[NDArray[np.intp], Float64, Float64]:
     """(N,) row of a LiDAR that each point is nearest to, its azimuth in degrees and its range."""
-    in_sensor_m = transform_points(invert(lidar.mount.matrix()), points_m)
+    in_sensor_m = transform_points(invert(lidar.mount.to_matrix()), points_m)
     x, y, z = in_sensor_m.T
-    rows_deg, elevation_deg = np.sort(lidar.rows_deg()), np.rad2deg(np.arctan2(z, np.hypot(x, y)))
+    rows_deg, elevation_deg = np.sort(lidar.compute_elevations_deg()), np.rad2deg(np.arctan2(z, np.hypot(x, y)))
     row = np.searchsorted((rows_deg[1:] + rows_deg[:-1]) / 2, elevation_deg)
     return row, np.rad2deg(np.arctan2(y, x)), np.linalg.norm(in_sensor_m, axis=1)
 
@@ -176,7 +176,7 @@ def _expected(
 
     def above_m(range_m: Float64) -> Float64:
         points_m = origin_m + towards * range_m[:, None]
-        return np.asarray(points_m[:, 2] - road.height_m(points_m))
+        return np.asarray(points_m[:, 2] - road.compute_heights_m(points_m))
 
     # The road bends little: the first crossing is looked for in steps, then halved down to a millimetre.
     near_m, far_m = np.full(len(towards), 1.0), np.full(len(towards), np.inf)
@@ -197,27 +197,29 @@ def _expected(
 class ReturnFit(NamedTuple):
     """Range at 10 % and spread of ln range of a LiDAR, the likeliest from rays to a road, and errors of ln of both.
 
-    `fades` says whether the recording tells: twice the range would have left other returns.
+    `is_range_observable` says whether the recording tells: twice the range would have left other returns.
     """
 
     range_at_10_percent_m: float
-    spread: float
-    range_error: float
-    spread_error: float
-    fades: bool
+    log_range_std: float
+    log_range_error: float
+    log_std_error: float
+    is_range_observable: bool
 
 
-def fit_returns(rays: GroundRays, road: Material) -> ReturnFit:
+def fit_returns(rays: GroundRays, road_material: Material) -> ReturnFit:
     """The likeliest range at 10 % and spread. The rays of a cell meet one spot, and count as one."""
     from scipy.optimize import minimize, minimize_scalar
     from scipy.special import log_ndtr
 
-    at_one_metre = log_excess(rays.range_m, rays.cos_incidence, road.share, road.incidence_exponent, 1.0)
-    returned = rays.returned / rays.rays
+    at_one_metre = compute_log_excess(
+        rays.range_m, rays.cos_incidence, road_material.numeric_reflectivity, road_material.incidence_exponent, 1.0
+    )
+    returned = rays.return_counts / rays.ray_counts
 
     def surprise(logs: Float64) -> float:
         """Of logarithms of both."""
-        excess = (at_one_metre + 2 * logs[0]) / np.hypot(2 * np.exp(logs[1]), road.spread)
+        excess = (at_one_metre + 2 * logs[0]) / np.hypot(2 * np.exp(logs[1]), road_material.log_reflectivity_std)
         log_seen = np.log(SURE) + log_ndtr(excess)
         prior = ((logs[1] - np.log(USUAL_SPREAD)) / SPREAD_IS_SURE_TO) ** 2 / 2
         return float(prior - (returned * log_seen + (1 - returned) * np.log1p(-np.exp(log_seen))).sum())
@@ -241,32 +243,32 @@ class LidarCalibration(NamedTuple):
 
     Args:
         name: Its name in the rig.
-        rays: How many rays pointed at the road.
-        farthest_m: So far away it was seen, at most.
+        num_rays: How many rays pointed at the road.
+        max_range_m: So far away it was seen, at most.
         fit: What fits best.
-        noise_m: Standard deviation of ranges about the road; NaN where none was seen closely.
+        range_noise_m: Standard deviation of ranges about the road; NaN where none was seen closely.
     """
 
     name: str
-    rays: float
-    farthest_m: float
+    num_rays: float
+    max_range_m: float
     fit: ReturnFit
-    noise_m: float
+    range_noise_m: float
 
     @property
-    def words(self) -> str:
+    def text(self) -> str:
         """It in a line."""
-        fit, seen = self.fit, f"{self.rays:,.0f} rays to a road up to {self.farthest_m:.0f} m away"
-        noise = f"; noise {1e3 * self.noise_m:.1f} mm" if np.isfinite(self.noise_m) else ""
-        if not fit.fades:
+        fit, seen = self.fit, f"{self.num_rays:,.0f} rays to a road up to {self.max_range_m:.0f} m away"
+        noise = f"; noise {1e3 * self.range_noise_m:.1f} mm" if np.isfinite(self.range_noise_m) else ""
+        if not fit.is_range_observable:
             return (
                 f"{self.name}: {seen} cannot tell how far it sees, for the road hardly fades in them; it takes far "
                 f"road in the open{noise}"
             )
-        low_m, high_m = fit.range_at_10_percent_m * np.exp([-fit.range_error, fit.range_error])
+        low_m, high_m = fit.range_at_10_percent_m * np.exp([-fit.log_range_error, fit.log_range_error])
         return (
             f"{self.name}: {fit.range_at_10_percent_m:.0f} m at 10 % ({low_m:.0f} to {high_m:.0f}), spread "
-            f"{fit.spread:.2f} (within a factor of {np.exp(fit.spread_error):.1f}), from {seen}{noise}"
+            f"{fit.log_range_std:.2f} (within a factor of {np.exp(fit.log_std_error):.1f}), from {seen}{noise}"
         )
 
 
@@ -301,13 +303,13 @@ def calibrate(recording: Recording, rig: Rig) -> tuple[Rig, list[LidarCalibratio
         _check_different(sweeps, f"{recording.path}: {sensor.name}")
         told = _calibration(sensor, sweeps, road, str(recording.path))
         keys = sensor.model_dump(exclude_unset=True)
-        if told.fit.fades:
+        if told.fit.is_range_observable:
             keys |= {
                 "range_at_10_percent_m": round(told.fit.range_at_10_percent_m, 1),
-                "spread": round(told.fit.spread, 3),
+                "log_range_std": round(told.fit.log_range_std, 3),
             }
-        if np.isfinite(told.noise_m):
-            keys["range_noise_m"] = round(told.noise_m, 4)
+        if np.isfinite(told.range_noise_m):
+            keys["range_noise_m"] = round(told.range_noise_m, 4)
         sensors.append(Lidar.model_validate(keys))
         found.append(told)
     return rig.model_copy(update={"sensors": tuple(sensors)}), found
@@ -355,15 +357,15 @@ def _check_different(sweeps: Sequence[Float32], source: str) -> None:
 
 
 def _calibration(lidar: Lidar, sweeps: Sequence[Float32], road: Material, source: str) -> LidarCalibration:
-    rays = ground_rays(sweeps, lidar)
-    if rays.rays.sum() < FEWEST_RAYS:
+    rays = count_ground_rays(sweeps, lidar)
+    if rays.ray_counts.sum() < FEWEST_RAYS:
         raise ValueError(
-            f"{source}: {lidar.name} has {rays.rays.sum():.0f} rays to an open road {NEAREST_M:g} to {FARTHEST_M:g} m "
+            f"{source}: {lidar.name} has {rays.ray_counts.sum():.0f} rays to an open road {NEAREST_M:g} to {FARTHEST_M:g} m "
             f"away; {FEWEST_RAYS} are needed: a drive on a straight, level road, and a rig whose mounts are right"
         )
     fit = fit_returns(rays, road)
     noise_m = _noise_m(sweeps, lidar)
-    return LidarCalibration(lidar.name, float(rays.rays.sum()), float(rays.range_m.max()), fit, noise_m)
+    return LidarCalibration(lidar.name, float(rays.ray_counts.sum()), float(rays.range_m.max()), fit, noise_m)
 
 
 def _noise_m(sweeps: Sequence[Float32], lidar: Lidar) -> float:
@@ -371,7 +373,7 @@ def _noise_m(sweeps: Sequence[Float32], lidar: Lidar) -> float:
     off_m, step_deg = [np.empty(0)], lidar.horizontal_fov_deg / lidar.columns
     for sweep in sweeps:
         points_m = sweep.astype(np.float64)
-        on_road = np.abs(points_m[:, 2] - road_profile(points_m).height_m(points_m)) < OFF_GROUND_M
+        on_road = np.abs(points_m[:, 2] - fit_road_profile(points_m).compute_heights_m(points_m)) < OFF_GROUND_M
         row, azimuth_deg, range_m = _in_rows(points_m[on_road & (np.abs(points_m[:, 1]) < HALF_LANES_M)], lidar)
         order = np.lexsort((azimuth_deg, row))
         row, azimuth_deg, range_m = row[order], azimuth_deg[order], range_m[order]

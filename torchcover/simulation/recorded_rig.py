@@ -20,11 +20,11 @@ from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.formats.ros import RosBag
 from torchcover.recordings.recorders import CLEARANCE_M
 from torchcover.recordings.recording import CalibratedRecording, Recording, SensorCalibrations, UndistortedRecording
-from torchcover.simulation.bodies import body_called, mover_mesh
+from torchcover.simulation.bodies import build_actor_mesh, create_body_shape
 from torchcover.simulation.camera_sensor import MOUNT_T_CAMERA
 from torchcover.simulation.lidar import LidarModel
 from torchcover.simulation.rig import Rig
-from torchcover.simulation.scan_estimate import as_cast, estimate_scan
+from torchcover.simulation.scan_estimate import estimate_scan, undo_motion_compensation
 
 # What is on a roof reaches so far above the highest LiDAR.
 ABOVE_SENSOR_M = 0.2
@@ -35,11 +35,11 @@ CAMERA = {"stride": 4, "min_range_m": 0.1, "max_range_m": 200.0}
 ASSUMED = "assumed: depth from 0.1 to 200 m in every fourth pixel"
 
 
-def rig_document(
+def build_rig_document(
     recording: Recording,
     *,
-    sensors: Sequence[str] | None = None,
-    models: Mapping[str, str] | None = None,
+    sensor_names: Sequence[str] | None = None,
+    lidar_models: Mapping[str, str] | None = None,
     raw_images: bool = False,
 ) -> dict[str, Any]:
     """Make a rig of what a recording knows of its sensors, and of what these saw.
@@ -48,8 +48,8 @@ def rig_document(
 
     Args:
         recording: The recording.
-        sensors: LiDARs that are wanted; all if not given.
-        models: Name of a LiDAR -> a built-in `LidarModel`, or the path of one.
+        sensor_names: LiDARs that are wanted; all if not given.
+        lidar_models: Name of a LiDAR -> a built-in `LidarModel`, or the path of one.
         raw_images: Whether cameras have the distortion of their lenses where the data set ships undistorted images;
             by default they are the cameras of the released images.
 
@@ -61,9 +61,9 @@ def rig_document(
         ValueError: An unknown sensor or model, a LiDAR whose place is not known or whose points do not lie in rows, or
             raw images of a recording that knows no other lenses than those of its images.
     """
-    models = models or {}
-    wanted = tuple(recording.sensors) if sensors is None else tuple(sensors)
-    unknown = [name for name in (*wanted, *models) if name not in recording.sensors]
+    lidar_models = lidar_models or {}
+    wanted = tuple(recording.sensors) if sensor_names is None else tuple(sensor_names)
+    unknown = [name for name in (*wanted, *lidar_models) if name not in recording.sensors]
     if unknown:
         raise ValueError(
             f"{recording.path}: no LiDAR {', '.join(unknown)}; the recording has {', '.join(recording.sensors)}"
@@ -72,7 +72,7 @@ def rig_document(
     cameras = _raw_cameras(recording) if raw_images else known.cameras
     told, documents = [], []
     for name in wanted:
-        document, said = _lidar(recording, name, known, models.get(name))
+        document, said = _lidar(recording, name, known, lidar_models.get(name))
         documents.append(document)
         told.append(f"{name}: {said}.")
     documents += [_camera(camera) for camera in cameras]
@@ -98,7 +98,7 @@ def _raw_cameras(recording: Recording) -> tuple[Calibration, ...]:
     return recording.read_raw_cameras()
 
 
-def recorded_body(recording: Recording, vehicle: str | Path) -> BoundingBox:
+def build_ego_box(recording: Recording, vehicle: str | Path) -> BoundingBox:
     """The body of the vehicle that recorded something, and what is mounted on it.
 
     `vehicle` is a built-in one, the YAML file of one or a mesh file; or `x0,x1,y0,y1,z0,z1`, the sides of the body in
@@ -111,7 +111,7 @@ def recorded_body(recording: Recording, vehicle: str | Path) -> BoundingBox:
             return BoundingBox((x0, y0, z0), (x1, y1, z1))
         except ValueError as error:
             raise ValueError(f"vehicle {vehicle}: x0,x1,y0,y1,z0,z1 in metres are needed, x0 < x1: {error}") from error
-    ego = BoundingBox.from_points(mover_mesh("vehicle", body_called(vehicle)).vertices_m)
+    ego = BoundingBox.from_points(build_actor_mesh("vehicle", create_body_shape(vehicle)).vertices_m)
     mounts = recording.read_calibrations().mounts if isinstance(recording, RosBag) else {}
     top_m = max([ego.upper_m[2], *(float(mount[2, 3]) + ABOVE_SENSOR_M for mount in mounts.values())])
     return BoundingBox((*ego.lower_m[:2], CLEARANCE_M), (*ego.upper_m[:2], top_m))
@@ -135,24 +135,27 @@ def _lidar(recording: Recording, name: str, known: SensorCalibrations, model: st
     if model is not None:
         LidarModel.load(model)
         return {"type": "lidar", "name": name, "mount": _pose(mount), "model": model}, f"{mounted}; scans as {model}"
-    clouds, lasers, undone = as_cast(recording, name, chosen, mount)
+    clouds, lasers, undone = undo_motion_compensation(recording, name, chosen, mount)
     found = estimate_scan(clouds, lasers)
     if found is None:
         raise ValueError(
             f"{recording.path}: the points of {name} do not lie in rows that can be told apart; name its model (see "
             f"`torchcover list`): --lidar {name}=MODEL"
         )
-    mount = mount @ build_transform(convert_euler_to_rotation(found.centre_deg, 0.0, 0.0), [0.0, 0.0, found.origin_m])
-    mounted += f", its rays' origin {found.origin_m:+.2f} m higher" if found.origin_m else ""
+    mount = mount @ build_transform(
+        convert_euler_to_rotation(found.center_azimuth_deg, 0.0, 0.0), [0.0, 0.0, found.origin_height_m]
+    )
+    mounted += f", its rays' origin {found.origin_height_m:+.2f} m higher" if found.origin_height_m else ""
     pattern = {
         "elevations_deg": [round(float(elevation), 3) + 0.0 for elevation in found.elevations_deg],
         "horizontal_fov_deg": round(found.horizontal_fov_deg, 3),
-        "columns": found.columns,
+        "columns": found.num_columns,
         "max_range_m": math.ceil(found.max_range_m * 10) / 10,
     }
     return {"type": "lidar", "name": name, "mount": _pose(mount), **pattern}, (
         f"{mounted}; estimated from {count} scan{'s' * (count > 1)}: {len(found.elevations_deg)} rows (those that "
-        f"returned anything), {found.columns:,} columns, the range of the farthest return" + (undone and f"; {undone}")
+        f"returned anything), {found.num_columns:,} columns, the range of the farthest return"
+        + (undone and f"; {undone}")
     )
 
 

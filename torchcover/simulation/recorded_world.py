@@ -29,7 +29,7 @@ from torchcover.recordings.objects import extract_objects
 from torchcover.recordings.recording import Recording
 from torchcover.recordings.reference import KNOWN_POINTS, ON_GROUND_M, USUAL_BODY, VOTES, AccumulatedReference
 from torchcover.recordings.sweeps import MOVES_MPS, compute_voxel_indices, find_first_occurrences
-from torchcover.simulation.height_field import Slopes
+from torchcover.simulation.height_field import GroundHeightField
 from torchcover.simulation.recorded.run import pieces
 from torchcover.simulation.shapes import Mesh
 
@@ -67,23 +67,23 @@ AROUND_SIDES = np.array(
     ]
 )
 
-Row = tuple[float | str, ...]
+TableRow = tuple[float | str, ...]
 
 
-class Surveyed(NamedTuple):
+class MappedDrive(NamedTuple):
     """What a drive has seen, in the world from its first place: the ground, where it is known, and what is on it.
 
-    `standing_m` (N, 3) is a place in each cell in which something stands or lies; `loose` has of each scan when it was,
-    (N, 3) what does not stand, and whether each is seen past; `images` say how far some of them saw.
+    `static_points_m` (N, 3) is a place in each cell in which something stands or lies; `dynamic_scans` has of each scan when it was,
+    (N, 3) what does not stand, and whether each is seen past; `range_images` say how far some of them saw.
     """
 
-    ground: Slopes
-    standing_m: Float64
-    loose: list[tuple[float, Float64, Bools]]
-    images: list[RangeImage]
+    ground: GroundHeightField
+    static_points_m: Float64
+    dynamic_scans: list[tuple[float, Float64, Bools]]
+    range_images: list[RangeImage]
 
 
-def write_world(recording: Recording, folder: Path, *, steps: int | None = None) -> str:
+def write_scenario(recording: Recording, folder: Path, *, num_frames: int | None = None) -> str:
     """Make a scenario of a drive: `scenario.yaml` in a folder, and the files that it names.
 
     The ground is a height field through what was seen of it. What stands is what no two scans have seen past, as cells
@@ -93,7 +93,7 @@ def write_world(recording: Recording, folder: Path, *, steps: int | None = None)
     Args:
         recording: With times and poses.
         folder: Where to; made if it does not exist.
-        steps: How many of its frames, from the first on; all if not given.
+        num_frames: How many of its frames, from the first on; all if not given.
 
     Returns:
         What was made, in words.
@@ -106,7 +106,7 @@ def write_world(recording: Recording, folder: Path, *, steps: int | None = None)
     reference.check(recording, ())
     assert recording.times_s is not None  # as checked
     last = recording.key_frames[
-        (len(recording.key_frames) if steps is None else min(steps, len(recording.key_frames))) - 1
+        (len(recording.key_frames) if num_frames is None else min(num_frames, len(recording.key_frames))) - 1
     ]
     times_s = recording.times_s[: last + 1] - recording.times_s[0]
     gaps = np.flatnonzero(np.diff(times_s) > WINDOW_S)
@@ -133,11 +133,11 @@ def write_world(recording: Recording, folder: Path, *, steps: int | None = None)
     placed = drive.interpolate_many(instants_s)
     way = np.column_stack([instants_s, placed[:, :3, 3], convert_rotation_to_euler(placed[:, :3, :3])[:, ::-1]])
     told = (
-        f"{times_s[-1]:.1f} s; ground of {seen.ground.wanted.sum() * SQUARE_M**2:,.0f} m2, {len(cells):,} cells of "
+        f"{times_s[-1]:.1f} s; ground of {seen.ground.cell_mask.sum() * SQUARE_M**2:,.0f} m2, {len(cells):,} cells of "
         f"{CELL_M:g} m that stand, {len({row[1] for row in rows})} movers "
         f"({'of its labels' if labelled else 'found by rays'})"
     )
-    bodies = {"ground": seen.ground.mesh(), **({"standing": cell_mesh(cells)} if len(cells) else {})}
+    bodies = {"ground": seen.ground.build_mesh(), **({"standing": build_cell_mesh(cells)} if len(cells) else {})}
     scenario = {
         "name": re.sub(r"\W+", "_", recording.path.resolve().stem).strip("_") or "recording",
         "description": f"The drive of the recording {recording.path}: {told}. What no sensor saw is not there.",
@@ -150,7 +150,7 @@ def write_world(recording: Recording, folder: Path, *, steps: int | None = None)
         "time_step_s": STEP_S,
         "duration_s": round(float(instants_s[-1]), 6),
     }
-    tables: dict[str, list[Row]] = {"ego": [TRAJECTORY_COLUMNS, *map(tuple, way.tolist())]}
+    tables: dict[str, list[TableRow]] = {"ego": [TRAJECTORY_COLUMNS, *map(tuple, way.tolist())]}
     if rows:
         tables["movers"] = [("t", "id", "category", *BOX_COLUMNS[1:]), *rows]
     texts = {f"{name}.csv": format_csv(table) for name, table in tables.items()} | {"scenario.yaml": to_yaml(scenario)}
@@ -165,7 +165,7 @@ def write_world(recording: Recording, folder: Path, *, steps: int | None = None)
 
 def _seen(
     recording: Recording, reference: AccumulatedReference, times_s: Float64, poses: Matrix, own: BoundingBox
-) -> Surveyed:
+) -> MappedDrive:
     """What all windows of a drive have seen, one after the other; nothing where the vehicle itself is."""
     field, sweeps = _Field(poses[:, :2, 3]), reference.sweep_window
     standing_m, loose, images = np.empty((0, 3)), [], []
@@ -193,7 +193,7 @@ def _seen(
         standing_m = standing_m[find_first_occurrences(compute_voxel_indices(standing_m, CELL_M))]
         field.add(recording, reference, index, poses[index])
         done = max(sweeps.find_frames_in_window(recording, index))
-    return Surveyed(field.slopes(recording), standing_m, sorted(loose, key=lambda scan: scan[0]), images)
+    return MappedDrive(field.slopes(recording), standing_m, sorted(loose, key=lambda scan: scan[0]), images)
 
 
 class _Field:
@@ -226,21 +226,21 @@ class _Field:
         better = np.isfinite(heights_m) & (away_m < self._away_m[part])
         self._heights_m[part][better], self._away_m[part][better] = heights_m[better], away_m[better]
 
-    def slopes(self, recording: Recording) -> Slopes:
+    def slopes(self, recording: Recording) -> GroundHeightField:
         """All of it."""
         known = np.isfinite(self._heights_m)
         wanted = known[1:, 1:] & known[1:, :-1] & known[:-1, 1:] & known[:-1, :-1]
         if not wanted.any():
             raise ValueError(f"{recording.path}: no ground is seen around the vehicle; is z up, and 0 on the ground?")
-        return Slopes(self._lower_m, self._heights_m, wanted, SQUARE_M)
+        return GroundHeightField(self._lower_m, self._heights_m, wanted, SQUARE_M)
 
 
-def _cells(seen: Surveyed, driven: Sequence[tuple[Matrix, BoundingBox]]) -> Int64:
+def _cells(seen: MappedDrive, driven: Sequence[tuple[Matrix, BoundingBox]]) -> Int64:
     """(N, 3) the cells, in steps of `CELL_M`, that something fills; none of where anything drives."""
-    field = HeightField(seen.ground.lower_m, seen.ground.corners_m, SQUARE_M)
-    above_m = seen.standing_m[:, 2] - field.compute_heights_m(seen.standing_m[:, :2])
+    field = HeightField(seen.ground.origin_m, seen.ground.corner_heights_m, SQUARE_M)
+    above_m = seen.static_points_m[:, 2] - field.compute_heights_m(seen.static_points_m[:, :2])
     stands = ~(above_m < ON_GROUND_M)
-    places_m, above_m = seen.standing_m[stands], above_m[stands]
+    places_m, above_m = seen.static_points_m[stands], above_m[stands]
     cells = np.floor(places_m / CELL_M).astype(np.int64)
     order = np.lexsort(cells.T[::-1])
     places_m, above_m, cells = places_m[order], above_m[order], cells[order]
@@ -254,7 +254,7 @@ def _cells(seen: Surveyed, driven: Sequence[tuple[Matrix, BoundingBox]]) -> Int6
     filled = cells[own] - down[:, None] * np.array([0, 0, 1])
     cells, places_m = np.concatenate([cells, filled]), np.concatenate([places_m, (filled + 0.5) * CELL_M])
     votes = np.zeros(len(cells), np.int16)
-    for image in seen.images:
+    for image in seen.range_images:
         image.add_votes(places_m, votes)
     cells = cells[votes < VOTES]
     cells = cells[np.argsort(cells[:, 0], kind="stable")]
@@ -268,7 +268,7 @@ def _cells(seen: Surveyed, driven: Sequence[tuple[Matrix, BoundingBox]]) -> Int6
     return filling
 
 
-def _around(row: Row) -> tuple[Matrix, BoundingBox]:
+def _around(row: TableRow) -> tuple[Matrix, BoundingBox]:
     """Where a mover is, with the points beside it that were not seen past."""
     x, y, z, *size_m, yaw_deg = (float(number) for number in row[3:])
     length, width, height = np.array(size_m) / 2 + BESIDE_M
@@ -276,25 +276,25 @@ def _around(row: Row) -> tuple[Matrix, BoundingBox]:
     return build_transform(convert_euler_to_rotation(yaw_deg, 0.0, 0.0), [x, y, z]), box
 
 
-def cell_mesh(cells: Int64) -> Mesh:
+def build_cell_mesh(cell_indices: Int64) -> Mesh:
     """The sides of (N, 3) cells, each once, in steps of `CELL_M`, that no other of them touches.
 
     Example:
-        >>> mesh = cell_mesh(np.array([[0, 0, 0], [0, 0, 1]]))
+        >>> mesh = build_cell_mesh(np.array([[0, 0, 0], [0, 0, 1]]))
         >>> mesh.faces.shape, mesh.vertices_m.max(axis=0).tolist()
         ((20, 3), [0.2, 0.2, 0.4])
     """
-    from_m = cells.min(axis=0) - 1
-    size = cells.max(axis=0) - from_m + 3
+    from_m = cell_indices.min(axis=0) - 1
+    size = cell_indices.max(axis=0) - from_m + 3
 
     def numbered(places: Int64) -> Int64:
         return np.asarray(np.ravel_multi_index(tuple((places - from_m).T), tuple(size)))
 
-    numbers, corners = np.sort(numbered(cells)), []
+    numbers, corners = np.sort(numbered(cell_indices)), []
     for side, around in zip(SIDES, AROUND_SIDES, strict=True):
-        beside = numbered(cells + side)
+        beside = numbered(cell_indices + side)
         at = np.searchsorted(numbers, beside).clip(max=len(numbers) - 1)
-        bare = cells[numbers[at] != beside]
+        bare = cell_indices[numbers[at] != beside]
         corners.append((bare[:, None] + around).reshape(-1, 3))
     used, of_side = np.unique(numbered(np.concatenate(corners)), return_inverse=True)
     of_side = of_side.reshape(-1, 4)
@@ -302,7 +302,7 @@ def cell_mesh(cells: Int64) -> Mesh:
     return Mesh(vertices * CELL_M, np.concatenate([of_side[:, [0, 1, 2]], of_side[:, [0, 2, 3]]]))
 
 
-def _labelled(recording: Recording, last_s: float) -> Iterator[Row]:
+def _labelled(recording: Recording, last_s: float) -> Iterator[TableRow]:
     """Rows of `movers.csv` of labelled objects."""
     pose = recording.get_world_T_vehicle(0)
     assert pose is not None  # as checked
@@ -318,9 +318,9 @@ def _labelled(recording: Recording, last_s: float) -> Iterator[Row]:
                 yield (row[0], name, track.category, *row[1:4], *track.size_m, row[4])
 
 
-def _found(seen: Surveyed, drive: Trajectory) -> Iterator[Row]:
+def _found(seen: MappedDrive, drive: Trajectory) -> Iterator[TableRow]:
     """Rows of `movers.csv` of what rays tell to move, from one instant to the next."""
-    scan_s = np.array([time_s for time_s, *_ in seen.loose])
+    scan_s = np.array([time_s for time_s, *_ in seen.dynamic_scans])
     tracks: list[list[tuple[float, Float64, MovingCluster]]] = []
     before_s = -np.inf
     for time_s in np.unique(scan_s):
@@ -328,7 +328,7 @@ def _found(seen: Surveyed, drive: Trajectory) -> Iterator[Row]:
             continue
         before_s, ego_m = time_s, drive.interpolate_positions_m(np.array([time_s]))[0]
         near = np.flatnonzero(np.abs(scan_s - time_s) <= COMPARED_S)
-        scans_m = [seen.loose[scan][1] for scan in near]
+        scans_m = [seen.dynamic_scans[scan][1] for scan in near]
         scans_m = [of_m[np.linalg.norm(of_m[:, :2] - ego_m[:2], axis=1) < WITHIN_M] for of_m in scans_m]
         _go_on(tracks, time_s, find_moving_clusters(scans_m, scan_s[near] - time_s))
     number = 0
@@ -348,13 +348,13 @@ def _found(seen: Surveyed, drive: Trajectory) -> Iterator[Row]:
             yield (time_s, f"found_{number}", called, *box.tolist())
 
 
-def _seen_past(seen: Surveyed, scan_s: Float64, times_s: Sequence[float], boxes: Float64) -> float:
+def _seen_past(seen: MappedDrive, scan_s: Float64, times_s: Sequence[float], boxes: Float64) -> float:
     """The share that is seen past of what lies in the boxes of a track; what only comes into sight never is."""
     inside = past = 0
     for time_s, box in zip(times_s, boxes, strict=True):
         pose, room = _around(("", "", "", *box.tolist()))
         for scan in np.flatnonzero(scan_s == time_s):
-            _, points_m, is_past = seen.loose[scan]
+            _, points_m, is_past = seen.dynamic_scans[scan]
             rows = find_points_in_box(transform_points(invert(pose), points_m), room)
             inside, past = inside + len(rows), past + int(is_past[rows].sum())
     return past / max(inside, 1)
@@ -381,7 +381,9 @@ def _go_on(
     tracks += [[(time_s, middles_m[which], found[which])] for which in sorted(left)]
 
 
-def _boxes(track: Sequence[tuple[float, Float64, MovingCluster]], drive: Trajectory, ground: Slopes) -> Float64:
+def _boxes(
+    track: Sequence[tuple[float, Float64, MovingCluster]], drive: Trajectory, ground: GroundHeightField
+) -> Float64:
     """(K, 7) x, y, z of the bottom, length, width, height and yaw of what was found at each time of a track.
 
     Of a body the sides are seen that face the vehicle; there its box ends.
@@ -398,7 +400,7 @@ def _boxes(track: Sequence[tuple[float, Float64, MovingCluster]], drive: Traject
     axes = np.stack([np.stack([np.cos(yaw), np.sin(yaw)], 1), np.stack([-np.sin(yaw), np.cos(yaw)], 1)], axis=1)
     ends = np.array([[np.quantile(moved.points_m[:, :2] @ axis.T, share, axis=0) for share in (0.02, 0.98)]
                      for axis, (*_, moved) in zip(axes, track, strict=True)])  # fmt: skip
-    under_m = HeightField(ground.lower_m, ground.corners_m, ground.cell_m).compute_heights_m(middles_m)
+    under_m = HeightField(ground.origin_m, ground.corner_heights_m, ground.cell_m).compute_heights_m(middles_m)
     lowest_m, highest_m = np.array([np.quantile(moved.points_m[:, 2], (0.02, 0.98)) for *_, moved in track]).T
     under_m = np.where(np.isfinite(under_m), under_m, lowest_m)
     seen_m = np.column_stack([ends[:, 1] - ends[:, 0], highest_m - under_m])

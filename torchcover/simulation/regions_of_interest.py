@@ -10,7 +10,7 @@ from pydantic import Field, PositiveFloat, model_validator
 from torchcover.coverage import BevGrid, Region, build_near_field_regions, check_regions, forward_regions
 from torchcover.coverage.grid import PAPER_HEIGHTS, BandFrame
 from torchcover.geometry.arrays import Float64
-from torchcover.simulation.documents import Bounds, Coordinate, Document, Readable
+from torchcover.simulation.documents import Bounds, Coordinate, Document, FileDocument
 
 # Holds the paper's regions, and the space beside and behind the vehicle.
 GRID_X_M = (-40.0, 160.0)
@@ -26,7 +26,7 @@ Area = tuple[tuple[float, float], tuple[float, float]]
 Areas = tuple[Area, ...]
 # Heights in metres: (low, high) of each.
 Bands = tuple[tuple[float, float], ...]
-Name = Annotated[str, Field(min_length=1)]
+NonEmptyName = Annotated[str, Field(min_length=1)]
 
 
 class RegionOfInterest(Document):
@@ -46,10 +46,10 @@ class RegionOfInterest(Document):
     def _check_one_of(self) -> Self:
         if (self.x_m is None) != (self.y_m is None) or (self.x_m is None) == (self.polygon_m is None):
             raise ValueError("give x_m and y_m, two bounds each, or the corners of polygon_m")
-        self.called("region")
+        self.build_region("region")
         return self
 
-    def called(self, name: str) -> Region:
+    def build_region(self, name: str) -> Region:
         """The region under a name."""
         if self.x_m is not None and self.y_m is not None:
             return Region(name, self.x_m, self.y_m)
@@ -57,7 +57,7 @@ class RegionOfInterest(Document):
         return Region.from_corners(name, self.polygon_m)
 
 
-class GridOfInterest(Document):
+class GridSettings(Document):
     """What of the grid is not to be as usual.
 
     Args:
@@ -71,7 +71,7 @@ class GridOfInterest(Document):
     cell_m: PositiveFloat | None = None
 
 
-class RegionsOfInterest(Readable):
+class RegionsOfInterest(FileDocument):
     """What a run is asked about, for any vehicle; with nothing given, the usual table.
 
     Args:
@@ -94,24 +94,24 @@ class RegionsOfInterest(Readable):
     """
 
     kind: ClassVar[str] = "a file of regions"
-    regions: dict[Name, RegionOfInterest] = Field(default_factory=dict)
-    heights: dict[Name, Bounds] = Field(default_factory=dict)
-    grid: GridOfInterest = GridOfInterest()
+    regions: dict[NonEmptyName, RegionOfInterest] = Field(default_factory=dict)
+    heights: dict[NonEmptyName, Bounds] = Field(default_factory=dict)
+    grid: GridSettings = GridSettings()
 
-    def around(
+    def build_query_plan(
         self,
         ego_outline_m: Float64 | None = None,
         cell_m: float | None = None,
         band_frame: BandFrame = DEFAULT_BAND_FRAME,
-        within: Region | None = None,
-    ) -> "Asked":
+        visible_region: Region | None = None,
+    ) -> "QueryPlan":
         """What follows for one vehicle.
 
         Args:
             ego_outline_m: (K, 2) corners x, y of the vehicle; None if unknown: then there is no near field.
             cell_m: Side of a cell, whatever `grid` says.
             band_frame: What the height bands are over, as in `BevGrid`.
-            within: Beyond which nothing is to be seen, such as a room: where neither regions nor the extent of the grid
+            visible_region: Beyond which nothing is to be seen, such as a room: where neither regions nor the extent of the grid
                 are asked for, the grid is that, with the near field, and its name that of a region.
 
         Raises:
@@ -122,31 +122,31 @@ class RegionsOfInterest(Readable):
         """
         vehicle = None if ego_outline_m is None else _bounds(ego_outline_m)
         cell_m = cell_m or self.grid.cell_m or CELL_M
-        named = tuple(region.called(name) for name, region in self.regions.items())
+        named = tuple(region.build_region(name) for name, region in self.regions.items())
         if named or self.grid.x_m or self.grid.y_m:
-            within = None
+            visible_region = None
         grid = (
             self._grid(named, cell_m, band_frame)
-            if within is None
-            else self._fitted(within, vehicle, cell_m, band_frame)
+            if visible_region is None
+            else self._fitted(visible_region, vehicle, cell_m, band_frame)
         )
         if named:
             check_regions(named, grid)
             _warn_of_hidden(named, vehicle)
-            return Asked(grid, named, (*(_area(region) for region in named), (grid.x_m, grid.y_m)), named)
-        ranges = forward_regions() if within is None else forward_regions(NEAR_RANGES_M)
+            return QueryPlan(grid, named, (*(_area(region) for region in named), (grid.x_m, grid.y_m)), named)
+        ranges = forward_regions() if visible_region is None else forward_regions(NEAR_RANGES_M)
         forward = tuple(region for region in ranges if region.is_within(grid))
-        if within is not None:
-            forward = *forward, Region(within.name, grid.x_m, grid.y_m)
+        if visible_region is not None:
+            forward = *forward, Region(visible_region.name, grid.x_m, grid.y_m)
         check_regions(forward, grid)
-        near = () if ego_outline_m is None else near_field(ego_outline_m)
+        near = () if ego_outline_m is None else build_near_field(ego_outline_m)
         if not self.heights:  # of what is above the ground there, bodies are put there
             near = tuple(replace(region, bands=("ground",)) for region in near)
         # Cells may be larger than the near field.
         near = tuple(region for region in near if region.is_within(grid) and region.mask_cells(grid).any())
         around = (_around(near),) if near else ()
         usual = (*forward, *near) or (Region("grid", grid.x_m, grid.y_m),)
-        return Asked(grid, usual, (*map(_area, forward), *around, (grid.x_m, grid.y_m)), forward or usual)
+        return QueryPlan(grid, usual, (*map(_area, forward), *around, (grid.x_m, grid.y_m)), forward or usual)
 
     def _fitted(self, within: Region, vehicle: Area | None, cell_m: float, band_frame: BandFrame) -> BevGrid:
         """Of whole cells around what can be seen and the near field."""
@@ -166,21 +166,21 @@ class RegionsOfInterest(Readable):
         return BevGrid(x, y, cell_m, self.heights or PAPER_HEIGHTS, band_frame)
 
 
-class Asked(NamedTuple):
+class QueryPlan(NamedTuple):
     """What a run is asked about.
 
     Args:
         grid: Cells and height bands.
         regions: Those that numbers are given for.
         areas: The rectangles that the reference sensor is aimed at, which hold them and the grid.
-        awaited: The regions whose errors a target error waits for: all that were asked for by name; in the usual table
+        target_regions: The regions whose errors a target error waits for: all that were asked for by name; in the usual table
             those in front.
     """
 
     grid: BevGrid
     regions: tuple[Region, ...]
     areas: Areas
-    awaited: tuple[Region, ...]
+    target_regions: tuple[Region, ...]
 
     @property
     def bands_m(self) -> Bands:
@@ -188,7 +188,7 @@ class Asked(NamedTuple):
         return tuple(self.grid.heights.values())
 
 
-def near_field(ego_outline_m: Float64) -> tuple[Region, ...]:
+def build_near_field(ego_outline_m: Float64) -> tuple[Region, ...]:
     """That of a vehicle with (K, 2) corners x, y; see `build_near_field_regions`."""
     return build_near_field_regions(*_bounds(ego_outline_m))
 

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator, NonNegativeFloat, PositiveFloat
 
 from torchcover.geometry.arrays import Float32
-from torchcover.simulation.builtin import builtin_names
-from torchcover.simulation.documents import BuiltIn
+from torchcover.simulation.builtin import list_builtin_names
+from torchcover.simulation.documents import BuiltInDocument
 
 # What nobody said the material of is scenery: walls for the most part.
 UNSAID = "brick"
@@ -35,7 +35,7 @@ def _reflecting(given: Any) -> Any:  # noqa: ANN401  (whatever stood in the file
     return given
 
 
-class Material(BuiltIn):
+class Material(BuiltInDocument):
     """A surface, as light of 905 nm meets it.
 
     Args:
@@ -44,7 +44,7 @@ class Material(BuiltIn):
         reflectivity: Share of light that a white, rough surface would return, 0 to 1: the median. `retroreflective`:
             it sends light back to where it came from, and always returns.
         incidence_exponent: k; what returns falls as the cosine of the incidence to the power of k. 1 is Lambert's law.
-        spread: Standard deviation of ln reflectivity.
+        log_reflectivity_std: Standard deviation of ln reflectivity.
         varies_by: Whether that is between places, drawn for each ray, or between bodies, so that a dark one is dark all
             over.
 
@@ -59,61 +59,61 @@ class Material(BuiltIn):
     description: str = ""
     reflectivity: Annotated[float | Literal["retroreflective"], BeforeValidator(_reflecting)]
     incidence_exponent: NonNegativeFloat = 1.0
-    spread: NonNegativeFloat = 0.0
+    log_reflectivity_std: NonNegativeFloat = 0.0
     varies_by: Literal["place", "body"] = "place"
 
     @property
-    def share(self) -> float:
+    def numeric_reflectivity(self) -> float:
         """The reflectivity as a number: infinite for a retroreflector."""
         return np.inf if self.reflectivity == "retroreflective" else float(self.reflectivity)
 
 
-class Materials(NamedTuple):
-    """What all materials are, by number: `reflectivity`, `exponent`, and `spread` of ln reflectivity by what varies."""
+class MaterialTable(NamedTuple):
+    """What all materials are, by number: `reflectivity`, `incidence_exponent`, and `spread` of ln reflectivity by what varies."""
 
     reflectivity: Float32
-    exponent: Float32
-    spread_of_places: Float32
-    spread_of_bodies: Float32
+    incidence_exponent: Float32
+    point_log_std: Float32
+    body_log_std: Float32
 
 
-def material_number(name: str) -> int:
+def get_material_index(material_name: str) -> int:
     """The number of a material by name or YAML file, which meshes have in this process; 0 is where none was said.
 
     FileNotFoundError: there is none; the message lists those that there are. ValueError: a file that is not valid, or
     more materials than there are numbers.
     """
     known = _builtin_numbers()
-    if name in known:
-        return known[name]
-    own = Material.load(name)
+    if material_name in known:
+        return known[material_name]
+    own = Material.load(material_name)
     with _LOCK:
         if own not in _FROM_FILES:
             if len(known) + len(_FROM_FILES) == MOST:
-                raise ValueError(f"{name}: {MOST} materials are too many already")
+                raise ValueError(f"{material_name}: {MOST} materials are too many already")
             _FROM_FILES.append(own)
-            materials.cache_clear()
+            load_materials.cache_clear()
         return 1 + len(known) + _FROM_FILES.index(own)
 
 
 @cache
 def _builtin_numbers() -> dict[str, int]:
-    return {name: number for number, name in enumerate(builtin_names("materials"), 1)}
+    return {name: number for number, name in enumerate(list_builtin_names("materials"), 1)}
 
 
 @cache
-def materials() -> Materials:
+def load_materials() -> MaterialTable:
     """All materials by their numbers."""
-    each = [Material.load(name) for name in (UNSAID, *builtin_names("materials"))] + _FROM_FILES
-    of_body = [one.spread if one.varies_by == "body" else 0.0 for one in each]
-    of_place = [one.spread - spread for one, spread in zip(each, of_body, strict=True)]
-    columns = ([one.share for one in each], [one.incidence_exponent for one in each], of_place, of_body)
-    return Materials._make(np.array(column, dtype=np.float32) for column in columns)
+    each = [Material.load(name) for name in (UNSAID, *list_builtin_names("materials"))] + _FROM_FILES
+    of_body = [one.log_reflectivity_std if one.varies_by == "body" else 0.0 for one in each]
+    of_place = [one.log_reflectivity_std - spread for one, spread in zip(each, of_body, strict=True)]
+    columns = ([one.numeric_reflectivity for one in each], [one.incidence_exponent for one in each], of_place, of_body)
+    return MaterialTable._make(np.array(column, dtype=np.float32) for column in columns)
 
 
-def tone(body: NDArray[np.integer]) -> Float32:
+def compute_brightness_offsets(body_indices: NDArray[np.integer]) -> Float32:
     """(N,) by how many spreads each body is brighter than its material, by its number; 0 for what is no body, -1."""
-    return np.asarray(TONES[body % len(TONES)])
+    return np.asarray(TONES[body_indices % len(TONES)])
 
 
 Floats = NDArray[np.floating]
@@ -126,7 +126,7 @@ LN_20 = float(np.log(20.0))
 LEAST_COSINE = 1e-4
 
 
-def log_excess(
+def compute_log_excess(
     range_m: float | Floats,
     cos_incidence: float | Floats,
     reflectivity: float | Floats,
@@ -147,18 +147,18 @@ def log_excess(
     return excess - 2.0 * extinction_per_m * range_m if extinction_per_m else excess
 
 
-def return_probability(
-    log_excess: float | Floats, spread: float | Floats, reflectivity_spread: float | Floats = 0.0
+def compute_return_probability(
+    log_excess: float | Floats, log_range_std: float | Floats, log_reflectivity_std: float | Floats = 0.0
 ) -> Floats:
-    """(N,) P(return) of hits with (N,) ln q, `spread` the standard deviation of ln range of the sensor.
+    """(N,) P(return) of hits with (N,) ln q, `log_range_std` the standard deviation of ln range of the sensor.
 
-    `reflectivity_spread` (N,) is that of ln reflectivity between places of the material.
+    `log_reflectivity_std` (N,) is that of ln reflectivity between places of the material.
     """
-    sigmas = np.asarray(log_excess / np.hypot(2.0 * np.asarray(spread), reflectivity_spread))
+    sigmas = np.asarray(log_excess / np.hypot(2.0 * np.asarray(log_range_std), log_reflectivity_std))
     return np.asarray(SURE * torch.special.ndtr(torch.from_numpy(sigmas)).numpy())
 
 
-def extinction_per_m(visibility_m: float | None, rain_mm_h: float = 0.0) -> float:
+def compute_extinction_per_m(visibility_m: float | None, rain_mm_h: float = 0.0) -> float:
     """Extinction of light of 905 nm in air, one way: of fog by Koschmieder's law, if there is any, and of rain.
 
     Rain: 1.076 R^0.67 dB/km, R in mm/h (Carbonneau & Wisely 1998, Proc. SPIE 3232).
@@ -168,7 +168,7 @@ def extinction_per_m(visibility_m: float | None, rain_mm_h: float = 0.0) -> floa
     return float(of_rain + (0.0 if visibility_m is None else LN_20 / visibility_m))
 
 
-class Weather(BuiltIn):
+class Weather(BuiltInDocument):
     """What the air and the road are like.
 
     Args:
@@ -194,7 +194,7 @@ class Weather(BuiltIn):
     @property
     def extinction_per_m(self) -> float:
         """Of light on its way through the air, one way."""
-        return extinction_per_m(self.visibility_m, self.rain_mm_h)
+        return compute_extinction_per_m(self.visibility_m, self.rain_mm_h)
 
 
 CLEAR = Weather(name="clear")

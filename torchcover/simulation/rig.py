@@ -10,17 +10,17 @@ from pydantic import Field, PlainValidator, TypeAdapter, ValidationInfo, model_v
 
 from torchcover.files import to_yaml, write_atomically
 from torchcover.geometry import BoundingBox
-from torchcover.simulation.bodies import Body, Shape, VehicleShape, body_called, merge
-from torchcover.simulation.documents import BuiltIn, Document, NameOrFile, is_file_name
+from torchcover.simulation.bodies import Body, Shape, VehicleShape, create_body_shape, merge_meshes
+from torchcover.simulation.documents import BuiltInDocument, Document, NameOrFile, is_file_name
 from torchcover.simulation.kinds import SENSORS
 from torchcover.simulation.lidar import Lidar, LidarModel
 from torchcover.simulation.returns import Weather
-from torchcover.simulation.scenario import DEFAULT_EGO, Mover, Scenario
+from torchcover.simulation.scenario import DEFAULT_EGO, ActorDescription, Scenario
 from torchcover.simulation.sensor import Sensor
 from torchcover.simulation.shapes import Mesh, MeshFile
 
 
-def read_sensor(content: Any, info: ValidationInfo) -> Sensor:  # noqa: ANN401  (whatever stood in the file, or a sensor)
+def parse_sensor(content: Any, info: ValidationInfo) -> Sensor:  # noqa: ANN401  (whatever stood in the file, or a sensor)
     """A sensor of the kind that its `type` names."""
     kind = content.get("type", "lidar") if isinstance(content, dict) else getattr(content, "type", type(content))
     if not isinstance(kind, str) or kind not in SENSORS:
@@ -32,10 +32,10 @@ def _read_mounted(content: Any, info: ValidationInfo) -> Sensor:  # noqa: ANN401
     is_known = isinstance(content, dict) and str(content.get("type", "lidar")) in SENSORS
     if is_known and not get_close_matches("mount", map(str, content)):
         raise ValueError("mount: missing; metres from the ground under the vehicle's middle, as {x_m: 1.5, z_m: 1.7}")
-    return read_sensor(content, info)
+    return parse_sensor(content, info)
 
 
-class Rig(BuiltIn):
+class Rig(BuiltInDocument):
     """The sensors of a vehicle.
 
     Args:
@@ -89,16 +89,16 @@ class Rig(BuiltIn):
         keys["sensors"] = [_written(sensor) for sensor in self.sensors]
         write_atomically(Path(path), lambda aside: aside.write_text(to_yaml(keys), encoding="utf-8"))
 
-    def own_mesh(self, ego: Mesh) -> Mesh:
+    def build_occluder_mesh(self, ego_mesh: Mesh) -> Mesh:
         """All that hides something from its sensors on a vehicle: the body of that, and what the rig carries."""
-        return merge([ego, *(mesh for body in self.bodies for mesh in body.meshes())])
+        return merge_meshes([ego_mesh, *(mesh for body in self.bodies for mesh in body.build_meshes())])
 
     @property
     def sensor_model(self) -> Literal["ideal", "real"]:
         """`real` if what returns too little light to one of its LiDARs is no point; else every hit is one."""
         return "real" if any(isinstance(one, Lidar) and one.range_at_10_percent_m for one in self.sensors) else "ideal"
 
-    def sensing(self, sensor_model: Literal["ideal", "real"] | None) -> Self:
+    def apply_sensor_model(self, sensor_model: Literal["ideal", "real"] | None) -> Self:
         """The rig with ideal sensors, or as it is.
 
         Args:
@@ -124,9 +124,9 @@ class Rig(BuiltIn):
         ]
         return self.model_copy(update={"sensors": tuple(sensors)})
 
-    def content(self) -> dict[str, Any]:
+    def collect_content(self) -> dict[str, Any]:
         """Its sensors; the vehicle is in the scenario that it is simulated in, if it is the one."""
-        return {key: value for key, value in super().content().items() if key != "vehicle"}
+        return {key: value for key, value in super().collect_content().items() if key != "vehicle"}
 
 
 def _written(sensor: Sensor) -> dict[str, Any]:
@@ -157,7 +157,7 @@ class RoadsideParams:
     above_body_m: float = 2.0
 
 
-def is_roadside(rigs: Iterable[Rig], ego: BoundingBox, params: RoadsideParams = RoadsideParams()) -> bool:
+def is_roadside(rigs: Iterable[Rig], ego_box: BoundingBox, params: RoadsideParams = RoadsideParams()) -> bool:
     """Whether a rig is on a mast rather than on a vehicle, by the heights of its sensors and the size of its body.
 
     Example:
@@ -166,12 +166,12 @@ def is_roadside(rigs: Iterable[Rig], ego: BoundingBox, params: RoadsideParams = 
         False
     """
     top_m = max((sensor.mount.z_m for rig in rigs for sensor in rig.sensors), default=0.0)
-    length_m, width_m, _ = ego.size_m
+    length_m, width_m, _ = ego_box.size_m
     is_slender = top_m > params.slenderness * max(length_m, width_m)
-    return top_m >= params.min_height_m and (is_slender or top_m > ego.upper_m[2] + params.above_body_m)
+    return top_m >= params.min_height_m and (is_slender or top_m > ego_box.upper_m[2] + params.above_body_m)
 
 
-def with_ego(scenario: Scenario, rigs: Mapping[str, Rig], vehicle: str | Path | None = None) -> Scenario:
+def set_ego(scenario: Scenario, rigs: Mapping[str, Rig], vehicle: str | Path | None = None) -> Scenario:
     """The scenario with the body of what carries the rigs: the first of these that is given.
 
     `vehicle`; the shape of the scenario's own ego; the vehicle that the rigs name; an SUV.
@@ -186,13 +186,13 @@ def with_ego(scenario: Scenario, rigs: Mapping[str, Rig], vehicle: str | Path | 
         FileNotFoundError: No such vehicle.
 
     Example:
-        >>> with_ego(Scenario.load("courtyard"), {"roof": Rig.load("nuscenes")}).ego_name
+        >>> set_ego(Scenario.load("courtyard"), {"roof": Rig.load("nuscenes")}).ego_name
         'renault_zoe'
-        >>> with_ego(Scenario.load("courtyard"), {"roof": Rig.load("nuscenes")}, "van").ego_name
+        >>> set_ego(Scenario.load("courtyard"), {"roof": Rig.load("nuscenes")}, "van").ego_name
         'van'
     """
-    ego = scenario.ego or Mover()
-    shape = ego.shape if vehicle is None else _found_body("vehicle", body_called(vehicle))
+    ego = scenario.ego or ActorDescription()
+    shape = ego.shape if vehicle is None else _found_body("vehicle", create_body_shape(vehicle))
     return scenario.model_copy(update={"ego": ego.model_copy(update={"shape": shape or _of_rigs(rigs)})})
 
 
@@ -213,7 +213,7 @@ def _of_rigs(rigs: Mapping[str, Rig]) -> Shape:
 def _found_body(owner: str, shape: VehicleShape | MeshFile) -> VehicleShape | MeshFile:
     """The shape, once its file was found."""
     try:
-        shape.content()
+        shape.collect_content()
     except FileNotFoundError as error:
         raise FileNotFoundError(f"{owner}: {error}") from error
     return shape

@@ -1,6 +1,6 @@
 """How a LiDAR scans, from what it saw: rows, columns, ranges; without what was done to make up for the motion.
 
-`as_cast` has the rays as they were cast.
+`undo_motion_compensation` has the rays as they were cast.
 """
 
 from collections.abc import Callable, Sequence
@@ -37,29 +37,29 @@ SPREAD_DEG = 0.05
 ORIGIN_M, LINE_DEG, HIGHEST_M, CLOSER = 0.05, 0.01, 0.3, 0.5
 
 # The number of the laser of each point, scan by scan; None if unknown.
-Lasers = list[NDArray[np.integer]] | None
+LaserIndices = list[NDArray[np.integer]] | None
 
 
 class ScanEstimate(NamedTuple):
     """A scan pattern: (R,) elevations of the rows that returned anything, the highest first, and how many columns.
 
-    `horizontal_fov_deg` is 360 for a full turn, `centre_deg` the azimuth of its middle; the range is that of
-    the farthest return. `origin_m` is the height above the origin of the frame that the rays leave from, on average; 0
+    `horizontal_fov_deg` is 360 for a full turn, `center_azimuth_deg` the azimuth of its middle; the range is that of
+    the farthest return. `origin_height_m` is the height above the origin of the frame that the rays leave from, on average; 0
     if they need no other.
     """
 
     elevations_deg: Float64
-    columns: int
+    num_columns: int
     horizontal_fov_deg: float
-    centre_deg: float
+    center_azimuth_deg: float
     max_range_m: float
-    origin_m: float
+    origin_height_m: float
 
 
-def estimate_scan(scans: Sequence[Float64], lasers: Lasers = None) -> ScanEstimate | None:
+def estimate_scan(scans: Sequence[Float64], laser_indices: LaserIndices = None) -> ScanEstimate | None:
     """Estimate a LiDAR's pattern from (N, 3) points of scans in its frame; None if they do not lie in rows.
 
-    The LiDAR turns about z. A row whose rays all miss everything is not found. `lasers` says which laser each point is
+    The LiDAR turns about z. A row whose rays all miss everything is not found. `laser_indices` says which laser each point is
     of; they are found by elevation if unknown.
     """
     points_m = np.concatenate([np.empty((0, 3)), *scans])
@@ -68,15 +68,15 @@ def estimate_scan(scans: Sequence[Float64], lasers: Lasers = None) -> ScanEstima
     elevation_deg = np.rad2deg(np.arctan2(points_m[:, 2], np.hypot(points_m[:, 0], points_m[:, 1])))
     azimuth_deg = np.rad2deg(np.arctan2(points_m[:, 1], points_m[:, 0]))
     origin_m = 0.0
-    if lasers is None:
-        rows_deg = rows_of(elevation_deg)
+    if laser_indices is None:
+        rows_deg = estimate_row_elevations_deg(elevation_deg)
         if rows_deg is None:
             return None
         row = np.searchsorted((rows_deg[1:] + rows_deg[:-1]) / 2, elevation_deg)
     else:
-        _, row = np.unique(np.concatenate(lasers), return_inverse=True)
+        _, row = np.unique(np.concatenate(laser_indices), return_inverse=True)
     found_deg = np.array([np.median(elevation_deg[row == number]) for number in range(int(row.max()) + 1)])
-    if lasers is not None:
+    if laser_indices is not None:
         lines_deg, origins_m, off_deg = _lines(points_m, row)
         closer = np.median(np.abs(off_deg)) < CLOSER * np.median(np.abs(elevation_deg - found_deg[row]))
         if closer and np.abs(origins_m).max() < HIGHEST_M:  # on flat ground a tilt looks like an origin far below
@@ -92,7 +92,7 @@ def estimate_scan(scans: Sequence[Float64], lasers: Lasers = None) -> ScanEstima
     )
 
 
-def lasers_in_order(points_m: Float64) -> NDArray[np.integer] | None:
+def infer_laser_indices(points_m: Float64) -> NDArray[np.integer] | None:
     """(N,) the laser of each point of a cloud that is stored laser by laser, as KITTI's; None if it is not."""
     azimuth = np.arctan2(points_m[:, 1], points_m[:, 0])
     jump = np.diff(azimuth, prepend=azimuth[:1])
@@ -108,11 +108,11 @@ def lasers_in_order(points_m: Float64) -> NDArray[np.integer] | None:
     return laser if np.median(steps[np.diff(laser) > 0]) > STEPS * np.median(steps) else None
 
 
-def spread_deg(scans: Sequence[Float64], lasers: Lasers) -> float:
+def compute_row_spread_deg(scans: Sequence[Float64], laser_indices: LaserIndices) -> float:
     """How far points lie from rows: from those of their lasers, or how wide an angle all rows together take."""
     points_m = np.concatenate(scans)
-    if lasers is not None:
-        _, row = np.unique(np.concatenate(lasers), return_inverse=True)
+    if laser_indices is not None:
+        _, row = np.unique(np.concatenate(laser_indices), return_inverse=True)
         return float(np.median(np.abs(_lines(points_m, row)[2])))
     elevation_deg = np.rad2deg(np.arctan2(points_m[:, 2], np.hypot(points_m[:, 0], points_m[:, 1])))
     share = np.bincount(((elevation_deg + 90.0) / SPREAD_DEG).astype(np.int64)) / len(points_m)
@@ -143,12 +143,12 @@ def _lines(points_m: Float64, row: NDArray[np.intp]) -> tuple[Float64, Float64, 
     return np.rad2deg(np.arctan(slope)), origin_m, off
 
 
-def rows_of(elevation_deg: Float64) -> Float64 | None:
+def estimate_row_elevations_deg(elevations_deg: Float64) -> Float64 | None:
     """(R,) the elevations that points gather at, ascending, to a bin; None if that depends on how closely one looks."""
-    lowest = float(elevation_deg.min()) - 4 * COARSEST_DEG
-    number = ((elevation_deg - lowest) / BIN_DEG).astype(np.int64)
+    lowest = float(elevations_deg.min()) - 4 * COARSEST_DEG
+    number = ((elevations_deg - lowest) / BIN_DEG).astype(np.int64)
     size = int(number.max() + 4 * COARSEST_DEG / BIN_DEG)
-    least = max(PEAK_POINTS, PEAK_SHARE * len(elevation_deg))
+    least = max(PEAK_POINTS, PEAK_SHARE * len(elevations_deg))
     spectrum = np.fft.rfft(np.bincount(number, minlength=size).astype(np.float64))
     frequency = np.fft.rfftfreq(size)
     found: list[NDArray[np.intp]] = []
@@ -203,26 +203,26 @@ LOOKED_AT, MOVES_M, LESS_BLURRED, SEAM = 8_000, 0.05, 0.8, 0.035
 LONGEST_TURN_S = 0.25
 
 
-class Turn(NamedTuple):
+class Revolution(NamedTuple):
     """When the directions of a turn were measured: the one at the instant, its sense, its share before the instant."""
 
-    at_deg: float
-    sense: int
-    before: float
+    reference_azimuth_deg: float
+    direction: int
+    share_before: float
 
     @property
-    def begin_deg(self) -> float:
+    def start_azimuth_deg(self) -> float:
         """The azimuth that is measured first."""
-        return (self.at_deg - self.sense * 360.0 * self.before + 180.0) % 360.0 - 180.0
+        return (self.reference_azimuth_deg - self.direction * 360.0 * self.share_before + 180.0) % 360.0 - 180.0
 
-    def times(self, points_m: Matrix) -> Float64:
+    def compute_revolutions(self, points_m: Matrix) -> Float64:
         """(N,) when points were measured, in turns after the instant."""
         azimuth_deg = np.rad2deg(np.arctan2(points_m[:, 1], points_m[:, 0]))
-        return np.mod(self.sense * (azimuth_deg - self.begin_deg), 360.0) / 360.0 - self.before
+        return np.mod(self.direction * (azimuth_deg - self.start_azimuth_deg), 360.0) / 360.0 - self.share_before
 
-    def apart(self, points_m: Matrix) -> Bools:
+    def mask_off_seam(self, points_m: Matrix) -> Bools:
         """(N,) which points are not where a turn begins and ends."""
-        share = self.times(points_m) + self.before
+        share = self.compute_revolutions(points_m) + self.share_before
         return (share > SEAM) & (share < 1 - SEAM)
 
 
@@ -243,24 +243,24 @@ class _Scan(NamedTuple):
         then_T_now = (np.linalg.inv(world_T_then) @ self.way.interpolate(np.zeros(1, np.int64), "the LiDAR"))[of_point]
         return np.asarray(np.einsum("nij,nj->ni", then_T_now[:, :3, :3], points_m) + then_T_now[:, :3, 3])
 
-    def undone(self, turn: Turn, points_m: Matrix) -> Matrix:
+    def undone(self, turn: Revolution, points_m: Matrix) -> Matrix:
         """The same, by what the turn says of their directions then."""
         cast_m = points_m
         for _ in range(2):
-            cast_m = self.back(turn.times(cast_m) * self.turn_s, points_m)
+            cast_m = self.back(turn.compute_revolutions(cast_m) * self.turn_s, points_m)
         return cast_m
 
 
-def as_cast(
-    recording: Recording, sensor: str, instants: Sequence[int], vehicle_T_sensor: Matrix
-) -> tuple[list[Matrix], Lasers, str]:
+def undo_motion_compensation(
+    recording: Recording, sensor_name: str, frame_indices: Sequence[int], vehicle_T_sensor: Matrix
+) -> tuple[list[Matrix], LaserIndices, str]:
     """Scans in the frame of a LiDAR at the time of each ray, the lasers of their points, and what was undone.
 
     Where the times of points are not known, and the vehicle moves, they are those of even turns for which points lie
     closest to rows; if they lie so best as they are, nothing was done to them.
     """
-    scans = [_read(recording, sensor, index, vehicle_T_sensor) for index in instants]
-    lasers = [lasers_in_order(scan.points_m) if scan.rows is None else scan.rows for scan in scans]
+    scans = [_read(recording, sensor_name, index, vehicle_T_sensor) for index in frame_indices]
+    lasers = [infer_laser_indices(scan.points_m) if scan.rows is None else scan.rows for scan in scans]
     rows = None if any(of is None for of in lasers) else [of for of in lasers if of is not None]
     as_they_are = [scan.points_m for scan in scans]
     moving = [scan.way is not None and _way_m(scan.way) > MOVES_M for scan in scans]
@@ -278,35 +278,41 @@ def as_cast(
     some = [slice(None, None, max(1, len(scan.points_m) * len(scans) // LOOKED_AT)) for scan in scans]
     few = None if rows is None else [of[which] for of, which in zip(rows, some, strict=True)]
 
-    def blur(turn: Turn | None) -> float:
+    def blur(turn: Revolution | None) -> float:
         looked_at = [scan.points_m[which] for scan, which in zip(scans, some, strict=True)]
         if turn is not None:
             looked_at = [scan.undone(turn, points_m) for scan, points_m in zip(scans, looked_at, strict=True)]
-        return spread_deg(looked_at, few)
+        return compute_row_spread_deg(looked_at, few)
 
     turn, found = _best_turn(blur)
     if found > LESS_BLURRED * blur(None):
         return as_they_are, rows, ""
     cast = [scan.undone(turn, scan.points_m) for scan in scans]
     # Where a turn begins and ends, a degree decides which of the two it is.
-    inside = [turn.apart(scan.points_m) & turn.apart(points_m) for scan, points_m in zip(scans, cast, strict=True)]
+    inside = [
+        turn.mask_off_seam(scan.points_m) & turn.mask_off_seam(points_m)
+        for scan, points_m in zip(scans, cast, strict=True)
+    ]
     cast = [points_m[which] for points_m, which in zip(cast, inside, strict=True)]
     rows = None if rows is None else [of[which] for of, which in zip(rows, inside, strict=True)]
     return (
         cast,
         rows,
-        f"motion undone (turns {'counter-' * (turn.sense > 0)}clockwise from {turn.begin_deg:.0f} degrees)",
+        f"motion undone (turns {'counter-' * (turn.direction > 0)}clockwise from {turn.start_azimuth_deg:.0f} degrees)",
     )
 
 
-def _best_turn(blur: Callable[[Turn | None], float]) -> tuple[Turn, float]:
+def _best_turn(blur: Callable[[Revolution | None], float]) -> tuple[Revolution, float]:
     tried = {
-        turn: blur(turn) for turn in (Turn(at_deg, sense, b) for at_deg in AT_DEG for sense in (-1, 1) for b in BEFORE)
+        turn: blur(turn)
+        for turn in (Revolution(at_deg, sense, b) for at_deg in AT_DEG for sense in (-1, 1) for b in BEFORE)
     }
     best = min(tried, key=lambda turn: tried[turn])
     for share in FINER:
         for at_deg, before in ((45.0, 0.0), (-45.0, 0.0), (0.0, 0.25), (0.0, -0.25)):
-            turn = Turn(best.at_deg + share * at_deg, best.sense, best.before + share * before)
+            turn = Revolution(
+                best.reference_azimuth_deg + share * at_deg, best.direction, best.share_before + share * before
+            )
             tried[turn] = tried.get(turn) or blur(turn)
             best = min(best, turn, key=lambda turn: tried[turn])
     return best, tried[best]

@@ -19,18 +19,18 @@ import shapely
 from numpy.typing import NDArray
 
 from torchcover import __version__
-from torchcover.files import BadFileError, check_dtype_kind, parse_json, read_npz, guard_reader, read_limit_gb
+from torchcover.files import BadFileError, check_dtype_kind, guard_reader, parse_json, read_limit_gb, read_npz
 from torchcover.geometry.trajectory import Trajectory
-from torchcover.simulation.builtin import builtin_names
-from torchcover.simulation.documents import builtin_hashes
-from torchcover.simulation.scenario import Mover, Scenario
+from torchcover.simulation.builtin import list_builtin_names
+from torchcover.simulation.documents import hash_builtin_documents
+from torchcover.simulation.scenario import ActorDescription, Scenario
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.sumo.simulating import home
 from torchcover.simulation.traffic.fleet import load_bodies
-from torchcover.simulation.world import Actor, World
+from torchcover.simulation.world import Actor, Scene
 
 OWN_NAME = re.compile(r"[0-9a-f]{64}\.(npz|[0-9a-f]{32})")  # scenes, and temporary files of them; all others stay
-KINDS: dict[str, Any] = {kind.__name__: kind for kind in (World, Actor, Trajectory, Mesh)}
+KINDS: dict[str, Any] = {kind.__name__: kind for kind in (Scene, Actor, Trajectory, Mesh)}
 
 
 class SceneCache:
@@ -39,16 +39,16 @@ class SceneCache:
     def __init__(self, scenario: Scenario, seed: int, *, no_cache: bool = False) -> None:
         self._scenario, self._seed = scenario, seed
         # The code of other packages may change unnoticed.
-        is_known = not scenario.repeats and type(scenario.traffic).__module__.startswith("torchcover.")
+        is_known = not scenario.is_repeating and type(scenario.traffic).__module__.startswith("torchcover.")
         self._limit_bytes = 1e9 * read_limit_gb("TORCHCOVER_CACHE_GB", 1.0) if is_known and not no_cache else 0.0
         self._folder = _open_folder() if self._limit_bytes else None
 
-    def build(self, run: int, ego: Mesh | None) -> World:
+    def build(self, run_index: int, ego_mesh: Mesh | None) -> Scene:
         """Return the scene of a run, as `Scenario.world` builds it, to the bit; one of traffic is cached."""
-        if self._folder is None or ego is None:
-            return self._scenario.world(self._seed, run, ego)
-        key = hashlib.sha256(f"{_hash_sources(self._scenario)} {self._seed} {run}".encode()).hexdigest()
-        path, bodies = self._folder / f"{key}.npz", {**load_bodies(), "ego": ego}
+        if self._folder is None or ego_mesh is None:
+            return self._scenario.build_scene(self._seed, run_index, ego_mesh)
+        key = hashlib.sha256(f"{_hash_sources(self._scenario)} {self._seed} {run_index}".encode()).hexdigest()
+        path, bodies = self._folder / f"{key}.npz", {**load_bodies(), "ego": ego_mesh}
         try:
             if _stat_own(path):
                 scene = read_scene(path, bodies)
@@ -59,7 +59,7 @@ class SceneCache:
             warnings.warn(f"a cached scene is not used ({error})", stacklevel=2)
         with warnings.catch_warnings(record=True) as raised:
             warnings.simplefilter("always")
-            scene = self._scenario.world(self._seed, run, ego)
+            scene = self._scenario.build_scene(self._seed, run_index, ego_mesh)
         for warning in raised:
             warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
         if not any(issubclass(warning.category, UserWarning) for warning in raised):  # which a reader would not get
@@ -125,9 +125,13 @@ def _hash_sources(scenario: Scenario) -> str:
     """Hash what scenes follow from but seed and run: traffic and ego, code, libraries; no sensors, weather or names."""
     assert scenario.traffic is not None
     sources: list[object] = [__version__, _hash_code(), np.__version__, np.show_config(mode="dicts")["SIMD Extensions"]]
-    sources += [shapely.__version__, shapely.geos_version_string, builtin_names("materials")]
-    sources += [builtin_hashes("road_users"), type(scenario.traffic).__name__, scenario.traffic.content()]
-    sources.append((scenario.ego or Mover()).content())
+    sources += [shapely.__version__, shapely.geos_version_string, list_builtin_names("materials")]
+    sources += [
+        hash_builtin_documents("road_users"),
+        type(scenario.traffic).__name__,
+        scenario.traffic.collect_content(),
+    ]
+    sources.append((scenario.ego or ActorDescription()).collect_content())
     with suppress(ImportError, OSError):  # SUMO is not installed
         sources.append((home() / "bin" / "sumo").stat().st_mtime_ns)
     return hashlib.sha256(json.dumps(sources, sort_keys=True, default=repr).encode()).hexdigest()
@@ -141,7 +145,7 @@ def _hash_code() -> str:
     return digest.hexdigest()
 
 
-def encode_scene(key: str, scene: World, bodies: Mapping[str, Mesh]) -> dict[str, NDArray[Any]]:
+def encode_scene(key: str, scene: Scene, bodies: Mapping[str, Mesh]) -> dict[str, NDArray[Any]]:
     """Return a scene as arrays by number, and `scene`: the JSON of its key and of itself, in bytes.
 
     An array that is there several times is written once; of `bodies`, which scenes share, the names only.
@@ -166,7 +170,7 @@ def encode_scene(key: str, scene: World, bodies: Mapping[str, Mesh]) -> dict[str
 
 
 @guard_reader("a scene")
-def read_scene(path: Path, bodies: Mapping[str, Mesh]) -> World:
+def read_scene(path: Path, bodies: Mapping[str, Mesh]) -> Scene:
     """Read a scene, whose key is the stem of the path, without running code of it; its arrays are read-only."""
     arrays, meshes = read_npz(path, partial(check_dtype_kind, "biuf")), dict[str, Mesh]()
     for array in arrays.values():
@@ -184,5 +188,5 @@ def read_scene(path: Path, bodies: Mapping[str, Mesh]) -> World:
         part = KINDS[kind](*map(decode, items))
         return meshes.setdefault(str(items), part) if kind == "Mesh" else part  # actors share meshes
 
-    world: World = decode(scene)
+    world: Scene = decode(scene)
     return world

@@ -16,7 +16,7 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat, model_validator
 from torchcover.geometry.arrays import Float64, Int64
 from torchcover.simulation.bodies import Body
 from torchcover.simulation.documents import Document, Pose
-from torchcover.simulation.raycaster import Struck
+from torchcover.simulation.raycaster import HitAttributes
 from torchcover.simulation.returns import CLEAR, Weather
 
 Elevation = Annotated[float, Field(ge=-90.0, le=90.0)]
@@ -27,49 +27,49 @@ class RayHits:
     """N rays of a sensor that ended on something which is not the vehicle that carries it.
 
     Args:
-        ray: (N,) which ray, counted over the sensor's tiles. The rays of one beam ascend.
+        ray_indices: (N,) which ray, counted over the sensor's tiles. The rays of one beam ascend.
         range_m: (N,) how far it went, up to the sensor's range.
-        pixel_of_ray: (rays,) where each ray stands in `Sensor.directions`, row by row.
-        place: (N,) in which of several worlds, of which a sensor sees each alone; None if there is one.
-        find: Finds out what they ended on.
+        ray_pixel_indices: (rays,) where each ray stands in `Sensor.directions`, row by row.
+        position_indices: (N,) in which of several worlds, of which a sensor sees each alone; None if there is one.
+        find_attributes: Finds out what they ended on.
         weather: What they went through.
     """
 
-    ray: Int64
+    ray_indices: Int64
     range_m: NDArray[np.floating]
-    pixel_of_ray: Int64
-    place: Int64 | None = None
-    find: Callable[[], Struck] | None = None
+    ray_pixel_indices: Int64
+    position_indices: Int64 | None = None
+    find_attributes: Callable[[], HitAttributes] | None = None
     weather: Weather = CLEAR
 
     @property
-    def pixel(self) -> Int64:
+    def pixel_indices(self) -> Int64:
         """(N,) row * columns + column of each ray in `Sensor.directions`."""
-        return np.asarray(self.pixel_of_ray[self.ray])
+        return np.asarray(self.ray_pixel_indices[self.ray_indices])
 
     @cached_property
-    def struck(self) -> Struck:
+    def attributes(self) -> HitAttributes:
         """What they ended on: bodies, faces, angles of incidence, materials. A sensor that does not ask does not pay.
 
         Raises:
             ValueError: Hits of which that is unknown.
         """
-        if self.find is None:
+        if self.find_attributes is None:
             raise ValueError("the hits know where they are, and not on what; give RayHits its `find`")
-        return self.find()
+        return self.find_attributes()
 
 
 class Returns(NamedTuple):
-    """The points that a sensor makes of hits: `hit` (K,) of which, ascending; `error_m` (K,) along their rays.
+    """The points that a sensor makes of hits: `hit_indices` (K,) of which, ascending; `range_error_m` (K,) along their rays.
 
-    None for `hit`: of each, in order. None for `error_m`: they are exact.
+    None for `hit_indices`: of each, in order. None for `range_error_m`: they are exact.
     """
 
-    hit: Int64 | None
-    error_m: Float64 | None
+    hit_indices: Int64 | None
+    range_error_m: Float64 | None
 
 
-class Draws:
+class SensorNoise:
     """The random numbers of one sensor at one step.
 
     A sensor asks for the same kinds in the same order, whatever its rays hit.
@@ -87,22 +87,28 @@ class Draws:
         [1.0, 1.0]
     """
 
-    def __init__(self, generator: np.random.Generator | None, rays: int | None = None) -> None:
-        self._generator, self._rays = generator, rays
+    def __init__(self, rng: np.random.Generator | None, num_rays: int | None = None) -> None:
+        self._generator, self._rays = rng, num_rays
         self._of_rays: dict[str, Float64] = {}
         self._lock = Lock()
 
-    def normal(self, ray: Int64) -> Float64:
+    def sample_normal(self, ray_indices: Int64) -> Float64:
         """(N,) of a normal distribution with standard deviation 1, for hits of these rays."""
-        return np.zeros(len(ray)) if self._generator is None else self._drawn("error", "standard_normal", ray)
+        return (
+            np.zeros(len(ray_indices))
+            if self._generator is None
+            else self._drawn("error", "standard_normal", ray_indices)
+        )
 
-    def uniform(self, ray: Int64) -> Float64:
+    def sample_dropout_uniform(self, ray_indices: Int64) -> Float64:
         """(N,) evenly from [0, 1), for hits of these rays; 1 where there is no source."""
-        return np.ones(len(ray)) if self._generator is None else self._drawn("dropout", "random", ray)
+        return np.ones(len(ray_indices)) if self._generator is None else self._drawn("dropout", "random", ray_indices)
 
-    def chance(self, ray: Int64) -> Float64:
+    def sample_return_uniform(self, ray_indices: Int64) -> Float64:
         """(N,) evenly from [0, 1), others than `uniform`, for hits of these rays; 1/2 where there is no source."""
-        return np.full(len(ray), 0.5) if self._generator is None else self._drawn("return", "random", ray)
+        return (
+            np.full(len(ray_indices), 0.5) if self._generator is None else self._drawn("return", "random", ray_indices)
+        )
 
     def _drawn(self, purpose: str, kind: str, ray: Int64) -> Float64:
         draw = getattr(self._generator, kind)
@@ -153,31 +159,31 @@ class Sensor(Protocol):
         """Whether it measures the same thing alike at any time: its measuring draws no random numbers."""
 
     @property
-    def rays(self) -> int:
+    def num_rays(self) -> int:
         """How many rays `directions` has, NaN ones included: asked before it is called."""
 
-    def directions(self) -> Float64:
+    def compute_directions(self) -> Float64:
         """(3, rows, columns) unit directions in the sensor's frame; NaN where there is no ray."""
 
     @property
-    def counts_as(self) -> int:
+    def pixels_per_sample(self) -> int:
         """How many points each of its points is counted as on a body: of a camera, pixels of the full image."""
 
-    def times_s(self) -> Float64 | None:
+    def compute_ray_times_s(self) -> Float64 | None:
         """(rows, columns) when each ray is cast, after the time of the frame; None if all are at that time."""
 
-    def beams(self) -> Int64 | None:
+    def compute_beam_indices(self) -> Int64 | None:
         """(rows, columns) the number of the beam that each ray is part of; None if each is a beam of its own.
 
         What the rays of one beam hit is measured together; what those of others hit changes nothing about it.
         """
 
-    def measure(self, hits: RayHits, draws: Draws) -> Returns:
+    def measure(self, hits: RayHits, noise: SensorNoise) -> Returns:
         """What it makes of the hits of its rays.
 
         Args:
             hits: All hits of each beam that has one.
-            draws: Source of all random numbers.
+            noise: Source of all random numbers.
         """
 
 
@@ -195,13 +201,13 @@ class ScanTimes(Document):
     start_s: float | None = None
     deskewed: bool = True
 
-    def times_s(self, count: int) -> Float64:
+    def compute_times_s(self, num_times: int) -> Float64:
         """(count,) when each is cast, after the time of the frame."""
         start_s = -self.period_s if self.start_s is None else self.start_s
-        return np.asarray(start_s + self.period_s * (np.arange(count) + 0.5) / count)
+        return np.asarray(start_s + self.period_s * (np.arange(num_times) + 0.5) / num_times)
 
 
-class Ranging(Document):
+class RangeSensor(Document):
     """A sensor within whose ranges every hit gives a point, with noise and drop-out: the keys that such kinds share.
 
     Args:
@@ -228,7 +234,7 @@ class Ranging(Document):
             raise ValueError(f"range_noise_m ({self.range_noise_m}) must be below max_range_m ({self.max_range_m})")
         return self
 
-    def noise_m(self, range_m: NDArray[np.floating]) -> float | NDArray[np.floating]:
+    def compute_noise_std_m(self, range_m: NDArray[np.floating]) -> float | NDArray[np.floating]:
         """Standard deviation of measured ranges, of each of (N,) or of all; 0 if they are exact."""
         return self.range_noise_m
 
@@ -239,43 +245,50 @@ class Ranging(Document):
 
     @property
     def _errs(self) -> bool:
-        return bool(self.dropout or np.any(self.noise_m(np.ones(1))))
+        return bool(self.dropout or np.any(self.compute_noise_std_m(np.ones(1))))
 
     @property
-    def counts_as(self) -> int:
+    def pixels_per_sample(self) -> int:
         """1: a point is a measurement."""
         return 1
 
-    def times_s(self) -> Float64 | None:
+    def compute_ray_times_s(self) -> Float64 | None:
         """None: all rays are cast at the time of the frame."""
         return None
 
-    def beams(self) -> Int64 | None:
+    def compute_beam_indices(self) -> Int64 | None:
         """None: every ray measures alone."""
         return None
 
-    def measure(self, hits: RayHits, draws: Draws) -> Returns:
+    def measure(self, hits: RayHits, noise: SensorNoise) -> Returns:
         """A point for each hit that is not too close, with noise along its ray, unless it drops out."""
         if not self.min_range_m:
-            return self.erring(hits, None, draws)
+            return self.sample_returns(hits, None, noise)
         far_enough = hits.range_m >= self.min_range_m
-        return self.erring(hits, None if far_enough.all() else np.flatnonzero(far_enough), draws)
+        return self.sample_returns(hits, None if far_enough.all() else np.flatnonzero(far_enough), noise)
 
-    def erring(self, hits: RayHits, hit: Int64 | None, draws: Draws) -> Returns:
-        """Points at some of N hits, (K,) `hit` of them or all, with noise and drop-out."""
+    def sample_returns(self, hits: RayHits, hit_indices: Int64 | None, noise: SensorNoise) -> Returns:
+        """Points at some of N hits, (K,) `hit_indices` of them or all, with noise and drop-out."""
         if not self._errs:
-            return Returns(hit, None)
-        ray, range_m = (hits.ray, hits.range_m) if hit is None else (hits.ray[hit], hits.range_m[hit])
-        noise_m = self.noise_m(range_m)
+            return Returns(hit_indices, None)
+        ray, range_m = (
+            (hits.ray_indices, hits.range_m)
+            if hit_indices is None
+            else (hits.ray_indices[hit_indices], hits.range_m[hit_indices])
+        )
+        noise_m = self.compute_noise_std_m(range_m)
         # No range is less than 0.
-        error_m = np.maximum(noise_m * draws.normal(ray), -range_m) if np.any(noise_m) else None
+        error_m = np.maximum(noise_m * noise.sample_normal(ray), -range_m) if np.any(noise_m) else None
         if self.dropout:
-            stays = np.flatnonzero(draws.uniform(ray) >= self.dropout)
-            hit, error_m = stays if hit is None else hit[stays], None if error_m is None else error_m[stays]
-        return Returns(hit, error_m)
+            stays = np.flatnonzero(noise.sample_dropout_uniform(ray) >= self.dropout)
+            hit_indices, error_m = (
+                stays if hit_indices is None else hit_indices[stays],
+                None if error_m is None else error_m[stays],
+            )
+        return Returns(hit_indices, error_m)
 
 
-def vertical_fov_deg(sensor: Sensor) -> tuple[float, float]:
+def compute_vertical_fov_deg(sensor: Sensor) -> tuple[float, float]:
     """Lowest and highest elevation of a sensor's rays, in its middle column.
 
     Example:
@@ -284,6 +297,6 @@ def vertical_fov_deg(sensor: Sensor) -> tuple[float, float]:
         >>> [round(elevation, 9) for elevation in vertical_fov_deg(lidar)]
         [-15.0, 15.0]
     """
-    x, y, z = sensor.directions()
+    x, y, z = sensor.compute_directions()
     elevation_deg = np.rad2deg(np.arctan2(z, np.hypot(x, y)))[:, x.shape[1] // 2]
     return float(np.nanmin(elevation_deg)), float(np.nanmax(elevation_deg))

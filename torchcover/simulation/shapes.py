@@ -12,9 +12,9 @@ from pydantic import Field, PositiveFloat
 from torchcover.files import check_memory, guard_reader
 from torchcover.geometry import transform_points
 from torchcover.geometry.arrays import Bools, Float64, Int64
-from torchcover.simulation.documents import Document, PathBeside
-from torchcover.simulation.mesh_files import mesh_arrays
-from torchcover.simulation.returns import material_number
+from torchcover.simulation.documents import Document, RelativePath
+from torchcover.simulation.mesh_files import read_mesh_arrays
+from torchcover.simulation.returns import get_material_index
 
 CYLINDER_SIDES = 24
 MAX_SIDES = 10_000
@@ -31,39 +31,41 @@ Length = PositiveFloat
 class Mesh(NamedTuple):
     """A triangle mesh: `vertices_m` (V, 3) float64 in metres and `faces` (F, 3) int64 indices into them.
 
-    `material` (F,) uint8 is what each face is made of, by `material_number`; None, as 0, where that is not said.
-    `outward` (F,) is what `outward_faces` says, where that is known.
+    `material_indices` (F,) uint8 is what each face is made of, by `get_material_index`; None, as 0, where that is not said.
+    `is_outward` (F,) is what `find_outward_faces` says, where that is known.
     """
 
     vertices_m: Float64
     faces: Int64
-    material: NDArray[np.uint8] | None = None
-    outward: Bools | None = None
+    material_indices: NDArray[np.uint8] | None = None
+    is_outward: Bools | None = None
 
-    def moved(self, destination_T_source: Float64) -> "Mesh":
+    def transform(self, destination_T_source: Float64) -> "Mesh":
         """The mesh in another frame."""
         return self._replace(vertices_m=transform_points(destination_T_source, self.vertices_m))
 
-    def with_faces(self, which: Bools | Int64) -> "Mesh":
+    def select_faces(self, selection: Bools | Int64) -> "Mesh":
         """Some of its faces, of what they were made of."""
-        material = None if self.material is None else self.material[which]
-        return Mesh(self.vertices_m, self.faces[which], material)
+        material = None if self.material_indices is None else self.material_indices[selection]
+        return Mesh(self.vertices_m, self.faces[selection], material)
 
-    def parts(self) -> Iterator[tuple[slice, Float64]]:
+    def iterate_parts(self) -> Iterator[tuple[slice, Float64]]:
         """Which faces, and their (3, 3, N) corners, coordinates, faces: as many at a time as there is memory for."""
-        return parts_of([self])
+        return iterate_mesh_parts([self])
 
-    def made_of(self, material: str) -> "Mesh":
+    def assign_material(self, material_name: str) -> "Mesh":
         """The mesh with all its faces of a built-in material."""
-        return self._replace(material=np.full(len(self.faces), material_number(material), dtype=np.uint8))
+        return self._replace(
+            material_indices=np.full(len(self.faces), get_material_index(material_name), dtype=np.uint8)
+        )
 
     @property
-    def materials(self) -> NDArray[np.uint8]:
+    def filled_material_indices(self) -> NDArray[np.uint8]:
         """(F,) the number of what each face is made of."""
-        return np.zeros(len(self.faces), dtype=np.uint8) if self.material is None else self.material
+        return np.zeros(len(self.faces), dtype=np.uint8) if self.material_indices is None else self.material_indices
 
 
-def parts_of(meshes: Sequence[Mesh]) -> Iterator[tuple[slice, Float64]]:
+def iterate_mesh_parts(meshes: Sequence[Mesh]) -> Iterator[tuple[slice, Float64]]:
     """As `Mesh.parts`, of faces that are counted through all meshes: of small ones several together."""
     first, held = 0, list[Float64]()
     for number, mesh in enumerate(meshes, 1):
@@ -80,17 +82,17 @@ def parts_of(meshes: Sequence[Mesh]) -> Iterator[tuple[slice, Float64]]:
                 first, held = first + count, []
 
 
-def corners_of(meshes: Sequence[Mesh], faces: Int64) -> Float64:
+def get_corners_m(meshes: Sequence[Mesh], face_indices: Int64) -> Float64:
     """(3, 3, N) corners, coordinates, faces, of some that are counted through all meshes."""
     starts = np.cumsum([0] + [len(mesh.faces) for mesh in meshes])
-    corners_m, of_mesh = np.empty((3, 3, len(faces))), np.searchsorted(starts, faces, side="right") - 1
+    corners_m, of_mesh = np.empty((3, 3, len(face_indices))), np.searchsorted(starts, face_indices, side="right") - 1
     for number in np.unique(of_mesh).tolist():
         some, mesh = np.flatnonzero(of_mesh == number), meshes[number]
-        corners_m[..., some] = mesh.vertices_m[mesh.faces[faces[some] - starts[number]]].transpose(1, 2, 0)
+        corners_m[..., some] = mesh.vertices_m[mesh.faces[face_indices[some] - starts[number]]].transpose(1, 2, 0)
     return corners_m
 
 
-def normals_of(corners_m: Float64) -> Float64:
+def compute_normals(corners_m: Float64) -> Float64:
     """(3, N) normals of (3, 3, N) corners, coordinates, faces; 0 without an area, for Embree does not hit that."""
     first, second, third = corners_m
     across = np.cross(second - first, third - first, axis=0)
@@ -108,7 +110,7 @@ class Plane(Document):
     type: Literal["plane"]
     size_m: tuple[Length, Length]
 
-    def mesh(self) -> Mesh:
+    def build_mesh(self) -> Mesh:
         """Two triangles, centred."""
         return Mesh(_rectangle(self.size_m, 0.0), np.array([[0, 1, 2], [0, 2, 3]]))
 
@@ -123,7 +125,7 @@ class Box(Document):
     type: Literal["box"]
     size_m: tuple[Length, Length, Length]
 
-    def mesh(self) -> Mesh:
+    def build_mesh(self) -> Mesh:
         """Twelve triangles; x and y centred, z from 0."""
         length, width, height = self.size_m
         return _prism(_rectangle((length, width), 0.0), _rectangle((length, width), height))
@@ -145,7 +147,7 @@ class Frustum(Document):
     height_m: Length
     top_shift_m: float = 0.0
 
-    def mesh(self) -> Mesh:
+    def build_mesh(self) -> Mesh:
         """Twelve triangles."""
         top = _rectangle(self.top_m, self.height_m) + np.array([self.top_shift_m, 0.0, 0.0])
         return _prism(_rectangle(self.bottom_m, 0.0), top)
@@ -165,9 +167,9 @@ class Cylinder(Document):
     height_m: Length
     sides: Annotated[int, Field(ge=3, le=MAX_SIDES)] = CYLINDER_SIDES
 
-    def mesh(self) -> Mesh:
+    def build_mesh(self) -> Mesh:
         """A closed prism."""
-        bottom = np.insert(circle(self.sides) * self.radius_m, 2, 0.0, axis=1)
+        bottom = np.insert(compute_circle_points(self.sides) * self.radius_m, 2, 0.0, axis=1)
         return _prism(bottom, bottom + np.array([0.0, 0.0, self.height_m]))
 
 
@@ -181,12 +183,12 @@ class Ellipsoid(Document):
     type: Literal["ellipsoid"]
     size_m: tuple[Length, Length, Length]
 
-    def mesh(self) -> Mesh:
+    def build_mesh(self) -> Mesh:
         """Two poles and the rings between them, lowest first."""
         bands = ELLIPSOID_SIDES // 2
         elevation = np.pi * np.arange(1, bands) / bands - np.pi / 2
         # The unit sphere: axes are bands, sides, coordinates.
-        across = np.cos(elevation)[:, None, None] * circle(ELLIPSOID_SIDES)
+        across = np.cos(elevation)[:, None, None] * compute_circle_points(ELLIPSOID_SIDES)
         upwards = np.broadcast_to(np.sin(elevation)[:, None, None], (*across.shape[:2], 1))
         rings = np.concatenate([across, upwards], axis=2).reshape(-1, 3)
         sphere = np.concatenate([[[0.0, 0.0, -1.0]], rings, [[0.0, 0.0, 1.0]]])
@@ -199,17 +201,17 @@ class MeshFile(Document):
 
     Args:
         path: The file; relative to the document that names it.
-        metres_per_unit: Scale of the file: 1 for meters, 0.001 for millimeters; COLLADA files state their unit, which
+        meters_per_unit: Scale of the file: 1 for meters, 0.001 for millimeters; COLLADA files state their unit, which
             is applied before.
         transparent: Objects or materials of the file that all rays pass, such as windows.
     """
 
     type: Literal["mesh"]
-    path: PathBeside
-    metres_per_unit: PositiveFloat = 1.0
+    path: RelativePath
+    meters_per_unit: PositiveFloat = 1.0
     transparent: tuple[str, ...] = ()
 
-    def mesh(self) -> Mesh:
+    def build_mesh(self) -> Mesh:
         """All geometry of the file in one mesh, without its transparent parts.
 
         Raises:
@@ -226,10 +228,10 @@ class MeshFile(Document):
             is_opaque = ~np.asarray(np.isin(names, self.transparent).any(axis=1))[part]
             if not is_opaque.any():
                 raise ValueError(f"{self.path}: transparent: all {len(part):,} faces are; name the windows only")
-            mesh = mesh.with_faces(is_opaque)
-        return mesh._replace(vertices_m=mesh.vertices_m * self.metres_per_unit)
+            mesh = mesh.select_faces(is_opaque)
+        return mesh._replace(vertices_m=mesh.vertices_m * self.meters_per_unit)
 
-    def clear_materials(self) -> list[str]:
+    def list_transparent_materials(self) -> list[str]:
         """Materials that are partly transparent by the file, and stop rays, since `transparent` does not name them."""
         _, _, names, is_clear = _read_mesh(self.path)
         return sorted({material or name for name, material in names[is_clear].tolist()} - set(self.transparent))
@@ -249,7 +251,7 @@ def _read_mesh(path: Path) -> _MeshParts:
     with path.open("rb") as file:
         is_binary = b"\0" in file.read(PART)
     check_memory((_BYTES_PER_BINARY_BYTE if is_binary else _BYTES_PER_TEXT_BYTE) * path.stat().st_size)
-    vertices, faces, part, names, is_clear = mesh_arrays(path).values()
+    vertices, faces, part, names, is_clear = read_mesh_arrays(path).values()
     if len(faces) == 0:
         raise ValueError(f"a mesh with faces is needed; it has {len(vertices)} vertices and no face")
     if not np.isfinite(vertices).all():
@@ -266,9 +268,9 @@ def _rectangle(size_m: tuple[float, float], z_m: float) -> Float64:
 
 
 @cache
-def circle(corners: int) -> Float64:
+def compute_circle_points(num_corners: int) -> Float64:
     """(corners, 2) points of the unit circle, counter-clockwise from (1, 0)."""
-    angle = 2 * np.pi * np.arange(corners) / corners
+    angle = 2 * np.pi * np.arange(num_corners) / num_corners
     return np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
@@ -280,32 +282,32 @@ def _ball_faces(rings: int, corners: int) -> Int64:
     top = (rings - 1) * corners + 1
     faces = [np.stack([lower, following + 1, here + 1], axis=1), np.stack([upper, here + top, following + top], axis=1)]
     for first in range(1, top, corners):
-        faces.append(band(here + first, following + first, corners))
+        faces.append(build_band_faces(here + first, following + first, corners))
     return np.concatenate(faces)
 
 
-def band(here: Int64, following: Int64, upwards: int) -> Int64:
-    """Two triangles for each side between a ring and the one above it, whose indices are larger by `upwards`."""
+def build_band_faces(lower_indices: Int64, next_indices: Int64, level_offset: int) -> Int64:
+    """Two triangles for each side between a ring and the one above it, whose indices are larger by `level_offset`."""
     return np.concatenate(
         [
-            np.stack([here, following, following + upwards], axis=1),
-            np.stack([here, following + upwards, here + upwards], axis=1),
+            np.stack([lower_indices, next_indices, next_indices + level_offset], axis=1),
+            np.stack([lower_indices, next_indices + level_offset, lower_indices + level_offset], axis=1),
         ]
     )
 
 
 def _prism(bottom: Float64, top: Float64) -> Mesh:
     """Close the space between two convex polygons with K corners each, given counter-clockwise from above."""
-    return Mesh(np.concatenate([bottom, top]), prism_faces(2, len(bottom)))
+    return Mesh(np.concatenate([bottom, top]), build_prism_faces(2, len(bottom)))
 
 
 @cache
-def prism_faces(levels: int, corners: int) -> Int64:
+def build_prism_faces(num_levels: int, num_corners: int) -> Int64:
     """Sides, bottom and top of a prism through so many outlines, which share them: nobody may write into them."""
-    here = np.arange(corners)
-    side = band(here, (here + 1) % corners, corners)
-    fan = np.stack([np.zeros(corners - 2, dtype=np.int64), here[1:-1], here[2:]], axis=1)
-    sides = [side + level * corners for level in range(levels - 1)]
-    faces = np.concatenate([*sides, fan[:, ::-1], fan + (levels - 1) * corners])
+    here = np.arange(num_corners)
+    side = build_band_faces(here, (here + 1) % num_corners, num_corners)
+    fan = np.stack([np.zeros(num_corners - 2, dtype=np.int64), here[1:-1], here[2:]], axis=1)
+    sides = [side + level * num_corners for level in range(num_levels - 1)]
+    faces = np.concatenate([*sides, fan[:, ::-1], fan + (num_levels - 1) * num_corners])
     faces.flags.writeable = False
     return faces

@@ -20,8 +20,8 @@ from torchcover.geometry.arrays import Float32, Float64, Int64
 from torchcover.simulation.instant import SensorScan
 from torchcover.simulation.kinds import REFERENCE_SENSORS
 from torchcover.simulation.reference_sensor import PaperReference, ReferenceSensor
-from torchcover.simulation.regions_of_interest import Asked, RegionsOfInterest
-from torchcover.simulation.rig import Rig, is_roadside, with_ego
+from torchcover.simulation.regions_of_interest import QueryPlan, RegionsOfInterest
+from torchcover.simulation.rig import Rig, is_roadside, set_ego
 from torchcover.simulation.scenario import Scenario
 from torchcover.simulation.sensor import Sensor
 from torchcover.simulation.shapes import Mesh
@@ -49,11 +49,11 @@ class SimulatedFrames(FrameDataset):
         scenario: The world, the name of a built-in one, or the path of a YAML file.
         rig: The sensors, the name of a built-in rig, or the path of a YAML file.
         rigs: Several rigs instead, by the name under which `Frame.clouds` has their clouds; `{}`: the reference alone.
-        steps: Number of frames. Beyond the end of a scenario its traffic starts anew with other random numbers; without
+        num_frames: Number of frames. Beyond the end of a scenario its traffic starts anew with other random numbers; without
             traffic, the same instants are seen again, which `Frame.block_index` and `Frame.counts` say.
         seed: Seed of the traffic and of the reference sensor's poses.
         reference_sensor: The reference sensor, such as `PaperReference()`. If not given, a `SurfaceReference` that is
-            aimed at the usual regions: `reference_called`, and `reference_of_objects` with boxes, at up to twice the
+            aimed at the usual regions: `create_reference_sensor`, and `create_object_reference` with boxes, at up to twice the
             time.
         frame_interval_s: Time between one frame and the next, a multiple of the scenario's time step; that step if not given.
             Steps that follow each other are alike: with the same number of frames, a longer time shows more, and in
@@ -63,7 +63,7 @@ class SimulatedFrames(FrameDataset):
             scenario.
         vehicle: What carries the rigs: a built-in vehicle, the YAML file of one, or a mesh file. Not given: the
             scenario's own ego, else the vehicle that the rigs name, else an SUV.
-        kept_bytes: As in `Simulator`.
+        max_cached_bytes: As in `Simulator`.
         within_m: As in `Simulator`: the clouds have the points near the reference, and hardly any others.
         no_cache: As in `Simulator`.
         device: As in `Simulator`.
@@ -86,36 +86,36 @@ class SimulatedFrames(FrameDataset):
         rig: Rig | str | Path | None = None,
         *,
         rigs: Mapping[str, Rig | str | Path] | None = None,
-        steps: int,
+        num_frames: int,
         seed: int = 0,
         reference_sensor: ReferenceSensor | None = None,
         frame_interval_s: float | None = None,
         boxes: bool = False,
         vehicle: str | Path | None = None,
-        kept_bytes: float | None = None,
-        within_m: float | None = None,
+        max_cached_bytes: float | None = None,
+        search_radius_m: float | None = None,
         no_cache: bool = False,
         device: str | None = None,
     ) -> None:
-        if not 1 <= steps <= MAX_STEPS:
-            raise ValueError(f"steps: a number from 1 to {MAX_STEPS:,} is needed; got {steps}")
+        if not 1 <= num_frames <= MAX_STEPS:
+            raise ValueError(f"steps: a number from 1 to {MAX_STEPS:,} is needed; got {num_frames}")
         carried = _rigs(rig, rigs)
-        world = with_ego(scenario if isinstance(scenario, Scenario) else Scenario.load(scenario), carried, vehicle)
+        world = set_ego(scenario if isinstance(scenario, Scenario) else Scenario.load(scenario), carried, vehicle)
         if reference_sensor is None:
-            asked = RegionsOfInterest().around(world.ego_box().outline_m)
-            reference_sensor = reference_of_objects(asked) if boxes else reference_called(asked=asked)
+            asked = RegionsOfInterest().build_query_plan(world.compute_ego_box().outline_m)
+            reference_sensor = create_object_reference(asked) if boxes else create_reference_sensor(query_plan=asked)
         self.simulator = Simulator(
             world,
             carried,
             _fit_to_rigs(reference_sensor, carried, world),
             seed=seed,
             frame_interval_s=frame_interval_s,
-            kept_bytes=kept_bytes,
-            within_m=within_m,
+            max_cached_bytes=max_cached_bytes,
+            search_radius_m=search_radius_m,
             no_cache=no_cache,
             device=device,
         )
-        self.steps = steps
+        self.num_frames = num_frames
         self.boxes = boxes
 
     @property
@@ -155,11 +155,11 @@ class SimulatedFrames(FrameDataset):
 
     def get_scene_id(self, index: int) -> int:
         """Which world a frame is of; of one that plays again and again every process has it whole: the index."""
-        return index if self.scenario.repeats else self.simulator.run_of(index)
+        return index if self.scenario.is_repeating else self.simulator.get_run_index(index)
 
     def get_block_index(self, index: int) -> int:
         """As `Simulator.block_index`."""
-        return self.simulator.block_index(index)
+        return self.simulator.get_block_index(index)
 
     def has_boxes(self) -> bool:
         """Whether they were asked for."""
@@ -171,12 +171,12 @@ class SimulatedFrames(FrameDataset):
 
     def get_ego_mesh(self) -> Mesh:
         """What carries the rigs, in the vehicle frame; no world is built for it."""
-        return self.scenario.ego_mesh()
+        return self.scenario.build_ego_mesh()
 
     @property
     def ego_outline_m(self) -> Float64:
         """(4, 2) corners x, y of the ego as seen from above, counter-clockwise; no world is built for it."""
-        return self.scenario.ego_box().outline_m
+        return self.scenario.compute_ego_box().outline_m
 
     @property
     def description(self) -> Mapping[str, object]:
@@ -199,11 +199,11 @@ class SimulatedFrames(FrameDataset):
     def reference_record(self) -> Mapping[str, object]:
         """The reference sensor, the time between two frames; notes on ground, traffic and rays that the ego ends."""
         traffic, ego = self.scenario.traffic, self.get_ego_mesh()
-        words = [self.simulator.ground_words, traffic.drawn_words if traffic else ""]
-        if getattr(self.reference_sensor, "over_areas", False):
+        words = [self.simulator.ground_note, traffic.drawn_words if traffic else ""]
+        if getattr(self.reference_sensor, "is_over_areas", False):
             words.append("Reference positions: anywhere in the regions, for the rig is on a mast and not on a vehicle.")
         for name, rig in self.rigs.items():
-            self_hits = describe_self_hits(rig.sensors, rig.own_mesh(ego))
+            self_hits = describe_self_hits(rig.sensors, rig.build_occluder_mesh(ego))
             words.append(f"{name}: {self_hits}" if self_hits and len(self.rigs) > 1 else self_hits)
         return {
             "sensor": self.reference_sensor.name,
@@ -221,79 +221,83 @@ class SimulatedFrames(FrameDataset):
         sensor = self.reference_sensor
         pattern = repr(sensor) if is_dataclass(sensor) else hashlib.sha256(pickle.dumps(sensor)).hexdigest()
         return {
-            "scenario": self.scenario.content(),
-            **{f"rig {name}": rig.content() for name, rig in self.rigs.items()},
+            "scenario": self.scenario.collect_content(),
+            **{f"rig {name}": rig.collect_content() for name, rig in self.rigs.items()},
             "reference sensor": pattern,
             "seed": self.seed,
             "frame_interval_s": self.frame_interval_s,
             "boxes": self.boxes,
-            "within_m": self.simulator.within_m,
+            "search_radius_m": self.simulator.search_radius_m,
         }
 
-    def with_reference_sensor(self, reference_sensor: ReferenceSensor) -> Self:
+    def replace_reference_sensor(self, reference_sensor: ReferenceSensor) -> Self:
         """The same instants as another reference sensor sees them; the geometry is built once for both."""
         other = copy.copy(self)
         fitted = _fit_to_rigs(reference_sensor, self.rigs, self.scenario)
-        other.simulator = self.simulator.with_reference_sensor(fitted)
+        other.simulator = self.simulator.replace_reference_sensor(fitted)
         return other
 
     def __len__(self) -> int:
-        return self.steps
+        return self.num_frames
 
     def _frame_at(self, position: int) -> Frame:
-        return self.frame_of(self.simulator.step(position), position)
+        return self.build_frame(self.simulator.simulate_frame(position), position)
 
-    def frame_of(self, seen: Observation, index: int) -> Frame:
+    def build_frame(self, observation: Observation, index: int) -> Frame:
         """The frame of what the simulator saw at a step."""
-        weights, heights_m = seen.reference_weights, seen.reference_heights_m
+        weights, heights_m = observation.reference_weights, observation.reference_heights_m
         frame = Frame(
-            **of_rigs(self.rigs, seen.scans),
-            reference=torch.from_numpy(seen.reference),
+            **build_rig_fields(self.rigs, observation.scans),
+            reference=torch.from_numpy(observation.reference),
             reference_weights=None if weights is None else torch.from_numpy(weights),
             reference_heights_m=None if heights_m is None else torch.from_numpy(heights_m),
             index=index,
             name=f"{self.scenario.name} step {index}",
-            counts=seen.counts,
-            block_index=self.simulator.block_index(index),
+            counts=observation.counts,
+            block_index=self.simulator.get_block_index(index),
         )
-        return with_boxes(frame, self._boxes(index, seen.drawn), self.rigs) if self.boxes else frame
+        return (
+            add_boxes(frame, self._boxes(index, observation.sampled_point_counts), self.rigs) if self.boxes else frame
+        )
 
     def _boxes(self, index: int, drawn: Int64 | None) -> Boxes:
-        found = self.simulator.labels(index)
-        rows = [[*label.centre_m, *label.size_m, label.yaw_rad] for label in found]
+        found = self.simulator.compute_labels(index)
+        rows = [[*label.center_m, *label.size_m, label.yaw_rad] for label in found]
         velocities = np.array([label.velocity_mps for label in found])
         return Boxes.from_rows(
             torch.tensor(rows, dtype=torch.float32, device="cpu").view(-1, 7),
             velocity_mps=torch.tensor(velocities, dtype=torch.float32, device="cpu").view(-1, 2),
             ids=tuple(label.name for label in found),
             categories=tuple(label.category for label in found),
-            drawn_points=None if drawn is None else torch.from_numpy(drawn[[label.number for label in found]]),
-            bottom_heights_m=torch.from_numpy(self.simulator.bottom_heights_m(index, found)),
+            drawn_points=None if drawn is None else torch.from_numpy(drawn[[label.object_index for label in found]]),
+            bottom_heights_m=torch.from_numpy(self.simulator.compute_bottom_heights_m(index, found)),
         )
 
 
 def _fit_to_rigs(sensor: ReferenceSensor, rigs: Mapping[str, Rig], scenario: Scenario) -> ReferenceSensor:
     """The reference sensor, with positions over all regions if a rig is on a mast beside the road."""
-    if not is_roadside(rigs.values(), scenario.ego_box()):
+    if not is_roadside(rigs.values(), scenario.compute_ego_box()):
         return sensor
     if isinstance(sensor, PaperReference):
         raise ValueError(
             "reference paper: it looks from the mast of this roadside rig, so that what is hidden from both is in no "
             "number; use the reference surface, which looks from anywhere in the regions then"
         )
-    return sensor.for_roadside() if isinstance(sensor, SurfaceReference) else sensor
+    return sensor.extend_to_areas() if isinstance(sensor, SurfaceReference) else sensor
 
 
-def of_rigs(rigs: Mapping[str, Rig], scans: Mapping[str, Sequence[SensorScan]]) -> dict[str, Any]:
+def build_rig_fields(rigs: Mapping[str, Rig], scans: Mapping[str, Sequence[SensorScan]]) -> dict[str, Any]:
     """What a `Frame` says of its rigs: clouds, what was measured of them, and which points are of which sensor."""
     clouds = {name: torch.from_numpy(np.concatenate([one.points for one in seen])) for name, seen in scans.items()}
     measured = {
         name: Measurement(
-            torch.from_numpy(np.concatenate([one.points if one.landed is None else one.landed for one in seen])),
+            torch.from_numpy(
+                np.concatenate([one.points if one.measured_points is None else one.measured_points for one in seen])
+            ),
             torch.from_numpy(np.concatenate([_error_m(one) for one in seen])),
         )
         for name, seen in scans.items()
-        if any(one.landed is not None for one in seen)
+        if any(one.measured_points is not None for one in seen)
     }
     points = {
         name: {sensor.name: len(one.points) for sensor, one in zip(rigs[name].sensors, seen, strict=True)}
@@ -302,55 +306,60 @@ def of_rigs(rigs: Mapping[str, Rig], scans: Mapping[str, Sequence[SensorScan]]) 
     return {"clouds": clouds, "measurements": measured, "sensor_point_counts": points}
 
 
-def with_boxes(frame: Frame, boxes: Boxes, rigs: Mapping[str, Rig]) -> Frame:
+def add_boxes(frame: Frame, boxes: Boxes, rigs: Mapping[str, Rig]) -> Frame:
     """The frame with its objects, and how many points each of its rigs has on them."""
     clouds = {name: frame.get_cloud(name, max_error_m=MEASURED_WITHIN_M) for name in frame.clouds}
     counts_as = {}
     for name, rig in rigs.items():
-        if any(sensor.counts_as > 1 for sensor in rig.sensors):
+        if any(sensor.pixels_per_sample > 1 for sensor in rig.sensors):
             of_sensors = frame.get_clouds_by_sensor(name, max_error_m=MEASURED_WITHIN_M).values()
-            each = torch.tensor([sensor.counts_as for sensor in rig.sensors], device="cpu")
+            each = torch.tensor([sensor.pixels_per_sample for sensor in rig.sensors], device="cpu")
             counts_as[name] = each.repeat_interleave(torch.tensor([len(cloud) for cloud in of_sensors], device="cpu"))
     return replace(frame, boxes=add_point_counts(boxes, clouds, counts_as))
 
 
 def _error_m(scan: SensorScan) -> Float32:
-    return np.zeros(len(scan.points), dtype=np.float32) if scan.error_m is None else scan.error_m
+    return np.zeros(len(scan.points), dtype=np.float32) if scan.range_error_m is None else scan.range_error_m
 
 
-def reference_called(name: str | None = None, rays: int | None = None, asked: Asked | None = None) -> ReferenceSensor:
+def create_reference_sensor(
+    name: str | None = None, num_rays: int | None = None, query_plan: QueryPlan | None = None
+) -> ReferenceSensor:
     """A reference sensor by its name, aimed at what is asked about.
 
     Args:
         name: One of `torchcover.simulation.REFERENCE_SENSORS`; "surface" if not given.
-        rays: About how many rays at each step; the sensor's own number if not given.
-        asked: Regions, height bands and grid, as `RegionsOfInterest.around` gives them; those of `torchcover.evaluate`
+        num_rays: About how many rays at each step; the sensor's own number if not given.
+        query_plan: Regions, height bands and grid, as `RegionsOfInterest.around` gives them; those of `torchcover.evaluate`
             without the near field, for the vehicle is unknown, if not given.
 
     Raises:
         ValueError: Another name, or too few rays.
 
     Example:
-        >>> sensor = reference_called()
+        >>> sensor = create_reference_sensor()
         >>> sensor.name, sensor.rays, sensor.square_metres
         ('surface', 16384, True)
     """
     kind = REFERENCE_SENSORS.get(DEFAULT_REFERENCE if name is None else name)
     if kind is None:
         raise ValueError(f"reference {name}: {' or '.join(f'`{known}`' for known in REFERENCE_SENSORS)} is needed")
-    return kind.from_rays(asked or RegionsOfInterest().around(), rays)
+    return kind.from_query_plan(query_plan or RegionsOfInterest().build_query_plan(), num_rays)
 
 
-def reference_of_objects(asked: Asked | None = None) -> SurfaceReference:
+def create_object_reference(query_plan: QueryPlan | None = None) -> SurfaceReference:
     """The default reference sensor with 64 points for each object in range: one that knows how visible they are.
 
-    `asked` is as in `reference_called`.
+    `query_plan` is as in `create_reference_sensor`.
 
     Example:
-        >>> reference_of_objects().object_points
+        >>> create_object_reference().object_points
         64
     """
-    return replace(SurfaceReference.from_rays(asked or RegionsOfInterest().around(), None), object_points=OBJECT_POINTS)
+    return replace(
+        SurfaceReference.from_query_plan(query_plan or RegionsOfInterest().build_query_plan(), None),
+        points_per_object=OBJECT_POINTS,
+    )
 
 
 def _rigs(rig: Rig | str | Path | None, rigs: Mapping[str, Rig | str | Path] | None) -> dict[str, Rig]:

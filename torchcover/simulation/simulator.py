@@ -12,16 +12,16 @@ import torch
 
 from torchcover.geometry import BoundingBox
 from torchcover.geometry.arrays import Float32, Int64
-from torchcover.simulation.instant import Instant, SensorScan
-from torchcover.simulation.memory import BYTES_PER_RAY, check_fits
-from torchcover.simulation.rays import Balls
-from torchcover.simulation.reference_sensor import ReferenceScan, ReferenceSensor, Surroundings
-from torchcover.simulation.rig import Rig, with_ego
+from torchcover.simulation.instant import SceneSnapshot, SensorScan
+from torchcover.simulation.memory import BYTES_PER_RAY, check_memory_fits
+from torchcover.simulation.rays import SearchSpheres
+from torchcover.simulation.reference_sensor import ReferenceContext, ReferenceScan, ReferenceSensor
+from torchcover.simulation.rig import Rig, set_ego
 from torchcover.simulation.scenario import Scenario
-from torchcover.simulation.scene import Scene
-from torchcover.simulation.sensor import Draws
-from torchcover.simulation.stage import Scenes, Stage, Stages, warn_of_floating
-from torchcover.simulation.world import Label, labels
+from torchcover.simulation.scene import SceneGeometry
+from torchcover.simulation.sensor import SensorNoise
+from torchcover.simulation.stage import MountedRigs, MountedRigStore, SceneStore, warn_about_missing_ground
+from torchcover.simulation.world import ObjectLabel, compute_labels
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +33,7 @@ class Observation:
         reference: (M, 3) float32 points of the reference sensor.
         reference_weights: (M,) float32 square metres that each of them stands for; None if they count the same.
         reference_heights_m: (M,) float32 heights of the reference points above the local ground, from `ReferenceScan`.
-        drawn: (objects,) how many points the reference drew on each of `World.objects`, from `ReferenceScan`.
+        sampled_point_counts: (objects,) how many points the reference drew on each of `World.objects`, from `ReferenceScan`.
         counts: How many rays there were, how many of them the ego took, and what was left out, by name.
     """
 
@@ -41,7 +41,7 @@ class Observation:
     reference: Float32
     reference_weights: Float32 | None
     reference_heights_m: Float32 | None
-    drawn: Int64 | None
+    sampled_point_counts: Int64 | None
     counts: Mapping[str, int]
 
     @cached_property
@@ -58,15 +58,15 @@ class Simulator:
     are cast on as many threads as torch uses (`torch.set_num_threads`).
 
     Args:
-        scenario: The world; `with_ego` gives it its ego. Beyond its end the same plays again, or another one; see
+        scenario: The world; `set_ego` gives it its ego. Beyond its end the same plays again, or another one; see
             `Scenario.repeats`.
         rigs: The sensors, by the name under which `Observation.clouds` has their points.
         reference_sensor: The reference sensor.
         seed: Seed of the traffic, of the reference sensor, and of noise and drop-out.
         frame_interval_s: Time between one step and the next, a multiple of the scenario's time step; that step if not given.
-        kept_bytes: What the worlds that are kept, in case they are needed again, may take; a small share of the
+        max_cached_bytes: What the worlds that are kept, in case they are needed again, may take; a small share of the
             machine's memory if not given.
-        within_m: Only points of the rigs that lie so near to one of the reference are asked for, as detections up to
+        search_radius_m: Only points of the rigs that lie so near to one of the reference are asked for, as detections up to
             this threshold do: rays that hit nothing there are not cast. Those points are the same to the bit.
         no_cache: Whether worlds that are drawn are built though they lie on disk from an earlier run, and are not kept
             there either; frames are the same to the bit.
@@ -94,53 +94,55 @@ class Simulator:
         *,
         seed: int = 0,
         frame_interval_s: float | None = None,
-        kept_bytes: float | None = None,
-        within_m: float | None = None,
+        max_cached_bytes: float | None = None,
+        search_radius_m: float | None = None,
         no_cache: bool = False,
         device: str | None = None,
     ) -> None:
         if seed < 0:
             raise ValueError(f"seed: a number >= 0 is needed; got {seed}")
-        self.scenario = scenario = with_ego(scenario, rigs)
+        self.scenario = scenario = set_ego(scenario, rigs)
         self.rigs = rigs
         self.reference_sensor = reference_sensor
         self.seed = seed
-        self.within_m = within_m
-        self._every_steps = 1 if frame_interval_s is None else scenario.steps_in(frame_interval_s)
-        self._stages = Stages(Scenes(scenario, seed, kept_bytes, no_cache=no_cache, device=device), rigs)
+        self.search_radius_m = search_radius_m
+        self._every_steps = 1 if frame_interval_s is None else scenario.count_time_steps(frame_interval_s)
+        self._stages = MountedRigStore(
+            SceneStore(scenario, seed, max_cached_bytes, no_cache=no_cache, device=device), rigs
+        )
         self._check_size()
 
     @property
     def frame_interval_s(self) -> float:
         """Time between one step and the next."""
-        return self._every_steps * self.scenario.step_s
+        return self._every_steps * self.scenario.effective_time_step_s
 
     @property
-    def distinct_steps(self) -> int | None:
+    def num_distinct_frames(self) -> int | None:
         """How many steps show an instant for the first time; all later ones repeat them. None: no step ever does."""
-        instants = self.scenario.instants
+        instants = self.scenario.num_distinct_time_steps
         return None if instants is None else instants // math.gcd(instants, self._every_steps)
 
-    def block_index(self, index: int) -> int:
+    def get_block_index(self, index: int) -> int:
         """The number by which standard errors tell a step from others; steps that share it are alike.
 
         Where each run has a world of its own, that is the number of the run: its steps share a city. In a scenario that
         repeats it is the instant, be it seen for the first time or again. Where there is a single instant only the
         reference sensor's draw differs, and every step has a number of its own.
         """
-        if self.scenario.instants == 1:
+        if self.scenario.num_distinct_time_steps == 1:
             return index
         run, step = self.scenario.locate(index * self._every_steps)
-        return step if self.scenario.repeats else run
+        return step if self.scenario.is_repeating else run
 
-    def with_reference_sensor(self, reference_sensor: ReferenceSensor) -> Self:
+    def replace_reference_sensor(self, reference_sensor: ReferenceSensor) -> Self:
         """The same instants as another reference sensor sees them; the geometry is built once for both."""
         other = copy.copy(self)
         other.reference_sensor = reference_sensor
         other._check_size()
         return other
 
-    def with_rigs(self, rigs: Mapping[str, Rig]) -> Self:
+    def replace_rigs(self, rigs: Mapping[str, Rig]) -> Self:
         """The same instants as other rigs see them, on the same ego; the geometry is built once for both.
 
         Args:
@@ -148,16 +150,18 @@ class Simulator:
         """
         other = copy.copy(self)
         other.rigs = rigs
-        other._stages = self._stages.with_rigs(rigs)
+        other._stages = self._stages.replace_rigs(rigs)
         other._check_size()
         return other
 
-    def scans(self, index: int, within: Balls | None = None) -> Mapping[str, Sequence[SensorScan]]:
+    def simulate_scans(
+        self, index: int, search_spheres: SearchSpheres | None = None
+    ) -> Mapping[str, Sequence[SensorScan]]:
         """What the sensors see at one step, as in `step`, bit for bit; the reference is not cast.
 
         Args:
             index: Number of the step, from 0.
-            within: What is asked about, as in `MountedSensor.scan`; everything if not given.
+            search_spheres: What is asked about, as in `MountedSensor.scan`; everything if not given.
 
         Returns:
             Name of each rig -> what each of its sensors saw.
@@ -173,10 +177,10 @@ class Simulator:
             >>> roof.rays, roof.points.dtype
             (230400, dtype('float32'))
         """
-        stage, instant = self.placed(index)
-        return self._scans(stage, instant, index, within)
+        stage, instant = self.prepare_frame(index)
+        return self._scans(stage, instant, index, search_spheres)
 
-    def step(self, index: int) -> Observation:
+    def simulate_frame(self, index: int) -> Observation:
         """What is seen at one step.
 
         Args:
@@ -187,11 +191,13 @@ class Simulator:
             ValueError: A negative index, a sensor inside a body or below the ground, an actor that overlaps the ego, an
                 ego below the ground.
         """
-        stage, instant = self.placed(index)
+        stage, instant = self.prepare_frame(index)
         generator, name = np.random.default_rng([self.seed, index]), f"{self.scenario.name} step {index}"
-        around = Surroundings(stage.scene, instant, generator, name, threads=torch.get_num_threads())
+        around = ReferenceContext(stage.scene_geometry, instant, generator, name, num_threads=torch.get_num_threads())
         reference = self.reference_sensor.scan(around)
-        within = None if self.within_m is None else Balls.around(reference.points, self.within_m)
+        within = (
+            None if self.search_radius_m is None else SearchSpheres.from_points(reference.points, self.search_radius_m)
+        )
         scans = self._scans(stage, instant, index, within)
         of_all_rigs = [scan for of_rig in scans.values() for scan in of_rig]
         return Observation(
@@ -199,18 +205,18 @@ class Simulator:
             reference=reference.points,
             reference_weights=reference.weights,
             reference_heights_m=reference.heights_m,
-            drawn=reference.drawn,
+            sampled_point_counts=reference.sampled_point_counts,
             counts={
-                **_counts_of(stage.scene, instant, of_all_rigs, reference),
-                "repeated_frames": int(self.distinct_steps is not None and index >= self.distinct_steps),
+                **_counts_of(stage.scene_geometry, instant, of_all_rigs, reference),
+                "repeated_frames": int(self.num_distinct_frames is not None and index >= self.num_distinct_frames),
             },
         )
 
-    def check_run(self, steps: int) -> None:
+    def check_run(self, num_frames: int) -> None:
         """Refuse before its first step what a run through a world that repeats would end with; others come as they are.
 
         Args:
-            steps: How many steps the run has.
+            num_frames: How many steps the run has.
 
         Raises:
             ValueError: A sensor that is where none can be at the first step, an actor that overlaps the ego at any.
@@ -221,17 +227,17 @@ class Simulator:
         """
         if self.scenario.traffic is not None:
             self.scenario.traffic.check()
-        if self.scenario.repeats:
+        if self.scenario.is_repeating:
             stage, _ = self._stage(0)
-            world_steps = stage.scene.world.steps
-            indices = np.arange(min(steps, world_steps), dtype=np.int64)  # then they repeat themselves
+            world_steps = stage.scene_geometry.scene.num_time_steps
+            indices = np.arange(min(num_frames, world_steps), dtype=np.int64)  # then they repeat themselves
             seen = np.unique(indices * self._every_steps % world_steps)
-            stage.scene.check_apart(seen)
-            stage.check_mounts(stage.scene.at(0))
-            warn_of_floating(self.scenario.name, stage.scene, seen)
+            stage.scene_geometry.check_overlaps(seen)
+            stage.check_mounts(stage.scene_geometry.get_snapshot(0))
+            warn_about_missing_ground(self.scenario.name, stage.scene_geometry, seen)
 
     @property
-    def ground_words(self) -> str:
+    def ground_note(self) -> str:
         """What is taken for the ground of a scenario that does not say it; no words if it does.
 
         Example:
@@ -239,10 +245,10 @@ class Simulator:
             >>> Simulator(Scenario.load("urban"), {}, PaperReference(rows=16, columns=16)).ground_words
             ''
         """
-        if self.scenario.says_ground:
+        if self.scenario.has_ground:
             return ""
         names = [body.name for body in self.scenario.bodies for _ in body.poses]
-        found = zip(names, self.scene_of(0)[0].is_ground, strict=True)
+        found = zip(names, self.get_scene_geometry(0)[0].ground_masks, strict=True)
         taken = dict.fromkeys(repr(name) for name, is_ground in found if is_ground.any())
         if not taken:
             return (
@@ -251,47 +257,47 @@ class Simulator:
         what = "level faces under the ego, and what is level and connected with them"
         return f"Ground: {what}, of {', '.join(taken)}; bodies with `ground: true` say it otherwise."
 
-    def labels(self, index: int) -> list[Label]:
+    def compute_labels(self, index: int) -> list[ObjectLabel]:
         """The objects within the reference sensor's range at one step; names are an object's own within a run."""
-        scene, step = self.scene_of(index)
-        return labels(scene.world, step, self.reference_sensor.max_range_m)
+        scene, step = self.get_scene_geometry(index)
+        return compute_labels(scene.scene, step, self.reference_sensor.max_range_m)
 
-    def bottom_heights_m(self, index: int, found: Sequence[Label]) -> Float32:
+    def compute_bottom_heights_m(self, index: int, labels: Sequence[ObjectLabel]) -> Float32:
         """(K,) height of the bottom of each label's box at a step above the highest ground below its centre."""
-        scene, step = self.scene_of(index)
-        world_T_vehicle = scene.world.ego.trajectory.interpolate(step * scene.world.time_step_s)
-        centres_m = np.array([label.centre_m for label in found]).reshape(-1, 3)
-        halves_m = np.array([label.size_m[2] / 2 for label in found], dtype=np.float32)
-        return scene.ground.heights_m(centres_m, world_T_vehicle) - halves_m
+        scene, step = self.get_scene_geometry(index)
+        world_T_vehicle = scene.scene.ego.trajectory.interpolate(step * scene.scene.time_step_s)
+        centres_m = np.array([label.center_m for label in labels]).reshape(-1, 3)
+        halves_m = np.array([label.size_m[2] / 2 for label in labels], dtype=np.float32)
+        return scene.ground.compute_heights_m(centres_m, world_T_vehicle) - halves_m
 
-    def scene_of(self, index: int) -> tuple[Scene, int]:
+    def get_scene_geometry(self, index: int) -> tuple[SceneGeometry, int]:
         """The geometry of the world in which a step plays, and the time step in it.
 
         It is built when first needed, once in each process for each run through the scenario.
         """
         stage, step = self._stage(index)
-        return stage.scene, step
+        return stage.scene_geometry, step
 
-    def run_of(self, index: int) -> int:
+    def get_run_index(self, index: int) -> int:
         """Which run through the scenario a step belongs to: each is a world of its own, unless it repeats."""
         return self.scenario.locate(index * self._every_steps)[0]
 
     def _check_size(self) -> None:
-        of_rigs = sum(sensor.rays for rig in self.rigs.values() for sensor in rig.sensors)
-        rays = of_rigs + self.reference_sensor.rays
-        check_fits(
-            f"{rays:,} rays a step ({of_rigs:,} of the rig's sensors, {self.reference_sensor.rays:,} of the reference)",
+        of_rigs = sum(sensor.num_rays for rig in self.rigs.values() for sensor in rig.sensors)
+        rays = of_rigs + self.reference_sensor.num_rays
+        check_memory_fits(
+            f"{rays:,} rays a step ({of_rigs:,} of the rig's sensors, {self.reference_sensor.num_rays:,} of the reference)",
             BYTES_PER_RAY * rays,
             "use fewer rays, rows or columns",
         )
 
-    def _stage(self, index: int) -> tuple[Stage, int]:
+    def _stage(self, index: int) -> tuple[MountedRigs, int]:
         if index < 0:
             raise ValueError(f"index: a number >= 0 is needed; got {index}")
         run, step = self.scenario.locate(index * self._every_steps)
-        return self._stages.of_run(run), step
+        return self._stages.get_mounted_rigs(run), step
 
-    def placed(self, index: int) -> tuple[Stage, Instant]:
+    def prepare_frame(self, index: int) -> tuple[MountedRigs, SceneSnapshot]:
         """The stage of a step, and all of it at its time, with no sensor where none can be.
 
         Args:
@@ -301,7 +307,7 @@ class Simulator:
             FileNotFoundError, ValueError: As for `step`.
         """
         stage, step = self._stage(index)
-        instant = stage.scene.at(step, within_m=self._reach_m(stage.scene.ego_box))
+        instant = stage.scene_geometry.get_snapshot(step, max_distance_m=self._reach_m(stage.scene_geometry.ego_box))
         stage.check_mounts(instant)
         return stage, instant
 
@@ -309,38 +315,46 @@ class Simulator:
         """How far from the origin of the vehicle frame a sensor can see: its range starts where it is mounted."""
         farthest_m = np.abs(ego.corners_m).max(axis=0) + self.reference_sensor.shell_m
         reaches = [
-            float(np.linalg.norm(sensor.mount.matrix()[:3, 3])) + self.scenario.reach_m(sensor)
+            float(np.linalg.norm(sensor.mount.to_matrix()[:3, 3])) + self.scenario.compute_max_range_m(sensor)
             for rig in self.rigs.values()
             for sensor in rig.sensors
         ]
         return max([float(np.linalg.norm(farthest_m)) + self.reference_sensor.max_range_m, *reaches])
 
-    def _scans(self, stage: Stage, instant: Instant, index: int, within: Balls | None) -> dict[str, list[SensorScan]]:
-        scans: dict[str, list[SensorScan]] = {name: [] for name in stage.mounted}
-        for name, sensors in stage.mounted.items():
+    def _scans(
+        self, stage: MountedRigs, instant: SceneSnapshot, index: int, within: SearchSpheres | None
+    ) -> dict[str, list[SensorScan]]:
+        scans: dict[str, list[SensorScan]] = {name: [] for name in stage.sensors_by_rig}
+        for name, sensors in stage.sensors_by_rig.items():
             for k, mounted in enumerate(sensors, 1):
-                draws = Draws(np.random.default_rng([self.seed, index, k]), rays=len(mounted.pixel_of_ray))
-                scans[name].append(mounted.scan(instant, draws, threads=torch.get_num_threads(), within=within))
+                draws = SensorNoise(
+                    np.random.default_rng([self.seed, index, k]), num_rays=len(mounted.ray_pixel_indices)
+                )
+                scans[name].append(
+                    mounted.scan(instant, draws, num_threads=torch.get_num_threads(), search_spheres=within)
+                )
         return scans
 
 
-def _counts_of(scene: Scene, instant: Instant, scans: Sequence[SensorScan], reference: ReferenceScan) -> dict[str, int]:
+def _counts_of(
+    scene: SceneGeometry, instant: SceneSnapshot, scans: Sequence[SensorScan], reference: ReferenceScan
+) -> dict[str, int]:
     """What the rays of all sensors and of the reference met, and what was left out, next to all that there was."""
-    rays, self_hits = sum(scan.rays for scan in scans), sum(scan.self_hits for scan in scans)
-    pairs = (rays + reference.rays) * len(instant.moving)
+    rays, self_hits = sum(scan.num_rays for scan in scans), sum(scan.self_hits for scan in scans)
+    pairs = (rays + reference.num_rays) * len(instant.moving_bodies)
     return {
         "sensor_rays": rays,
         "sensor_self_hits": self_hits,
-        "reference_rays": reference.rays,
+        "reference_rays": reference.num_rays,
         "reference_self_hits": reference.self_hits,
-        "reference_poses": reference.places + reference.redrawn,
-        "reference_poses_resampled": reference.redrawn,
-        "moving_bodies": len(instant.moving) + instant.out_of_range,
-        "moving_bodies_out_of_range": instant.out_of_range,
-        "road_users_omitted": scene.world.left_out,
+        "reference_poses": reference.num_poses + reference.num_resampled_poses,
+        "reference_poses_resampled": reference.num_resampled_poses,
+        "moving_bodies": len(instant.moving_bodies) + instant.num_out_of_range,
+        "moving_bodies_out_of_range": instant.num_out_of_range,
+        "road_users_omitted": scene.scene.num_omitted_road_users,
         "ray_body_pairs": pairs,
-        "ray_body_pairs_omitted": pairs - reference.body_casts - sum(scan.body_casts for scan in scans),
-        "sensor_rays_reused": 0 if scene.moves else rays,
-        "sensor_rays_omitted": sum(scan.rays_spared for scan in scans),
-        "sensor_self_hits_reused": self_hits if scene.knows_self_hits else 0,
+        "ray_body_pairs_omitted": pairs - reference.num_body_casts - sum(scan.num_body_casts for scan in scans),
+        "sensor_rays_reused": 0 if scene.has_motion else rays,
+        "sensor_rays_omitted": sum(scan.num_omitted_rays for scan in scans),
+        "sensor_self_hits_reused": self_hits if scene.has_constant_self_hits else 0,
     }

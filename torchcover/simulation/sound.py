@@ -7,9 +7,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.geometry.arrays import Bools, Float64, Int64
-from torchcover.simulation.patches import edges_of, outward_by, outward_faces, surfaces_of
+from torchcover.simulation.patches import (
+    find_face_edges,
+    find_outward_faces,
+    find_outward_faces_from_edges,
+    label_surfaces,
+)
 from torchcover.simulation.raycaster import RayCaster
-from torchcover.simulation.shapes import Mesh, corners_of, normals_of, parts_of
+from torchcover.simulation.shapes import Mesh, compute_normals, get_corners_m, iterate_mesh_parts
 
 # Surfaces that are nearer to each other are one; nearer than the other, float32 cannot tell that they are two.
 COINCIDE_M = 1e-3
@@ -26,20 +31,20 @@ BODY_SHARE = 0.5
 MIXING = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], dtype=np.uint64)
 
 
-def told(owner: str, mesh: Mesh) -> Mesh:
+def check_mesh(owner: str, mesh: Mesh) -> Mesh:
     """A mesh with each face once, and warnings of what else is wrong with it.
 
     Warns:
         UserWarning: Faces that are there twice, neighbours whose normals disagree, or a body that is not closed.
     """
-    edge, way = edges_of(mesh)
+    edge, way = find_face_edges(mesh)
     once = _first_of_each(edge, way)
     if len(once) < len(mesh.faces):
         doubled = len(mesh.faces) - len(once)
         _warn(owner, f"{_share(doubled, len(mesh.faces))} of its faces are there more than once, and count once")
-        mesh = mesh.with_faces(once)
-        edge, way = edges_of(mesh)
-    surface = surfaces_of(edge)
+        mesh = mesh.select_faces(once)
+        edge, way = find_face_edges(mesh)
+    surface = label_surfaces(edge)
     faces = np.bincount(edge, weights=way != 0)
     turns = np.bincount(edge, weights=way)
     shared = faces == 2
@@ -61,19 +66,23 @@ def told(owner: str, mesh: Mesh) -> Mesh:
                 "only, though it looks like a body: rays pass through the holes, and nothing lies inside of it; close "
                 "it in a modelling tool",
             )
-    return mesh._replace(outward=outward_by(mesh, edge, way, surface))
+    return mesh._replace(is_outward=find_outward_faces_from_edges(mesh, edge, way, surface))
 
 
-def coincident_faces(meshes: Sequence[Mesh], within: Sequence[bool]) -> list[Bools]:
+def find_coincident_faces(meshes: Sequence[Mesh], allow_within_mesh: Sequence[bool]) -> list[Bools]:
     """Which faces coincide with another one that looks the same way, or may be seen from both sides, within 1 mm.
 
     Points of the faces are asked; of two surfaces that cover each other in a small part only, that may be overlooked.
-    Meshes never move and are near the origin; `within` says of each whether its faces may coincide with each other,
+    Meshes never move and are near the origin; `allow_within_mesh` says of each whether its faces may coincide with each other,
     too, as of parts of a vehicle that end in one plane. One (F,) mask for each.
     """
-    outward = np.concatenate([outward_faces(mesh) for mesh in meshes])
+    outward = np.concatenate([find_outward_faces(mesh) for mesh in meshes])
     number = np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes])
-    found, layer, in_itself = np.zeros(len(number), dtype=bool), _layers(meshes), np.array(within, dtype=bool)
+    found, layer, in_itself = (
+        np.zeros(len(number), dtype=bool),
+        _layers(meshes),
+        np.array(allow_within_mesh, dtype=bool),
+    )
     layers = [
         (
             which,
@@ -82,12 +91,12 @@ def coincident_faces(meshes: Sequence[Mesh], within: Sequence[bool]) -> list[Boo
         )
         for which in range(layer.max() + 1)
     ]
-    for part, corners_m in parts_of(meshes):
-        has_area = normals_of(corners_m).any(axis=0)
+    for part, corners_m in iterate_mesh_parts(meshes):
+        has_area = compute_normals(corners_m).any(axis=0)
         is_long = np.linalg.norm(corners_m - corners_m[[2, 0, 1]], axis=1).max(axis=0) > LONG_M
         for some, points in ((has_area & ~is_long, SIDE_POINTS), (has_area & is_long, LONG_SIDE_POINTS)):
             faces, corners = part.start + np.flatnonzero(some), corners_m[..., some]
-            normals = normals_of(corners).T
+            normals = compute_normals(corners).T
             for shares in _inner_points(points) if len(faces) else ():
                 places_m, inner, rows = np.tensordot(shares, corners, 1).T, in_itself[number[faces]], []
                 for which, caster, of_layer in layers:
@@ -97,13 +106,13 @@ def coincident_faces(meshes: Sequence[Mesh], within: Sequence[bool]) -> list[Boo
                     for start_m, whose in ((UPON_M, ~own | inner), (-APART_M, own & inner)):
                         asked = np.flatnonzero(whose)
                         starts_m, towards = places_m[asked] + start_m * normals[asked], -normals[asked]
-                        met = caster.faces_met(starts_m, towards, UPON_M + max(start_m, -COINCIDE_M / 2))
+                        met = caster.find_first_faces(starts_m, towards, UPON_M + max(start_m, -COINCIDE_M / 2))
                         hit = met >= 0
                         rows.append((asked[hit], of_layer[met[hit]]))
                 asked, two = np.concatenate(rows, axis=1)
                 others = two != faces[asked]
                 asked, one, two = asked[others], faces[asked[others]], two[others]
-                upon = normals[asked], normals_of(corners_of(meshes, two)).T
+                upon = normals[asked], compute_normals(get_corners_m(meshes, two)).T
                 cosine = (upon[0] * upon[1]).sum(axis=1)
                 alike, opposite = cosine > ALIKE, cosine < -ALIKE
                 # Nobody sees a bottom that stands on a sheet, nor what coincides with it there.
@@ -131,11 +140,11 @@ def _layers(meshes: Sequence[Mesh]) -> Int64:
     return layers
 
 
-def warn_of_coincidence(names: Sequence[str], coincident: Sequence[Bools]) -> None:
+def warn_about_coincident_faces(names: Sequence[str], coincident_masks: Sequence[Bools]) -> None:
     """Warn of bodies whose surfaces coincide with others."""
     shares = {
         name: f"{name!r} ({_share(int(mask.sum()), len(mask))} of the faces)"
-        for name, mask in zip(names, coincident, strict=True)
+        for name, mask in zip(names, coincident_masks, strict=True)
         if mask.any()
     }
     if shares:
@@ -160,7 +169,7 @@ def _first_of_each(edge: Int64, way: NDArray[np.int8]) -> Int64:
 def _encloses(mesh: Mesh, surface: Int64) -> Bools:
     """(F,) whether the surface of that number looks like a body: its normals point to all sides."""
     normals = np.empty((3, len(mesh.faces)))
-    for part, (first, second, third) in mesh.parts():
+    for part, (first, second, third) in mesh.iterate_parts():
         normals[:, part] = np.cross(second - first, third - first, axis=0)
     sums = np.stack([np.bincount(surface, axis, minlength=len(mesh.faces)) for axis in normals])
     area = np.bincount(surface, np.linalg.norm(normals, axis=0), minlength=len(mesh.faces))

@@ -12,10 +12,15 @@ from torchcover.geometry import BoundingBox, build_transform
 from torchcover.geometry.arrays import Bools, Float32, Float64, Int32, Int64
 from torchcover.simulation.local_ground import SLACK_M as HEIGHT_SLACK_M
 from torchcover.simulation.local_ground import TOLERANCE_M
-from torchcover.simulation.patches import Bounds, Patches
-from torchcover.simulation.reference_sensor import ReferenceScan, Surroundings, check_reach, position_in_shell
-from torchcover.simulation.regions_of_interest import DEFAULT_BAND_FRAME, Areas, Asked, Bands
-from torchcover.simulation.sight import Sight, sight
+from torchcover.simulation.patches import Patches, UprightBoxes
+from torchcover.simulation.reference_sensor import (
+    ReferenceContext,
+    ReferenceScan,
+    check_ranges,
+    sample_position_in_shell,
+)
+from torchcover.simulation.regions_of_interest import DEFAULT_BAND_FRAME, Areas, Bands, QueryPlan
+from torchcover.simulation.sight import Visibility, compute_visibility
 from torchcover.simulation.sound import UPON_M
 
 # Patches are looked up with this much to spare: drawn points are rounded to float32.
@@ -30,36 +35,36 @@ class SurfacePoints(NamedTuple):
     """K points of a surface.
 
     `points_m` (K, 3) where; `heights_m` (K,) above what bands are measured from; `normals` (K, 3) of length one on the
-    side from which they are looked at; `per_m2` (K,) how many points a square metre was given there, from all strata
-    together; `of_object` (K,) number of the object that they are on, -1 for none; `face` (1, K) or (0, K) as in
+    side from which they are looked at; `density_per_m2` (K,) how many points a square metre was given there, from all strata
+    together; `object_indices` (K,) number of the object that they are on, -1 for none; `coincident_faces` (1, K) or (0, K) as in
     `Patches`.
     """
 
     points_m: Float32
     heights_m: Float32
     normals: Float32
-    per_m2: Float64
-    of_object: Int32
-    face: Int32
+    density_per_m2: Float64
+    object_indices: Int32
+    coincident_faces: Int32
 
-    def some(self, which: Bools) -> Self:
+    def select(self, mask: Bools) -> Self:
         """Those of them for which (K,) is true."""
-        turned = self._replace(face=self.face.T)
-        some = type(self)._make(part[which] for part in turned)
-        return some._replace(face=some.face.T)
+        turned = self._replace(coincident_faces=self.coincident_faces.T)
+        some = type(self)._make(part[mask] for part in turned)
+        return some._replace(coincident_faces=some.coincident_faces.T)
 
-    def joined(self, others: "SurfacePoints") -> "SurfacePoints":
+    def concatenate(self, other_points: "SurfacePoints") -> "SurfacePoints":
         """These and others, one after the other."""
-        rows = max(len(self.face), len(others.face))
-        faces = [np.full((rows, len(part.points_m)), -1, dtype=np.int32) for part in (self, others)]
-        for face, part in zip(faces, (self, others), strict=True):
-            face[: len(part.face)] = part.face
+        rows = max(len(self.coincident_faces), len(other_points.coincident_faces))
+        faces = [np.full((rows, len(part.points_m)), -1, dtype=np.int32) for part in (self, other_points)]
+        for face, part in zip(faces, (self, other_points), strict=True):
+            face[: len(part.coincident_faces)] = part.coincident_faces
         return SurfacePoints(
-            np.concatenate([self.points_m, others.points_m]),
-            np.concatenate([self.heights_m, others.heights_m]),
-            np.concatenate([self.normals, others.normals]),
-            np.concatenate([self.per_m2, others.per_m2]),
-            np.concatenate([self.of_object, others.of_object]),
+            np.concatenate([self.points_m, other_points.points_m]),
+            np.concatenate([self.heights_m, other_points.heights_m]),
+            np.concatenate([self.normals, other_points.normals]),
+            np.concatenate([self.density_per_m2, other_points.density_per_m2]),
+            np.concatenate([self.object_indices, other_points.object_indices]),
             np.concatenate(faces, axis=1),
         )
 
@@ -70,21 +75,21 @@ class Stratum(NamedTuple):
     All three are (K,).
     """
 
-    patch: Int64
-    m2: Float64
-    inside_m2: Float64
+    patch_indices: Int64
+    area_m2: Float64
+    inside_area_m2: Float64
 
 
-class Objects(NamedTuple):
-    """The patches that belong to objects: `patch` (K,) numbers, object by object; `m2` (K,) their areas.
+class ObjectPatches(NamedTuple):
+    """The patches that belong to objects: `patch_indices` (K,) numbers, object by object; `area_m2` (K,) their areas.
 
-    `number` (J,) of each object, and `first` (J,) of its patches among these.
+    `object_indices` (J,) of each object, and `first_positions` (J,) of its patches among these.
     """
 
-    patch: Int64
-    m2: Float64
-    number: Int32
-    first: Int64
+    patch_indices: Int64
+    area_m2: Float64
+    object_indices: Int32
+    first_positions: Int64
 
 
 class SurfaceStrata:
@@ -94,7 +99,9 @@ class SurfaceStrata:
     points, (K,), NaN for none, as `Patches.heights_m` are, or about z if it is not given.
     """
 
-    def __init__(self, patches: Patches, boxes: Bounds, heights_m: Callable[[Float32], Float32] | None = None) -> None:
+    def __init__(
+        self, patches: Patches, boxes: UprightBoxes, heights_m: Callable[[Float32], Float32] | None = None
+    ) -> None:
         self._patches = patches
         self._boxes = boxes
         self._heights_m = heights_m
@@ -104,26 +111,26 @@ class SurfaceStrata:
         self._plane_m = (self._normals * patches.corner_m).sum(axis=0)
         lower_m, upper_m = patches.lower_m - np.float32(SLACK_M), patches.upper_m + np.float32(SLACK_M)
         if heights_m is not None:
-            lower_m[2], upper_m[2] = patches.heights_m
+            lower_m[2], upper_m[2] = patches.height_bounds_m
         self._strata = _strata(twice_m2 / 2, lower_m, upper_m, boxes)
-        self._objects = _objects(patches.of_object, twice_m2 / 2)
+        self._objects = _objects(patches.object_indices, twice_m2 / 2)
 
-    def draw(
-        self, place_m: Float64, each: float, generator: np.random.Generator, *, on_objects: int = 0
+    def sample_points(
+        self, position_m: Float64, points_per_box: float, rng: np.random.Generator, *, points_per_object: int = 0
     ) -> SurfacePoints:
-        """Points on patches that a place is in front of, about `each` a box; below 1, one with that probability.
+        """Points on patches that a place is in front of, about `points_per_box` a box; below 1, one with that probability.
 
-        Each object gets `on_objects` more, wherever it is. One that turns no face to the place gets them on the outer
+        Each object gets `points_per_object` more, wherever it is. One that turns no face to the place gets them on the outer
         side of all its faces, which hide them.
         """
-        x, y, z = place_m.tolist()
+        x, y, z = position_m.tolist()
         height_m = x * self._normals[0] + y * self._normals[1] + z * self._normals[2] - self._plane_m
-        front = (height_m > 0) | (~self._patches.outward & (height_m < 0))
-        drawn = [_drawn(stratum, front, each, generator) for stratum in self._strata]
+        front = (height_m > 0) | (~self._patches.is_outward & (height_m < 0))
+        drawn = [_drawn(stratum, front, points_per_box, rng) for stratum in self._strata]
         number = np.repeat(np.arange(len(drawn)), [len(patch) for patch, _ in drawn])
-        of_objects, object_per_m2 = _drawn_on_objects(self._objects, front, on_objects, generator)
+        of_objects, object_per_m2 = _drawn_on_objects(self._objects, front, points_per_object, rng)
         patch = np.concatenate([*(patch for patch, _ in drawn), of_objects])
-        points_m = self._points(patch, generator)
+        points_m = self._points(patch, rng)
         heights_m = self._heights_of(points_m, patch)
         placed_m = points_m[0], points_m[1], heights_m
         inside = np.stack([_inside(placed_m, low, high) for low, high in zip(*self._boxes, strict=True)])
@@ -132,16 +139,16 @@ class SurfaceStrata:
         inside[:, no_ground] = self._in_areas(points_m[:2, no_ground])
         kept = np.ones(len(patch), dtype=bool)
         kept[: len(number)] = inside[number, np.arange(len(number))]
-        patch, of_object = patch[kept], self._patches.of_object[patch[kept]]
+        patch, of_object = patch[kept], self._patches.object_indices[patch[kept]]
         # A face of something closed is looked at from its outer side only, whatever side the place is on.
-        side = np.where(self._patches.outward[patch], np.float32(1), np.sign(height_m[patch]))
+        side = np.where(self._patches.is_outward[patch], np.float32(1), np.sign(height_m[patch]))
         return SurfacePoints(
             np.ascontiguousarray(points_m[:, kept].T),
             heights_m[kept],
             (self._normals[:, patch] * side).T,
             np.array([density for _, density in drawn]) @ inside[:, kept] + object_per_m2[of_object],
             of_object,
-            self._patches.face.take(patch, axis=1),
+            self._patches.coincident_faces.take(patch, axis=1),
         )
 
     def _in_areas(self, places_m: Float32) -> Bools:
@@ -153,7 +160,9 @@ class SurfaceStrata:
         """(K,) what the third bounds of the boxes are about, of (3, K) points on the patches."""
         if self._heights_m is None:
             return np.asarray(points_m[2])
-        asked = np.flatnonzero(self._patches.heights_m[1].take(patch) > HEIGHT_SLACK_M)  # the others are the ground
+        asked = np.flatnonzero(
+            self._patches.height_bounds_m[1].take(patch) > HEIGHT_SLACK_M
+        )  # the others are the ground
         heights_m = np.zeros(len(patch), dtype=np.float32)
         heights_m[asked] = self._heights_m(points_m.take(asked, axis=1).T)
         return heights_m
@@ -164,8 +173,8 @@ class SurfaceStrata:
         a, b = ((start + np.arange(len(patch)) * np.array(PLANE_STEPS)[:, None]) % 1).astype(np.float32)
         beyond = a + b > 1
         a, b = np.where(beyond, 1 - a, a), np.where(beyond, 1 - b, b)
-        taken = self._patches.taken(patch)
-        return np.asarray(taken.corner_m + a * taken.first_m + b * taken.second_m)
+        taken = self._patches.select(patch)
+        return np.asarray(taken.corner_m + a * taken.first_edge_m + b * taken.second_edge_m)
 
 
 def _inside(placed_m: Sequence[Float32] | Float32, low: Float64, high: Float64) -> Bools:
@@ -175,7 +184,7 @@ def _inside(placed_m: Sequence[Float32] | Float32, low: Float64, high: Float64) 
     return inside
 
 
-def _strata(m2: Float32, lower_m: Float32, upper_m: Float32, boxes: Bounds) -> list[Stratum]:
+def _strata(m2: Float32, lower_m: Float32, upper_m: Float32, boxes: UprightBoxes) -> list[Stratum]:
     # What lies in an area, whatever its height, and how much of it: several bands ask about it.
     above: dict[bytes, tuple[Int64, Float32, Float32]] = {}
     strata = []
@@ -204,12 +213,12 @@ def _share(from_m: Float32, to_m: Float32, low: float, high: float) -> Float32:
 
 def _drawn(stratum: Stratum, front: Bools, each: float, generator: np.random.Generator) -> tuple[Int64, float]:
     """Patches, drawn by their area so that about `each` points lie in the stratum, and points per square metre."""
-    seen = front.take(stratum.patch)
-    up_to_m2 = np.cumsum(stratum.m2 * seen)
+    seen = front.take(stratum.patch_indices)
+    up_to_m2 = np.cumsum(stratum.area_m2 * seen)
     whole_m2 = float(up_to_m2[-1]) if len(up_to_m2) else 0.0
     if whole_m2 == 0:
         return np.empty(0, dtype=np.int64), 0.0
-    inside_m2 = max(float((stratum.inside_m2 * seen).sum()), whole_m2 / MOST_DRAWN)
+    inside_m2 = max(float((stratum.inside_area_m2 * seen).sum()), whole_m2 / MOST_DRAWN)
     wanted = each * whole_m2 / inside_m2
     expected = float(round(wanted)) if wanted >= 1 else wanted
     count = int(expected + generator.random())
@@ -217,38 +226,38 @@ def _drawn(stratum: Stratum, front: Bools, each: float, generator: np.random.Gen
     at_m2 = (np.arange(count) + generator.random(count)) / max(count, 1) * whole_m2
     # Rounding must not take the last one beyond the end, where patches may follow that are not seen.
     number = np.searchsorted(up_to_m2, np.minimum(at_m2, np.nextafter(whole_m2, 0.0)), side="right")
-    return stratum.patch[number], expected / whole_m2
+    return stratum.patch_indices[number], expected / whole_m2
 
 
-def _objects(of_object: Int32, m2: Float32) -> Objects:
+def _objects(of_object: Int32, m2: Float32) -> ObjectPatches:
     patch = np.flatnonzero(of_object >= 0)
     patch = patch[np.argsort(of_object[patch], kind="stable")]
     number, first = np.unique(of_object[patch], return_index=True)
-    return Objects(patch, m2[patch].astype(np.float64), number, first)
+    return ObjectPatches(patch, m2[patch].astype(np.float64), number, first)
 
 
 def _drawn_on_objects(
-    objects: Objects, front: Bools, each: int, generator: np.random.Generator
+    objects: ObjectPatches, front: Bools, each: int, generator: np.random.Generator
 ) -> tuple[Int64, Float64]:
     """Patches, `each` for every object, drawn by their area, and points per square metre by the object's number.
 
     The last density is for what is no object.
     """
-    per_m2 = np.zeros(objects.number.max(initial=-1) + 2)
-    if each == 0 or len(objects.number) == 0:
+    per_m2 = np.zeros(objects.object_indices.max(initial=-1) + 2)
+    if each == 0 or len(objects.object_indices) == 0:
         return np.empty(0, dtype=np.int64), per_m2
-    facing = front[objects.patch]
-    away = ~np.logical_or.reduceat(facing, objects.first)
-    facing |= away.repeat(np.diff(objects.first, append=len(facing)))
-    up_to_m2 = np.cumsum(objects.m2 * facing)
-    end_m2 = up_to_m2[np.append(objects.first[1:], len(facing)) - 1]
+    facing = front[objects.patch_indices]
+    away = ~np.logical_or.reduceat(facing, objects.first_positions)
+    facing |= away.repeat(np.diff(objects.first_positions, append=len(facing)))
+    up_to_m2 = np.cumsum(objects.area_m2 * facing)
+    end_m2 = up_to_m2[np.append(objects.first_positions[1:], len(facing)) - 1]
     start_m2 = np.append(0.0, end_m2[:-1])
-    per_m2[objects.number] = each / (end_m2 - start_m2)
+    per_m2[objects.object_indices] = each / (end_m2 - start_m2)
     # One in each of as many equal parts of the object's area; rounding must not take the last one to the next object.
     parts = (np.arange(each) + generator.random((len(end_m2), each))) / each
     at_m2 = start_m2[:, None] + parts * (end_m2 - start_m2)[:, None]
     at_m2 = np.minimum(at_m2, np.nextafter(end_m2, 0.0)[:, None])
-    return objects.patch[np.searchsorted(up_to_m2, at_m2.ravel(), side="right")], per_m2
+    return objects.patch_indices[np.searchsorted(up_to_m2, at_m2.ravel(), side="right")], per_m2
 
 
 DEFAULT_RAYS = 16_384
@@ -277,18 +286,18 @@ class SurfaceReference:
     Args:
         areas: Rectangles x, y in the vehicle frame in metres, ((x_low, x_high), (y_low, y_high)) each. They may
             overlap: small ones inside of large ones get more points.
-        rays: About how many rays there are in all, one for each point drawn.
-        places: How many places share the rays of a step.
+        num_rays: About how many rays there are in all, one for each point drawn.
+        num_poses: How many places share the rays of a step.
         bands_m: Height bands (low, high) in metres; half-open, as areas are. They may overlap too.
-        shell_m: Thickness of the shell around the ego in which the places are; `over_areas`, how far they lie from the
+        shell_m: Thickness of the shell around the ego in which the places are; `is_over_areas`, how far they lie from the
             ego at most.
         max_range_m: Farther points are not seen.
         band_frame: What heights are measured from: "ground", the local ground (`LocalGround`), or "vehicle", z = 0 of
             the vehicle frame.
-        object_points: How many more points at least are drawn on each object (`World.objects`) whose surface lies
+        points_per_object: How many more points at least are drawn on each object (`World.objects`) whose surface lies
             within that range of the places, in any area and at any height, from all places together; in addition to
-            `rays`.
-        over_areas: Whether the places are uniform over all areas instead, up to the height of the ego, as for a rig on
+            `num_rays`.
+        is_over_areas: Whether the places are uniform over all areas instead, up to the height of the ego, as for a rig on
             a mast: from there the shell sees the same as the rig, and what is hidden from both is in no number.
 
     Raises:
@@ -307,14 +316,14 @@ class SurfaceReference:
     has_area_weights: ClassVar[bool] = True
 
     areas: Areas
-    rays: int = DEFAULT_RAYS
-    places: int = 4
+    num_rays: int = DEFAULT_RAYS
+    num_poses: int = 4
     bands_m: Bands = tuple(PAPER_HEIGHTS.values())
     shell_m: float = 0.5
     max_range_m: float = 250.0
-    object_points: int = 0
+    points_per_object: int = 0
     band_frame: BandFrame = DEFAULT_BAND_FRAME
-    over_areas: bool = False
+    is_over_areas: bool = False
 
     def __post_init__(self) -> None:
         if not self.areas:
@@ -324,7 +333,7 @@ class SurfaceReference:
                 raise ValueError(f"areas: finite bounds, lower first, are needed; got {area}")
         if not self.bands_m or not all(-math.inf < low < high < math.inf for low, high in self.bands_m):
             raise ValueError(f"bands_m: at least one (low, high) with finite bounds is needed; got {self.bands_m}")
-        for name, least in (("rays", 1), ("places", 1), ("object_points", 0)):
+        for name, least in (("num_rays", 1), ("num_poses", 1), ("points_per_object", 0)):
             if getattr(self, name) < least:
                 raise ValueError(f"{name}: at least {least} is needed; got {getattr(self, name)}")
         if self.band_frame not in get_args(BandFrame):
@@ -332,104 +341,108 @@ class SurfaceReference:
         below = [band for band in self.bands_m if self.band_frame == "ground" and band[1] <= -TOLERANCE_M]
         if below:
             raise ValueError(f"bands_m: nothing is seen below the ground, and {below[0]} m lies there; use others")
-        check_reach(self.shell_m, self.max_range_m)
+        check_ranges(self.shell_m, self.max_range_m)
 
     @classmethod
-    def from_rays(cls, asked: Asked, rays: int | None) -> Self:
+    def from_query_plan(cls, query_plan: QueryPlan, num_rays: int | None) -> Self:
         """One that asks about some areas, with 16,384 rays if it is not told how many."""
-        rays = DEFAULT_RAYS if rays is None else rays
-        return cls(asked.areas, rays, bands_m=asked.bands_m, band_frame=asked.grid.band_frame)
+        num_rays = DEFAULT_RAYS if num_rays is None else num_rays
+        return cls(query_plan.areas, num_rays, bands_m=query_plan.bands_m, band_frame=query_plan.grid.band_frame)
 
-    def for_roadside(self) -> Self:
+    def extend_to_areas(self) -> Self:
         """The same sensor with places over all areas."""
-        return replace(self, over_areas=True, shell_m=float(np.hypot(*np.abs(self.areas).max(axis=(0, 2)))))
+        return replace(self, is_over_areas=True, shell_m=float(np.hypot(*np.abs(self.areas).max(axis=(0, 2)))))
 
-    def scan(self, surroundings: Surroundings) -> ReferenceScan:
+    def scan(self, context: ReferenceContext) -> ReferenceScan:
         """Draw points, and keep those that are seen; see `ReferenceSensor.scan`."""
         sides = np.array([(*area, band) for area in self.areas for band in self.bands_m], dtype=np.float64)
-        boxes = Bounds(*sides.transpose(2, 0, 1))
-        instant = surroundings.instant
+        boxes = UprightBoxes(*sides.transpose(2, 0, 1))
+        instant = context.snapshot
         # All places before the first point: they are the same for any number of rays.
-        drawn = [surroundings.free_pose(self._pose) for _ in range(self.places)]
+        drawn = [context.sample_free_pose(self._pose) for _ in range(self.num_poses)]
         places_m = [pose[:3, 3] for pose, _ in drawn]
         lower_m, upper_m = boxes.lower_m.min(axis=0), boxes.upper_m.max(axis=0)
         if self.band_frame == "vehicle":
-            surface, around, heights_m = surroundings.scene.surface(lower_m, upper_m), boxes, None
+            surface, around, heights_m = context.scene_geometry.get_surface(lower_m, upper_m), boxes, None
         else:
-            around, heights_m = self._at_any_height(boxes, surroundings.scene.ego_box), instant.heights_m
-            surface = surroundings.scene.surface(
+            around, heights_m = self._at_any_height(boxes, context.scene_geometry.ego_box), instant.compute_heights_m
+            surface = context.scene_geometry.get_surface(
                 around.lower_m.min(axis=0), around.upper_m.max(axis=0), (float(lower_m[2]), float(upper_m[2]))
             )
         # How near an object must come to the vehicle's origin to get points of its own.
         farthest_m = max(float(np.linalg.norm(place_m)) for place_m in places_m)
-        within_m = self.max_range_m + farthest_m if self.object_points else -math.inf
-        patches = surface.near(instant, around, within_m)
+        within_m = self.max_range_m + farthest_m if self.points_per_object else -math.inf
+        patches = surface.select_patches(instant, around, within_m)
         strata = SurfaceStrata(patches, boxes, heights_m)
-        pits = self._pits(surroundings, around) if self.band_frame == "ground" else None
+        pits = self._pits(context, around) if self.band_frame == "ground" else None
         above_m = max(ABOVE_M, ABOVE_SHARE * float(np.abs(instant.static_T_vehicle[:3, 3]).max()))
-        on_objects, looks = math.ceil(self.object_points / self.places), []
-        each = self.rays / (self.places * len(self.areas) * len(self.bands_m))
+        on_objects, looks = math.ceil(self.points_per_object / self.num_poses), []
+        each = self.num_rays / (self.num_poses * len(self.areas) * len(self.bands_m))
         for place_m in places_m:
-            found = strata.draw(place_m, each, surroundings.generator, on_objects=on_objects)
+            found = strata.sample_points(place_m, each, context.rng, points_per_object=on_objects)
             if pits is not None:
                 # Numbers of their own, so that those of the bands do not depend on pits.
-                of_pits = pits.draw(place_m, each, *surroundings.generator.spawn(1))
-                found = found.joined(of_pits._replace(heights_m=np.full_like(of_pits.heights_m, np.nan)))
-            found = _uncovered(found, surroundings)
+                of_pits = pits.sample_points(place_m, each, *context.rng.spawn(1))
+                found = found.concatenate(of_pits._replace(heights_m=np.full_like(of_pits.heights_m, np.nan)))
+            found = _uncovered(found, context)
             near = np.linalg.norm(found.points_m - place_m, axis=1) <= self.max_range_m
-            found = found if near.all() else found.some(near)
+            found = found if near.all() else found.select(near)
             targets_m = found.points_m + np.float32(above_m) * found.normals
-            looks.append((found, sight(instant, place_m, targets_m, threads=surroundings.threads)))
-        objects = len(surroundings.scene.world.objects)
+            looks.append((found, compute_visibility(instant, place_m, targets_m, num_threads=context.num_threads)))
+        objects = len(context.scene_geometry.scene.objects)
         return self._gathered(looks, objects, redrawn=sum(redrawn for _, redrawn in drawn))
 
-    def _pits(self, surroundings: Surroundings, around: Bounds) -> SurfaceStrata | None:
+    def _pits(self, surroundings: ReferenceContext, around: UprightBoxes) -> SurfaceStrata | None:
         """Prepare the surface that has no ground at or below it, a stratum for each area, if there is any."""
         lower_m, upper_m = around.lower_m.min(axis=0), around.upper_m.max(axis=0)
-        surface = surroundings.scene.surface_without_ground(lower_m, upper_m)
-        patches = surface.near(surroundings.instant, around)
-        return SurfaceStrata(patches, around) if len(patches.outward) else None
+        surface = surroundings.scene_geometry.get_surface_without_ground(lower_m, upper_m)
+        patches = surface.select_patches(surroundings.snapshot, around)
+        return SurfaceStrata(patches, around) if len(patches.is_outward) else None
 
-    def _at_any_height(self, boxes: Bounds, ego: BoundingBox) -> Bounds:
+    def _at_any_height(self, boxes: UprightBoxes, ego: BoundingBox) -> UprightBoxes:
         """The same areas, as far up and down in the vehicle frame as a point can be seen from a place."""
         reach_m = self.max_range_m + self.shell_m + float(np.abs(ego.corners_m).max())
         areas = np.unique(np.stack([boxes.lower_m[:, :2], boxes.upper_m[:, :2]], axis=1), axis=0)
         ends_m = np.broadcast_to(np.array([[[-reach_m], [reach_m]]]), (len(areas), 2, 1))
-        return Bounds(*np.concatenate([areas, ends_m], axis=2).swapaxes(0, 1))
+        return UprightBoxes(*np.concatenate([areas, ends_m], axis=2).swapaxes(0, 1))
 
     def _pose(self, ego: BoundingBox, generator: np.random.Generator) -> Float64:
-        if self.over_areas:
+        if self.is_over_areas:
             areas_m = np.array(self.areas)
             lower_m, upper_m = areas_m[:, :, 0].min(axis=0), areas_m[:, :, 1].max(axis=0)
             return build_transform(np.eye(3), generator.uniform([*lower_m, 0.0], [*upper_m, ego.upper_m[2]]))
-        return build_transform(np.eye(3), position_in_shell(ego, self.shell_m, generator))
+        return build_transform(np.eye(3), sample_position_in_shell(ego, self.shell_m, generator))
 
-    def _gathered(self, looks: list[tuple[SurfacePoints, Sight]], objects: int, redrawn: int) -> ReferenceScan:
+    def _gathered(self, looks: list[tuple[SurfacePoints, Visibility]], objects: int, redrawn: int) -> ReferenceScan:
         # One place stands for one of so many: every place's points are a surface of their own.
-        weights = [1.0 / (self.places * found.per_m2[look.seen]) for found, look in looks]
-        of_object = np.concatenate([found.of_object for found, _ in looks])
-        heights_m = np.concatenate([found.heights_m[look.seen] for found, look in looks])
+        weights = [1.0 / (self.num_poses * found.density_per_m2[look.is_visible]) for found, look in looks]
+        of_object = np.concatenate([found.object_indices for found, _ in looks])
+        heights_m = np.concatenate([found.heights_m[look.is_visible] for found, look in looks])
         return ReferenceScan(
-            points=np.concatenate([found.points_m[look.seen] for found, look in looks]),
+            points=np.concatenate([found.points_m[look.is_visible] for found, look in looks]),
             weights=np.concatenate(weights).astype(np.float32),
-            rays=sum(len(found.points_m) for found, _ in looks),
+            num_rays=sum(len(found.points_m) for found, _ in looks),
             self_hits=sum(look.self_hits for _, look in looks),
-            body_casts=sum(look.body_casts for _, look in looks),
-            redrawn=redrawn,
-            drawn=np.bincount(of_object[of_object >= 0], minlength=objects),
-            places=self.places,
+            num_body_casts=sum(look.num_body_casts for _, look in looks),
+            num_resampled_poses=redrawn,
+            sampled_point_counts=np.bincount(of_object[of_object >= 0], minlength=objects),
+            num_poses=self.num_poses,
             heights_m=heights_m if self.band_frame == "ground" else None,
         )
 
 
-def _uncovered(found: SurfacePoints, surroundings: Surroundings) -> SurfacePoints:
+def _uncovered(found: SurfacePoints, surroundings: ReferenceContext) -> SurfacePoints:
     """The points but those whose face is not the first from above of faces that coincide."""
-    asked = np.flatnonzero(found.face[0] >= 0) if len(found.face) else np.empty(0, dtype=np.int64)
+    asked = (
+        np.flatnonzero(found.coincident_faces[0] >= 0) if len(found.coincident_faces) else np.empty(0, dtype=np.int64)
+    )
     if len(asked) == 0:
         return found
     uncovered = np.ones(len(found.points_m), dtype=bool)
-    first = surroundings.instant.first_faces(found.points_m[asked], found.normals[asked], UPON_M)
+    first = surroundings.snapshot.find_first_faces(found.points_m[asked], found.normals[asked], UPON_M)
     # Between two faces of one surface rounding decides; these are not covered by another.
-    coincident = np.concatenate(surroundings.scene.coincident)
-    uncovered[asked] = (first == found.face[0, asked]) | (first < 0) | ~np.isin(first, coincident[coincident >= 0])
-    return found.some(uncovered)
+    coincident = np.concatenate(surroundings.scene_geometry.coincident_faces)
+    uncovered[asked] = (
+        (first == found.coincident_faces[0, asked]) | (first < 0) | ~np.isin(first, coincident[coincident >= 0])
+    )
+    return found.select(uncovered)

@@ -15,10 +15,10 @@ from torchcover.files import AtomicOutput, guard_reader, parse_xml, to_yaml
 from torchcover.geometry import BoundingBox, build_transform, convert_quaternion_to_rotation
 from torchcover.geometry.arrays import Float64
 from torchcover.recordings.other_formats import find_remedy
-from torchcover.simulation.bodies import merge
-from torchcover.simulation.documents import explain
+from torchcover.simulation.bodies import merge_meshes
+from torchcover.simulation.documents import format_validation_error
 from torchcover.simulation.gazebo_sensors import PlacedSensor, read_numbers, read_pose, read_sensors
-from torchcover.simulation.instant import encloses
+from torchcover.simulation.instant import is_enclosed
 from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.rig import Rig
 from torchcover.simulation.sensor import Sensor
@@ -120,13 +120,13 @@ def read_robot(path: Path, packages: Mapping[str, str | Path] | None = None) -> 
     positions = _joint_positions(joints)
     base_T_link = _link_poses(links, joints, positions)
     meshes = _read_meshes(links, path, packages or {})
-    pieces = [mesh.moved(base_T_link[name]) for name, link in links.items() for mesh in _link_meshes(link, meshes)]
+    pieces = [mesh.transform(base_T_link[name]) for name, link in links.items() for mesh in _link_meshes(link, meshes)]
     if not pieces:
         raise ValueError("no link has a visual or collision geometry, so there is no body")
-    box = BoundingBox.from_points(merge(pieces).vertices_m)
+    box = BoundingBox.from_points(merge_meshes(pieces).vertices_m)
     middle_m = np.add(box.lower_m, box.upper_m) / 2
     vehicle_T_base = build_transform(np.eye(3), (-middle_m[0], -middle_m[1], -box.lower_m[2]))
-    pieces = [piece.moved(vehicle_T_base) for piece in pieces]
+    pieces = [piece.transform(vehicle_T_base) for piece in pieces]
     vehicle_T_frame = {"__model__": vehicle_T_base}
     for name, joint in joints.items():
         vehicle_T_frame[name] = vehicle_T_base @ base_T_link[_end(joint, "child")]
@@ -136,10 +136,10 @@ def read_robot(path: Path, packages: Mapping[str, str | Path] | None = None) -> 
     if left_out := len(pieces) - len(kept):
         notes.append(f"Left out: what sensors are built into, {left_out} of {len(pieces)} bodies.")
     notes += _note_limits(joints, positions)
-    body = merge(kept)
+    body = merge_meshes(kept)
     if sensors:
         notes += filter(None, [describe_self_hits(_mounted(sensors), body)])
-    return Robot(root.get("name", path.stem), body, [sensor.keys for sensor in sensors], notes)
+    return Robot(root.get("name", path.stem), body, [sensor.sensor_keys for sensor in sensors], notes)
 
 
 def _by_name(root: Element, tag: str) -> dict[str, Element]:
@@ -269,7 +269,7 @@ def _read_meshes(links: Mapping[str, Element], path: Path, packages: Mapping[str
             f"{len(missing)} of {len(files)} meshes are missing: {_list_first(missing)}. Name the folder of a ROS "
             "package: --package NAME=FOLDER"
         )
-    return {name: MeshFile(type="mesh", path=file).mesh() for name, file in files.items() if file is not None}
+    return {name: MeshFile(type="mesh", path=file).build_mesh() for name, file in files.items() if file is not None}
 
 
 def _find_mesh(name: str, path: Path, packages: Mapping[str, str | Path]) -> Path | None:
@@ -292,8 +292,8 @@ def _link_meshes(link: Element, meshes: Mapping[str, Mesh]) -> list[Mesh]:
             try:
                 mesh = _shape_mesh(shape, name, meshes)
             except ValidationError as error:
-                raise ValueError(f"link {name!r}: <{shape.tag}>: {explain(error)}") from error
-            shown.append(mesh.moved(read_pose(body.find("origin"))))
+                raise ValueError(f"link {name!r}: <{shape.tag}>: {format_validation_error(error)}") from error
+            shown.append(mesh.transform(read_pose(body.find("origin"))))
     return shown
 
 
@@ -306,33 +306,33 @@ def _shape_mesh(shape: Element, link: str, meshes: Mapping[str, Mesh]) -> Mesh:
         return mesh._replace(vertices_m=mesh.vertices_m * scale, faces=faces)
     if shape.tag == "box":
         x, y, height_m = read_numbers(shape.get("size"), 3, "box size")
-        return _centered(Box(type="box", size_m=(x, y, height_m)).mesh(), height_m)
+        return _centered(Box(type="box", size_m=(x, y, height_m)).build_mesh(), height_m)
     if shape.tag not in ("cylinder", "capsule", "sphere"):
         raise ValueError(
             f"link {link!r}: geometry <{shape.tag}> cannot be applied; use box, cylinder, capsule, sphere or mesh"
         )
     (radius_m,) = read_numbers(shape.get("radius"), 1, f"{shape.tag} radius")
-    ball = _centered(Ellipsoid(type="ellipsoid", size_m=(2 * radius_m,) * 3).mesh(), 2 * radius_m)
+    ball = _centered(Ellipsoid(type="ellipsoid", size_m=(2 * radius_m,) * 3).build_mesh(), 2 * radius_m)
     if shape.tag == "sphere":
         return ball
     (length_m,) = read_numbers(shape.get("length"), 1, f"{shape.tag} length")
-    tube = _centered(Cylinder(type="cylinder", radius_m=radius_m, height_m=length_m).mesh(), length_m)
+    tube = _centered(Cylinder(type="cylinder", radius_m=radius_m, height_m=length_m).build_mesh(), length_m)
     if shape.tag == "cylinder":
         return tube
     ends_m = (-length_m / 2, length_m / 2)
-    return merge([tube, *(ball.moved(build_transform(np.eye(3), (0.0, 0.0, end_m))) for end_m in ends_m)])
+    return merge_meshes([tube, *(ball.transform(build_transform(np.eye(3), (0.0, 0.0, end_m))) for end_m in ends_m)])
 
 
 def _centered(mesh: Mesh, height_m: float) -> Mesh:
-    return mesh.moved(build_transform(np.eye(3), (0.0, 0.0, -height_m / 2)))
+    return mesh.transform(build_transform(np.eye(3), (0.0, 0.0, -height_m / 2)))
 
 
 def _mounted(sensors: Sequence[PlacedSensor]) -> Sequence[Sensor]:
     """The sensors as those of a rig. ValueError: one that no rig can have, such as one with a range of 0."""
     try:
-        return Rig.model_validate({"name": "robot", "sensors": [sensor.keys for sensor in sensors]}).sensors
+        return Rig.model_validate({"name": "robot", "sensors": [sensor.sensor_keys for sensor in sensors]}).sensors
     except ValidationError as error:
-        raise ValueError(explain(error)) from error
+        raise ValueError(format_validation_error(error)) from error
 
 
 def _without_housings(pieces: Sequence[Mesh], sensors: Sequence[PlacedSensor]) -> list[Mesh]:
@@ -357,7 +357,7 @@ def _is_housing(piece: Mesh, sensor: PlacedSensor) -> bool:
     lower_m, upper_m = piece.vertices_m.min(axis=0), piece.vertices_m.max(axis=0)
     if not ((lower_m <= position_m) & (position_m <= upper_m)).all():
         return False
-    if encloses(RayCaster([piece]), position_m):
+    if is_enclosed(RayCaster([piece]), position_m):
         return True
     self_hits, rays = count_self_hits(_mounted([sensor])[0], piece)
     return self_hits >= HOUSING_SHARE * rays

@@ -30,45 +30,45 @@ class Actor:
 
 
 @dataclass(frozen=True, eq=False)
-class World:
+class Scene:
     """Everything there is, over time.
 
     Args:
-        static: Meshes in the world frame that never move.
+        static_meshes: Meshes in the world frame that never move.
         ego: The vehicle that carries the rig.
         actors: The others.
         time_step_s: Time between two frames.
         duration_s: Time after which the trajectories end.
-        parked: Objects that never move, of which there may be many.
-        ground: Numbers of the static meshes that one drives or walks on: their level faces are the ground. None if
+        static_actors: Objects that never move, of which there may be many.
+        ground_mesh_indices: Numbers of the static meshes that one drives or walks on: their level faces are the ground. None if
             that is not known: then `Scene.ground` finds it.
-        coincident: For each static mesh (F,) which of its faces lie within 1 mm of others, of which one counts; empty
+        coincident_masks: For each static mesh (F,) which of its faces lie within 1 mm of others, of which one counts; empty
             if none do.
-        left_out: How many more road users the source of the traffic had near the ego, where bodies cannot be.
+        num_omitted_road_users: How many more road users the source of the traffic had near the ego, where bodies cannot be.
     """
 
-    static: tuple[Mesh, ...]
+    static_meshes: tuple[Mesh, ...]
     ego: Actor
     actors: tuple[Actor, ...] = ()
     time_step_s: float = 0.1
     duration_s: float = 0.0
-    parked: tuple[Actor, ...] = ()
-    ground: tuple[int, ...] | None = None
-    coincident: tuple[Bools, ...] = ()
-    left_out: int = 0
+    static_actors: tuple[Actor, ...] = ()
+    ground_mesh_indices: tuple[int, ...] | None = None
+    coincident_masks: tuple[Bools, ...] = ()
+    num_omitted_road_users: int = 0
 
     @property
     def objects(self) -> tuple[Actor, ...]:
         """What may be recognised: the actors, then the parked. An object's number is its place in this order."""
-        return self.actors + self.parked
+        return self.actors + self.static_actors
 
     @property
-    def steps(self) -> int:
+    def num_time_steps(self) -> int:
         """Number of instants: at 0, one time step, two time steps, ... up to the duration."""
-        return steps_of(self.duration_s, self.time_step_s)
+        return count_time_steps(self.duration_s, self.time_step_s)
 
 
-def steps_of(duration_s: float, time_step_s: float) -> int:
+def count_time_steps(duration_s: float, time_step_s: float) -> int:
     """Number of instants from 0 to a duration, both included."""
     steps = duration_s / time_step_s
     if not steps < MAX_STEPS:
@@ -79,49 +79,49 @@ def steps_of(duration_s: float, time_step_s: float) -> int:
     return int(steps + 1e-9) + 1
 
 
-class Label(NamedTuple):
+class ObjectLabel(NamedTuple):
     """An object in the vehicle frame: the box of its body, its yaw, and its velocity over ground along x and y.
 
-    `number` is its place in `World.objects`.
+    `object_index` is its place in `World.objects`.
     """
 
-    number: int
+    object_index: int
     name: str
     category: str
-    centre_m: Matrix
+    center_m: Matrix
     size_m: tuple[float, float, float]
     yaw_rad: float
     velocity_mps: Matrix
 
 
-def labels(world: World, step: int, within_m: float) -> list[Label]:
+def compute_labels(scene: Scene, time_step_index: int, max_distance_m: float) -> list[ObjectLabel]:
     """All objects near the ego at one step, in the order of the world; the ego itself is left out.
 
     An object is near if the origin of its frame is, over ground. Boxes stand upright in the vehicle frame: a body that
     tilts against the ego by a degree leaves its box by a few centimetres.
     """
-    time_s = step * world.time_step_s
-    world_T_vehicle = world.ego.trajectory.interpolate(time_s)
+    time_s = time_step_index * scene.time_step_s
+    world_T_vehicle = scene.ego.trajectory.interpolate(time_s)
     vehicle_T_world = invert(world_T_vehicle)
     found, box_of = [], dict[int, BoundingBox]()  # actors of one kind share a mesh
-    for number, actor in enumerate(world.objects):
+    for number, actor in enumerate(scene.objects):
         position_m = actor.trajectory.interpolate_positions_m(np.array([time_s]))[0]
         # Not near, too, if absent: NaN.
-        if np.hypot(*(position_m - world_T_vehicle[:3, 3])[:2]) <= within_m:
+        if np.hypot(*(position_m - world_T_vehicle[:3, 3])[:2]) <= max_distance_m:
             if id(actor.mesh) not in box_of:
                 box_of[id(actor.mesh)] = BoundingBox.from_points(actor.mesh.vertices_m)
             found.append(_label(number, actor, box_of[id(actor.mesh)], vehicle_T_world, time_s))
     return found
 
 
-def _label(number: int, actor: Actor, box: BoundingBox, vehicle_T_world: Matrix, time_s: float) -> Label:
+def _label(number: int, actor: Actor, box: BoundingBox, vehicle_T_world: Matrix, time_s: float) -> ObjectLabel:
     vehicle_T_actor = vehicle_T_world @ actor.trajectory.interpolate(time_s)
     middle_m = (np.array(box.lower_m) + np.array(box.upper_m)) / 2
-    return Label(
+    return ObjectLabel(
         number,
         actor.name,
         actor.category,
-        centre_m=transform_points(vehicle_T_actor, middle_m[None])[0],
+        center_m=transform_points(vehicle_T_actor, middle_m[None])[0],
         size_m=box.size_m,
         yaw_rad=float(np.deg2rad(convert_rotation_to_euler(vehicle_T_actor[:3, :3])[0])),
         velocity_mps=(vehicle_T_world[:3, :3] @ actor.trajectory.compute_velocity_mps(time_s))[:2],

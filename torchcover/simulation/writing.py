@@ -103,9 +103,9 @@ def _setup(frames: SimulatedFrames) -> RecordingSetup:
     (rig,) = frames.rigs.values()
     return RecordingSetup(
         rig.name,
-        {sensor.name: sensor.mount.matrix() for sensor in rig.sensors},
+        {sensor.name: sensor.mount.to_matrix() for sensor in rig.sensors},
         [sensor.name for sensor in rig.sensors if isinstance(sensor, Lidar)],
-        frames.scenario.ego_box(),
+        frames.scenario.compute_ego_box(),
         frames.has_area_weights,
         frames.boxes,
     )
@@ -113,17 +113,21 @@ def _setup(frames: SimulatedFrames) -> RecordingSetup:
 
 def _step(frames: SimulatedFrames, index: int) -> FrameRecord:
     ((name, rig),) = frames.rigs.items()
-    seen = frames.simulator.step(index)
-    landed = [scan.points if scan.landed is None else scan.landed for scan in seen.scans[name]]
-    scene, step = frames.simulator.scene_of(index)
-    world = scene.world
-    played = round(index * frames.frame_interval_s / world.time_step_s) // world.steps if world.steps > 1 else 0
+    seen = frames.simulator.simulate_frame(index)
+    landed = [scan.points if scan.measured_points is None else scan.measured_points for scan in seen.scans[name]]
+    scene, step = frames.simulator.get_scene_geometry(index)
+    world = scene.scene
+    played = (
+        round(index * frames.frame_interval_s / world.time_step_s) // world.num_time_steps
+        if world.num_time_steps > 1
+        else 0
+    )
     return FrameRecord(
         _name(index),
         index * frames.frame_interval_s + played * APART_S,
         world.ego.trajectory.interpolate(step * world.time_step_s),
         {sensor.name: cloud for sensor, cloud in zip(rig.sensors, landed, strict=True)},
-        frames.frame_of(seen, index),
+        frames.build_frame(seen, index),
     )
 
 

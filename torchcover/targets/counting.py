@@ -9,16 +9,16 @@ from numpy.typing import NDArray
 
 from torchcover.geometry import BoundingBox, build_transform
 from torchcover.geometry.arrays import Bools, Float32, Float64, Int32, Int64
-from torchcover.simulation.instant import Instant, in_threads
-from torchcover.simulation.moving import Moving
-from torchcover.simulation.rays import outlines, rotate
-from torchcover.simulation.reference_sensor import Surroundings, position_in_shell
+from torchcover.simulation.instant import SceneSnapshot, run_in_threads
+from torchcover.simulation.moving import MovingBodies
+from torchcover.simulation.rays import compute_outlines, rotate
+from torchcover.simulation.reference_sensor import ReferenceContext, sample_position_in_shell
 from torchcover.simulation.rig import Rig
 from torchcover.simulation.scenario import Scenario
-from torchcover.simulation.scene import Scene
-from torchcover.simulation.sensor import Draws, RayHits
-from torchcover.simulation.sight import Ends, MountedSensor
-from torchcover.simulation.stage import Scenes, Stages
+from torchcover.simulation.scene import SceneGeometry
+from torchcover.simulation.sensor import RayHits, SensorNoise
+from torchcover.simulation.sight import MountedSensor, RayEnds
+from torchcover.simulation.stage import MountedRigStore, SceneStore
 from torchcover.targets.placing import blocked, ground_under, standing
 from torchcover.targets.surface import SAMPLES, Surface, Target
 
@@ -33,14 +33,14 @@ RIG = "rig"
 class SensorStep(NamedTuple):
     """One sensor at one step: where its rays end without a target, and the random numbers of each."""
 
-    ends: Ends
-    draws: Draws
+    ends: RayEnds
+    draws: SensorNoise
 
     @classmethod
-    def of_rig(cls, ends: Sequence[Ends], seed: int, step: int) -> "list[SensorStep]":
+    def of_rig(cls, ends: Sequence[RayEnds], seed: int, step: int) -> "list[SensorStep]":
         """The sensors of a rig, with the numbers of each ray: all places see the same rays err and drop out."""
         return [
-            cls(one, Draws(np.random.default_rng([seed, step, k]), rays=len(one.range_m)))
+            cls(one, SensorNoise(np.random.default_rng([seed, step, k]), num_rays=len(one.range_m)))
             for k, one in enumerate(ends, 1)
         ]
 
@@ -79,15 +79,17 @@ class Steps:
         self._scenario, self._target, self._surface, self._poses = scenario, target, surface, vehicle_T_target
         self._steps, self._every_steps, self._seed = steps, every_steps, seed
         self.places = max(1, -(-PLACES // steps))
-        self._stages = Stages(Scenes(scenario, seed), {RIG: rig})
-        sensor_reach_m = [float(np.linalg.norm(s.mount.matrix()[:3, 3])) + scenario.reach_m(s) for s in rig.sensors]
+        self._stages = MountedRigStore(SceneStore(scenario, seed), {RIG: rig})
+        sensor_reach_m = [
+            float(np.linalg.norm(s.mount.to_matrix()[:3, 3])) + scenario.compute_max_range_m(s) for s in rig.sensors
+        ]
         raster_reach_m = float(np.linalg.norm(vehicle_T_target[:, :3, 3], axis=1).max(initial=0.0))
         self._within_m = max([raster_reach_m + target.solid.reach_m, *sensor_reach_m])
 
     @property
     def mounted(self) -> Sequence[MountedSensor]:
         """The sensors; their rays are the same at every step."""
-        return self._stages.of_run(self._scenario.locate(0)[0]).mounted[RIG]
+        return self._stages.get_mounted_rigs(self._scenario.locate(0)[0]).sensors_by_rig[RIG]
 
     def __iter__(self) -> Iterator[Step]:
         """One after the other.
@@ -95,33 +97,35 @@ class Steps:
         FileNotFoundError: a mesh, vehicle or trajectory file is missing. ValueError: a sensor or an actor that is where
         none can be.
         """
-        resting: tuple[list[Ends], Float64, Bools] | None = None
+        resting: tuple[list[RayEnds], Float64, Bools] | None = None
         for index in range(self._steps):
             run, step = self._scenario.locate(index * self._every_steps)
-            stage = self._stages.of_run(run)
-            instant = stage.scene.at(step, within_m=self._within_m)
+            stage = self._stages.get_mounted_rigs(run)
+            instant = stage.scene_geometry.get_snapshot(step, max_distance_m=self._within_m)
             stage.check_mounts(instant)
             # Where nothing moves, the first answer holds.
             ends, ground_z_m, free = resting or (
-                [m.ends(instant) for m in stage.mounted[RIG]],
+                [m.compute_ray_ends(instant) for m in stage.sensors_by_rig[RIG]],
                 *free_places(instant, self._target, self._surface, self._poses),
             )
-            if not stage.scene.moves and self._scenario.repeats:
+            if not stage.scene_geometry.has_motion and self._scenario.is_repeating:
                 resting = ends, ground_z_m, free
-            visible = self._visible(stage.scene, instant, standing(self._poses, ground_z_m), index)
+            visible = self._visible(stage.scene_geometry, instant, standing(self._poses, ground_z_m), index)
             yield Step(SensorStep.of_rig(ends, self._seed, index), ground_z_m, free, visible)
 
-    def _visible(self, scene: Scene, instant: Instant, vehicle_T_target: Float64, index: int) -> NDArray[np.uint8]:
+    def _visible(
+        self, scene: SceneGeometry, instant: SceneSnapshot, vehicle_T_target: Float64, index: int
+    ) -> NDArray[np.uint8]:
         generator = np.random.default_rng([self._seed, index])
-        surroundings = Surroundings(
+        surroundings = ReferenceContext(
             scene, instant, generator, f"{self._scenario.name} step {index}", torch.get_num_threads()
         )
         seen = []
         for _ in range(self.places):
-            pose, _ = surroundings.free_pose(pose_in_shell)
+            pose, _ = surroundings.sample_free_pose(pose_in_shell)
             seen.append(
                 [
-                    self._surface.seen_from(pose[:3, 3], self._target, poses, instant, threads=surroundings.threads)
+                    self._surface.seen_from(pose[:3, 3], self._target, poses, instant, threads=surroundings.num_threads)
                     for poses in _chunks(vehicle_T_target)
                 ]
             )
@@ -130,18 +134,20 @@ class Steps:
         return np.stack([np.concatenate([none, *of_place]) for of_place in seen])
 
 
-def free_places(instant: Instant, target: Target, surface: Surface, vehicle_T_target: Float64) -> tuple[Float64, Bools]:
+def free_places(
+    instant: SceneSnapshot, target: Target, surface: Surface, vehicle_T_target: Float64
+) -> tuple[Float64, Bools]:
     """Where the ground is, 0 where there is none, and where there is some, with room for a target on it: (P,) each."""
     z_m = ground_under(instant, vehicle_T_target[:, :2, 3])
     there, z_m = np.isfinite(z_m), np.nan_to_num(z_m)
     upright = _chunks(standing(vehicle_T_target, z_m))
-    taken = [blocked(instant, target.solid.box, surface.points_m, some) for some in upright]
+    taken = [blocked(instant, target.solid.bounding_box, surface.points_m, some) for some in upright]
     return z_m, there & ~np.concatenate([np.empty(0, dtype=bool), *taken])
 
 
 def pose_in_shell(ego: BoundingBox, generator: np.random.Generator) -> Float64:
     """A (4, 4) random place of a reference sensor."""
-    return build_transform(np.eye(3), position_in_shell(ego, SHELL_M, generator))
+    return build_transform(np.eye(3), sample_position_in_shell(ego, SHELL_M, generator))
 
 
 def _chunks(poses: Float64) -> list[Float64]:
@@ -207,34 +213,34 @@ class Beams(NamedTuple):
     @classmethod
     def of(cls, mounted: MountedSensor) -> Self | None:
         """Those of a sensor; None if each ray is measured alone."""
-        beams = mounted.sensor.beams()
+        beams = mounted.sensor.compute_beam_indices()
         if beams is None:
             return None
-        of_ray = beams.ravel()[mounted.pixel_of_ray]
+        of_ray = beams.ravel()[mounted.ray_pixel_indices]
         first = np.concatenate([[0], np.cumsum(np.bincount(of_ray))])
         return cls(of_ray, np.argsort(of_ray, kind="stable"), first)
 
-    def filled(self, hits: RayHits, ends: Ends) -> tuple[RayHits, Int64]:
+    def filled(self, hits: RayHits, ends: RayEnds) -> tuple[RayHits, Int64]:
         """All hits of each beam in which a target has some, at each position.
 
         `hits`: N hits on the target, by ascending position and ray; `ends`: where the rays end without it. Returns M
         hits, by position, beam and ray, and (M,) which of the N each is, -1 if it is on something else.
         """
-        assert hits.place is not None  # the positions
+        assert hits.position_indices is not None  # the positions
         rays, beams = len(self.of_ray), len(self.first) - 1
-        place, beam = np.divmod(np.unique(hits.place * beams + self.of_ray[hits.ray]), beams)
+        place, beam = np.divmod(np.unique(hits.position_indices * beams + self.of_ray[hits.ray_indices]), beams)
         length = np.diff(self.first)[beam]
         begins = np.cumsum(length) - length
         ray = self.ray[np.arange(length.sum()) + (self.first[beam] - begins).repeat(length)]
         place = place.repeat(length)
-        number, asked = hits.place * rays + hits.ray, place * rays + ray
+        number, asked = hits.position_indices * rays + hits.ray_indices, place * rays + ray
         of_target = np.minimum(np.searchsorted(number, asked), len(number) - 1)
         of_target = np.where(number[of_target] == asked, of_target, -1)
         range_m = ends.range_m[ray]
         on_target = of_target >= 0
         range_m[on_target] = hits.range_m[of_target[on_target]]
         there = np.flatnonzero(on_target | ends.is_hit[ray])
-        return RayHits(ray[there], range_m[there], hits.pixel_of_ray, place[there]), of_target[there]
+        return RayHits(ray[there], range_m[there], hits.ray_pixel_indices, place[there]), of_target[there]
 
 
 def count(
@@ -264,7 +270,9 @@ def count(
             if on_ground is None or not np.array_equal(on_ground.placed.vehicle_T_part[:, 2, 3], z_m):
                 standing_there = standing(poses, z_m)
                 # No bodies of the scene: their numbers say so.
-                placed = Moving.placed([target.solid] * len(poses), standing_there, np.full(len(poses), -1))
+                placed = MovingBodies.from_geometries(
+                    [target.solid] * len(poses), standing_there, np.full(len(poses), -1)
+                )
                 met = [meetings(placed, *sensor) for sensor in zip(mounted, farthest_m, strict=True)]
                 near = [
                     surface.near(_in_target(sensor, some_met, standing_there), threshold_m)
@@ -275,21 +283,21 @@ def count(
             _count_step(sums, on_ground, mounted, beams, cut, hits, threshold_m)
         return sums
 
-    parts = in_threads(torch.get_num_threads(), count_some, range(0, max(len(vehicle_T_target), 1), CHUNK))
+    parts = run_in_threads(torch.get_num_threads(), count_some, range(0, max(len(vehicle_T_target), 1), CHUNK))
     return Sums._make(np.concatenate(column, axis=-1) for column in zip(*parts, strict=True))
 
 
-def meetings(placed: Moving, mounted: MountedSensor, farthest_m: Float32) -> Met:
+def meetings(placed: MovingBodies, mounted: MountedSensor, farthest_m: Float32) -> Met:
     """Where the rays of a sensor meet each of some bodies, were it alone, if no farther off than (rays,) ranges."""
     origin_m, vehicle_R_sensor = mounted.vehicle_T_sensor[:3, 3], mounted.vehicle_T_sensor[:3, :3]
-    bodies, first, parts = outlines(placed.corners_m, origin_m), 0, []
+    bodies, first, parts = compute_outlines(placed.box_corners_m, origin_m), 0, []
     for tile in mounted.tiles:
         rays = tile.directions.shape[1]
         directions = rotate(vehicle_R_sensor, tile.directions)
         limit_m = farthest_m[first : first + rays]
-        met, _ = placed.meetings(origin_m, vehicle_R_sensor, tile, directions, limit_m, bodies)
-        towards = directions.take(met.ray, axis=1).T
-        parts.append(Met(met.part, first + met.ray, met.range_m, met.triangle, towards))
+        met, _ = placed.find_body_hits(origin_m, vehicle_R_sensor, tile, directions, limit_m, bodies)
+        towards = directions.take(met.ray_indices, axis=1).T
+        parts.append(Met(met.part_indices, first + met.ray_indices, met.range_m, met.triangle_indices, towards))
         first += rays
     together = Met._make(np.concatenate(column) for column in zip(*parts, strict=True))
     # A ray that fills up the block of a tile is cast more than once.
@@ -303,7 +311,7 @@ class _OnGround(NamedTuple):
     `placed` has P bodies; `met` is by each sensor, and of that the points of the surface that are near: `near`.
     """
 
-    placed: Moving
+    placed: MovingBodies
     met: Sequence[Met]
     near: Sequence[NDArray[np.uint8]]
 
@@ -322,13 +330,13 @@ def _count_step(
     near = np.zeros((count, step.visible.shape[2]), dtype=np.uint8)
     for k, (sensor, one, seen) in enumerate(zip(mounted, there.met, step.sensors, strict=True)):
         measured = measured_points(sensor, beams[k], one, seen, there.placed, threshold_m)
-        points[k] = sensor.sensor.counts_as * np.bincount(one.position[measured], minlength=count)
+        points[k] = sensor.sensor.pixels_per_sample * np.bincount(one.position[measured], minlength=count)
         near |= _any_of_each(one.position[measured], there.near[k][measured], count)
     _add(sums, step, points, near, hits)
 
 
 def measured_points(
-    mounted: MountedSensor, beams: Beams | None, met: Met, seen: SensorStep, placed: Moving, within_m: float
+    mounted: MountedSensor, beams: Beams | None, met: Met, seen: SensorStep, placed: MovingBodies, within_m: float
 ) -> Int64:
     """Which of N meetings give a point that is no farther off along its ray, by position: nothing else is in the way.
 
@@ -338,9 +346,9 @@ def measured_points(
     hits = RayHits(
         met.ray[arrived],
         met.range_m[arrived],
-        mounted.pixel_of_ray,
+        mounted.ray_pixel_indices,
         met.position[arrived],
-        lambda: placed.struck(met.position[arrived], met.triangle[arrived], met.direction[arrived].T),
+        lambda: placed.compute_hit_attributes(met.position[arrived], met.triangle[arrived], met.direction[arrived].T),
         mounted.weather,
     )
     of_target = np.arange(len(arrived))

@@ -8,7 +8,7 @@ import numpy as np
 
 from torchcover.geometry import BoundingBox, find_overlaps
 from torchcover.geometry.arrays import Bools, Float64, Int64
-from torchcover.simulation.instant import Instant
+from torchcover.simulation.instant import SceneSnapshot
 
 MARGIN_M = 5.0
 SIDES = ("front", "rear", "left", "right")
@@ -168,7 +168,7 @@ def poses(positions_m: Float64, yaw_rad: Float64) -> Float64:
     return matrices
 
 
-def ground_under(instant: Instant, positions_m: Float64) -> Float64:
+def ground_under(instant: SceneSnapshot, positions_m: Float64) -> Float64:
     """(P,) z of the ground in the vehicle frame at (P, 2) places; NaN where there is none.
 
     Of several grounds above each other that counts which somebody walks on who comes from the vehicle: the highest that
@@ -178,7 +178,7 @@ def ground_under(instant: Instant, positions_m: Float64) -> Float64:
     z_m = NEAR_M + STEEPEST_WAY * away_m
     # The vertical of the world is not that of the vehicle: where the first look ends, a second one looks down.
     for _ in range(2):
-        z_m = z_m - instant.heights_m(np.column_stack([positions_m, z_m]))
+        z_m = z_m - instant.compute_heights_m(np.column_stack([positions_m, z_m]))
     # Rounding makes no slope.
     return np.where(np.abs(z_m) < LEVEL_M, 0.0, z_m)
 
@@ -196,22 +196,22 @@ def holding(box: BoundingBox, vehicle_T_target: Float64, place_m: Float64) -> Bo
     return np.asarray(((there_m > box.lower_m) & (there_m < box.upper_m)).all(axis=1))
 
 
-def blocked(instant: Instant, box: BoundingBox, samples_m: Float64, vehicle_T_target: Float64) -> Bools:
+def blocked(instant: SceneSnapshot, box: BoundingBox, samples_m: Float64, vehicle_T_target: Float64) -> Bools:
     """(P,) whether anything but the ego takes a target's room, (P, 4, 4) poses of its box.
 
     What moves does so with its box. Of what rests, its faces are asked: whether one lies between the middle of the
     target and one of (M, 3) points of its surface, or the middle is behind one. Kerbs of up to 0.2 m do not count.
     """
     taken = np.zeros(len(vehicle_T_target), dtype=bool)
-    moving, reach_m = instant.moving, float(np.linalg.norm(box.corners_m, axis=1).max())
-    away_m = np.linalg.norm(vehicle_T_target[:, None, :3, 3] - moving.centre_m, axis=2)
-    near = (away_m <= moving.radius_m + reach_m) & (moving.body != instant.ego)
+    moving, reach_m = instant.moving_bodies, float(np.linalg.norm(box.corners_m, axis=1).max())
+    away_m = np.linalg.norm(vehicle_T_target[:, None, :3, 3] - moving.center_m, axis=2)
+    near = (away_m <= moving.radius_m + reach_m) & (moving.body_indices != instant.ego_index)
     for k in np.flatnonzero(near.any(axis=0)).tolist():
-        taken[near[:, k]] |= find_overlaps(box, vehicle_T_target[near[:, k]], moving.corners_m[k])
+        taken[near[:, k]] |= find_overlaps(box, vehicle_T_target[near[:, k]], moving.box_corners_m[k])
     return taken | _meets_static(instant, box, samples_m, vehicle_T_target)
 
 
-def _meets_static(instant: Instant, box: BoundingBox, samples_m: Float64, vehicle_T_target: Float64) -> Bools:
+def _meets_static(instant: SceneSnapshot, box: BoundingBox, samples_m: Float64, vehicle_T_target: Float64) -> Bools:
     height_m = box.upper_m[2]
     middle_m = (np.array(box.lower_m) + np.array(box.upper_m)) / 2
     low_m = min(STEP_UP_M, height_m / 2)
@@ -224,13 +224,16 @@ def _meets_static(instant: Instant, box: BoundingBox, samples_m: Float64, vehicl
     length_m = np.tile(np.linalg.norm(ways_m, axis=1), len(starts_m))
     directions = (towards_m / length_m[:, None]).T.astype(np.float32)
     origins_m = starts_m.astype(np.float32).repeat(len(ways_m), axis=0)
-    hits = instant.static.cast_from_each(origins_m, directions, length_m.astype(np.float32))
-    met: Bools = (hits.body >= 0) & (hits.body != instant.ego)
+    hits = instant.static_caster.cast_from_each(origins_m, directions, length_m.astype(np.float32))
+    met: Bools = (hits.body_indices >= 0) & (hits.body_indices != instant.ego_index)
     up = np.zeros((3, len(starts_m)), dtype=np.float32)
     up[:] = (instant.static_T_vehicle[:3, 2])[:, None]
-    above = instant.static.cast_from_each(
+    above = instant.static_caster.cast_from_each(
         starts_m.astype(np.float32), up, np.full(len(starts_m), np.inf, dtype=np.float32)
     )
-    inside = above.body >= 0  # of something, perhaps
-    inside[inside] = [(instant.static.inside(place_m) != instant.ego).any() for place_m in starts_m[inside]]
+    inside = above.body_indices >= 0  # of something, perhaps
+    inside[inside] = [
+        (instant.static_caster.find_enclosing_bodies(place_m) != instant.ego_index).any()
+        for place_m in starts_m[inside]
+    ]
     return np.asarray(met.reshape(len(starts_m), -1).any(axis=1) | inside)

@@ -13,8 +13,8 @@ from torchcover.frames import Frame
 from torchcover.geometry import BoundingBox, find_overlaps
 from torchcover.geometry.arrays import Bools, Float64, Int64
 from torchcover.metrics import BlockedSums
-from torchcover.simulation.reference_sensor import Surroundings
-from torchcover.simulation.regions_of_interest import near_field
+from torchcover.simulation.reference_sensor import ReferenceContext
+from torchcover.simulation.regions_of_interest import build_near_field
 from torchcover.simulation.simulator import Simulator
 from torchcover.targets.counting import SensorStep, Step, count, free_places, pose_in_shell
 from torchcover.targets.placing import Raster, holding, poses, standing, yaws
@@ -51,8 +51,8 @@ class Probe(NamedTuple):
         at_m = Raster.around(vehicle, NEAR_FIELD_M).positions_m
         inside = np.stack([region.mask_points(*torch.from_numpy(at_m).T).numpy() for region in regions])
         region, place = inside.nonzero()
-        vehicle_T_body = poses(at_m[place], yaws("narrow", body.solid.box, vehicle, at_m[place]))
-        room = ~find_overlaps(body.solid.box, vehicle_T_body, vehicle.corners_m)
+        vehicle_T_body = poses(at_m[place], yaws("narrow", body.solid.bounding_box, vehicle, at_m[place]))
+        room = ~find_overlaps(body.solid.bounding_box, vehicle_T_body, vehicle.corners_m)
         cell = grid.find_cells(torch.from_numpy(vehicle_T_body[:, :3, 3].copy())).numpy()
         return cls(body, Surface.of(body), region, room, vehicle_T_body, cell)
 
@@ -97,8 +97,8 @@ class Probes(BlockedSums):
     def __init__(
         self, simulator: Simulator, bodies: Sequence[Target], blocks: int = 1, places: int = PLACES, every: int = EVERY
     ) -> None:
-        vehicle = simulator.scenario.ego_box()
-        regions, around = near_field(vehicle.outline_m), Raster.around(vehicle, NEAR_FIELD_M, MAP_CELL_M)
+        vehicle = simulator.scenario.compute_ego_box()
+        regions, around = build_near_field(vehicle.outline_m), Raster.around(vehicle, NEAR_FIELD_M, MAP_CELL_M)
         names, rigs = tuple(body.name for body in bodies), tuple(simulator.rigs)
         super().__init__(blocks, {"bodies": names, "regions": regions, "rigs": rigs, "blocks": blocks})
         self.simulator, self.places, self.every, self.regions = simulator, places, every, regions
@@ -118,19 +118,21 @@ class Probes(BlockedSums):
             return None
         simulator, index, seed = self.simulator, frame.index, self.simulator.seed
         generator = np.random.default_rng([seed, index, STREAM])
-        stage, instant = simulator.placed(index)
-        place_m = Surroundings(stage.scene, instant, generator, frame.name).free_pose(pose_in_shell)[0][:3, 3]
+        stage, instant = simulator.prepare_frame(index)
+        place_m = ReferenceContext(stage.scene_geometry, instant, generator, frame.name).sample_free_pose(
+            pose_in_shell
+        )[0][:3, 3]
         sums, cells = np.zeros(self.sums.shape[1:]), np.zeros(self.cells.shape)
-        ends = [[one.ends(instant) for one in mounted] for mounted in stage.mounted.values()]
+        ends = [[one.compute_ray_ends(instant) for one in mounted] for mounted in stage.sensors_by_rig.values()]
         for number, probe in enumerate(self.probes):
-            some, box = probe.some(self.places, generator), probe.body.solid.box
+            some, box = probe.some(self.places, generator), probe.body.solid.bounding_box
             vehicle_T_body = probe.vehicle_T_body[some]
             z_m, free = free_places(instant, probe.body, probe.surface, vehicle_T_body)
             np.add.at(sums[:, number, :, TRIED].T, probe.region[some], 1.0)
             some = some[room := free & probe.room[some]]
             vehicle_T_body, z_m = vehicle_T_body[room], z_m[room]
             visible = probe.surface.seen_from(place_m, probe.body, standing(vehicle_T_body, z_m), instant)
-            for rig, mounted in enumerate(stage.mounted.values()):
+            for rig, mounted in enumerate(stage.sensors_by_rig.values()):
                 held = np.any([holding(box, vehicle_T_body, one.vehicle_T_sensor[:3, 3]) for one in mounted], axis=0)
                 step = Step(SensorStep.of_rig(ends[rig], seed, index), z_m, ~held, visible[None])
                 seen = count(
@@ -140,7 +142,7 @@ class Probes(BlockedSums):
                 each = np.stack([np.zeros(len(some)), seen.steps, seen.seen, *m2], axis=1)
                 np.add.at(sums[rig, number], probe.region[some], each)
                 np.add.at(cells[rig, number], probe.cell[some], each[:, [FREE, SEEN]])
-        return StepProbes(simulator.block_index(index), torch.from_numpy(sums), torch.from_numpy(cells))
+        return StepProbes(simulator.get_block_index(index), torch.from_numpy(sums), torch.from_numpy(cells))
 
     def add_sums(self, step: StepProbes | None) -> None:
         """Add what `sums_of` gives."""

@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.geometry.arrays import Bools, Float64
-from torchcover.simulation.bodies import body_called, mover_mesh
-from torchcover.simulation.instant import ALL_AROUND_RAYS, Instant
-from torchcover.simulation.moving import Solid
-from torchcover.simulation.patches import outward_faces
+from torchcover.simulation.bodies import build_actor_mesh, create_body_shape
+from torchcover.simulation.instant import ALL_AROUND_RAYS, SceneSnapshot
+from torchcover.simulation.moving import BodyGeometry
+from torchcover.simulation.patches import find_outward_faces
 from torchcover.simulation.shapes import Mesh
-from torchcover.simulation.sight import SHORTER, sight
+from torchcover.simulation.sight import SHORTER, compute_visibility
 from torchcover.simulation.surface_reference import ABOVE_M, PLANE_STEPS
 
 # What people say -> the built-in body that is meant, whose name has its size.
@@ -39,9 +39,9 @@ class Target:
     mesh: Mesh
 
     @cached_property
-    def solid(self) -> Solid:
+    def solid(self) -> BodyGeometry:
         """Its geometry, to cast rays at."""
-        return Solid(self.mesh)
+        return BodyGeometry(self.mesh)
 
     def __getstate__(self) -> dict[str, object]:
         return {"name": self.name, "mesh": self.mesh}  # Embree's scenes cannot be pickled
@@ -49,7 +49,7 @@ class Target:
     @property
     def bottom_m(self) -> float:
         """Height of its lowest point above the ground, in meters."""
-        return self.solid.box.lower_m[2]
+        return self.solid.bounding_box.lower_m[2]
 
     @classmethod
     def load(cls, name_or_path: str | Path) -> Self:
@@ -62,7 +62,7 @@ class Target:
             ValueError: The file is neither a vehicle nor a mesh, or is flat.
         """
         name = TARGETS.get(str(name_or_path), str(name_or_path))
-        mesh = mover_mesh(f"target {name!r}", body_called(name), "target", keep_height=True)
+        mesh = build_actor_mesh(f"target {name!r}", create_body_shape(name), "target", keep_height=True)
         return cls(Path(name).stem if Path(name).suffix else name, mesh)
 
 
@@ -100,14 +100,14 @@ class Surface(NamedTuple):
         a, b = (np.arange(drawn) * np.array(PLANE_STEPS)[:, None] + 0.5) % 1
         a, b = np.where(a + b > 1, 1 - a, a)[:, None], np.where(a + b > 1, 1 - b, b)[:, None]
         points_m = (1 - a - b) * corners_m[face, 0] + a * corners_m[face, 1] + b * corners_m[face, 2]
-        normals, two_sided = across[face] / twice_m2[face][:, None], ~outward_faces(target.mesh)[face]
+        normals, two_sided = across[face] / twice_m2[face][:, None], ~find_outward_faces(target.mesh)[face]
         outer = np.flatnonzero(two_sided | ~_enclosed(target, points_m + ABOVE_M * normals))
         kept = outer[(np.arange(SAMPLES) + 0.5).astype(np.int64) * len(outer) // SAMPLES]
         m2_each = float(up_to[-1]) / 2 * len(outer) / drawn / SAMPLES
         return cls(points_m[kept], normals[kept], two_sided[kept], m2_each)
 
     def seen_from(
-        self, place_m: Float64, target: Target, vehicle_T_target: Float64, instant: Instant, *, threads: int = 1
+        self, place_m: Float64, target: Target, vehicle_T_target: Float64, instant: SceneSnapshot, *, threads: int = 1
     ) -> Bits:
         """(P, M / 8) bits: which of the points a (3,) place sees, the target itself and everything else in the way.
 
@@ -126,12 +126,14 @@ class Surface(NamedTuple):
             (ways_m / length_m[:, None]).T.astype(np.float32),
             (length_m * (1 - SHORTER)).astype(np.float32),
         )
-        open_ways = np.flatnonzero(hits.body < 0)
+        open_ways = np.flatnonzero(hits.body_indices < 0)
         position, sample = position[open_ways], sample[open_ways]
         in_vehicle_m = np.einsum("nij,nj->ni", vehicle_T_target[position, :3, :3], ends_m[open_ways])
         in_vehicle_m += vehicle_T_target[position, :3, 3]
         seen = np.zeros((len(vehicle_T_target), SAMPLES), dtype=bool)
-        seen[position, sample] = sight(instant, place_m, in_vehicle_m.astype(np.float32), threads=threads).seen
+        seen[position, sample] = compute_visibility(
+            instant, place_m, in_vehicle_m.astype(np.float32), num_threads=threads
+        ).is_visible
         return np.packbits(seen, axis=1)
 
     def near(self, hits_m: Float64, within_m: float) -> Bits:
@@ -152,5 +154,5 @@ def _enclosed(target: Target, points_m: Float64) -> Bools:
     for towards in ALL_AROUND_RAYS.T:  # most get out at once
         directions, far_m = np.tile(towards[:, None], len(left)), np.full(len(left), np.inf, dtype=np.float32)
         hits = target.solid.caster.cast_from_each(points_m[left].astype(np.float32), directions, far_m)
-        left = left[hits.body >= 0]
+        left = left[hits.body_indices >= 0]
     return np.asarray(np.isin(np.arange(len(points_m)), left))

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from torchcover.geometry import find_overlaps
 from torchcover.geometry.arrays import Float64
-from torchcover.simulation.memory import check_fits
-from torchcover.simulation.rig import Rig, with_ego
+from torchcover.simulation.memory import check_memory_fits
+from torchcover.simulation.rig import Rig, set_ego
 from torchcover.simulation.scenario import Scenario
 from torchcover.targets.counting import PLACES, Steps, count
 from torchcover.targets.placing import Heading, Raster, holding, poses, yaws
@@ -69,8 +69,8 @@ def survey(
         >>> seen.points.shape, bool((seen.points > 0).any())
         ((2, 4), True)
     """
-    scenario = with_ego(scenario, {rig.name: rig})
-    vehicle = scenario.ego_box()
+    scenario = set_ego(scenario, {rig.name: rig})
+    vehicle = scenario.compute_ego_box()
     raster = Raster.around(vehicle) if raster is None else raster
     _check_size(target, raster)
     spots = survey_places(
@@ -81,7 +81,7 @@ def survey(
         rig=rig.name,
         scenario=scenario.name,
         target=target.name,
-        target_size_m=target.solid.box.size_m,
+        target_size_m=target.solid.bounding_box.size_m,
         target_bottom_m=target.bottom_m,
         heading=heading,
         raster=raster,
@@ -89,7 +89,7 @@ def survey(
         vehicle_outline_m=_outline_m(scenario),
         sensor_model=rig.sensor_model,
         sensor_names=tuple(sensor.name for sensor in rig.sensors),
-        sensors_m=np.array([sensor.mount.matrix()[:2, 3] for sensor in rig.sensors]),
+        sensors_m=np.array([sensor.mount.to_matrix()[:2, 3] for sensor in rig.sensors]),
         hits=hits,
         threshold_m=threshold_m,
         seed=seed,
@@ -118,15 +118,15 @@ def survey_places(
     the others are in the way as ever.
     """
     _check(steps, seed, hits, threshold_m)
-    scenario = with_ego(scenario, {rig.name: rig})
-    vehicle, box = scenario.ego_box(), target.solid.box
+    scenario = set_ego(scenario, {rig.name: rig})
+    vehicle, box = scenario.compute_ego_box(), target.solid.bounding_box
     _check_memory(rig, len(positions_m), steps)
     vehicle_T_target = poses(positions_m, yaws(heading, box, vehicle, positions_m))
     occupied = find_overlaps(box, vehicle_T_target, vehicle.corners_m)
     for sensor in rig.sensors:
-        occupied |= holding(box, vehicle_T_target, sensor.mount.matrix()[:3, 3])
+        occupied |= holding(box, vehicle_T_target, sensor.mount.to_matrix()[:3, 3])
     surface, elsewhere = Surface.of(target), np.flatnonzero(~occupied)
-    every_steps = 1 if frame_interval_s is None else scenario.steps_in(frame_interval_s)
+    every_steps = 1 if frame_interval_s is None else scenario.count_time_steps(frame_interval_s)
     around = vehicle_T_target[elsewhere]
     run = Steps(rig, scenario, target, surface, around, steps=steps, every_steps=every_steps, seed=seed)
     some = range(len(rig.sensors)) if counting is None else counting
@@ -159,7 +159,7 @@ def _outline_m(scenario: Scenario) -> Float64:
     """(K, 2) the smallest convex outline of the vehicle, seen from above."""
     from shapely import MultiPoint
 
-    return np.array(MultiPoint(scenario.ego_mesh().vertices_m[:, :2]).convex_hull.exterior.coords)[:-1]
+    return np.array(MultiPoint(scenario.build_ego_mesh().vertices_m[:, :2]).convex_hull.exterior.coords)[:-1]
 
 
 def _check(steps: int, seed: int, hits: int, threshold_m: float) -> None:
@@ -171,7 +171,7 @@ def _check(steps: int, seed: int, hits: int, threshold_m: float) -> None:
 
 
 def _check_size(target: Target, raster: Raster) -> None:
-    length_m, width_m, _ = target.solid.box.size_m
+    length_m, width_m, _ = target.solid.bounding_box.size_m
     wide_m, high_m = raster.x[1] - raster.x[0], raster.y[1] - raster.y[0]
     if max(length_m, width_m) > max(wide_m, high_m) or min(length_m, width_m) > min(wide_m, high_m):
         raise ValueError(
@@ -181,12 +181,12 @@ def _check_size(target: Target, raster: Raster) -> None:
 
 
 def _check_memory(rig: Rig, cells: int, steps: int) -> None:
-    rays = sum(sensor.rays for sensor in rig.sensors)
+    rays = sum(sensor.num_rays for sensor in rig.sensors)
     places = max(PLACES, steps)
     needed_bytes = BYTES_PER_RAY * rays * steps + cells * (
         BYTES_PER_CELL + places * SAMPLES // 8 + 8 * len(rig.sensors)
     )
-    check_fits(
+    check_memory_fits(
         f"{cells:,} places and {steps:,} steps of {rays:,} rays",
         needed_bytes,
         "use fewer steps or a larger step of the raster",

@@ -82,14 +82,14 @@ def test_an_ego_that_is_not_there(tmp_path, table):
 def test_an_ego_that_leaves_or_jumps(tmp_path, table):
     path, keys = table
     fails(scenario(path, ego_id="a8", duration_s=4.0), r"'a8' and the others are known for 2\.8 s; begin_s 0 and")
-    assert scenario(path, ego_id="a8").steps == 29
+    assert scenario(path, ego_id="a8").num_time_steps == 29
     fails(scenario(path, begin_s=9.0, **keys), "known for 4 s; begin_s 9 and duration_s 0 reach beyond")
     whole = path.read_text()
     rewrite(path, lambda row: None if row[1] == "a1" and 1.3 < float(row[0]) < 2.9 else row)
     fails(
         scenario(path, ego_id="a1"), r"a gap of over 1 s \(max_gap_s\), or jumps. It is there from 0 to 1.2 s, 3 to 4 s"
     )
-    assert scenario(path, ego_id="a1", begin_s=3.0).steps == 11
+    assert scenario(path, ego_id="a1", begin_s=3.0).num_time_steps == 11
     path.write_text(whole)
     rewrite(path, lambda row: [*row[:3], "9999", *row[4:]] if row[:2] == ["2.0", "a1"] else row)
     fails(scenario(path, ego_id="a1"), "or jumps. It is there from 0 to 1.8 s, 2 to 2 s, 2.2 to 4 s")
@@ -114,7 +114,7 @@ def test_an_ego_and_others_at_different_times(table):
 def test_tables_of_boxes(table, old, new, message):
     path, keys = table
     with pytest.raises(BadFileError, match=message) as caught:
-        scenario(replaced(path, old, new), **keys).world()
+        scenario(replaced(path, old, new), **keys).build_scene()
     assert str(caught.value).startswith(str(path))
 
 
@@ -141,7 +141,7 @@ def test_shapes_of_commonroad(tmp_path):
     box = "<rectangle><length>4.5</length><width>1.8</width></rectangle>"
     corners = "".join(f"<point><x>{x}</x><y>{y}</y></point>" for x, y in ((0, -1), (4, -1), (4, 1), (0, 1)))
     path = replaced(write_commonroad(tmp_path / "a.xml"), box, f"<polygon>{corners}</polygon>")
-    actor = scenario(path, ego_id=5, duration_s=0.4).world().actors[0]
+    actor = scenario(path, ego_id=5, duration_s=0.4).build_scene().actors[0]
     np.testing.assert_allclose(np.ptp(actor.mesh.vertices_m, axis=0)[:2], [4.0, 2.0])
     np.testing.assert_allclose(actor.trajectory.interpolate(0.0)[:2, 3], [1426.0, 2200.0])
 
@@ -216,7 +216,7 @@ def test_tables_of_nuscenes(tmp_path):
         annotations.write_text(json.dumps([{**good[0], **change}, *good[1:]]))
         fails(scenario(folder), message, BadFileError)
     annotations.write_text("[]")
-    assert len(scenario(folder).world().actors) == 0
+    assert len(scenario(folder).build_scene().actors) == 0
     (folder / "ego_pose.json").write_text("[]")
     fails(scenario(folder), "no ego_pose from the first sample", BadFileError)
     (folder / "instance.json").unlink()
@@ -252,7 +252,7 @@ def test_logs_of_argoverse(tmp_path, column, change, message):
 def test_logs_that_lack_something(tmp_path, monkeypatch):
     log = write_argoverse2(tmp_path, (*OTHERS, EGO._replace(category="ego_vehicle")))
     (log / "annotations.feather").rename(log / "annotations_with_ego.feather")
-    assert "ego" not in [actor.name for actor in scenario(log).world().actors]
+    assert "ego" not in [actor.name for actor in scenario(log).build_scene().actors]
     fails(scenario(log, scene="a"), "scene: is for tables of nuScenes")
     lack_pyarrow(monkeypatch)
     fails(scenario(log), r"annotations_with_ego.feather: .*pip install 'torchcover\[av2\]'", ImportError)

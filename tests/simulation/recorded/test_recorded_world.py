@@ -5,9 +5,9 @@ import pytest
 
 from tests.recordings.drives import Drive
 from torchcover.recordings import open_recording
-from torchcover.simulation import Rig, Scenario, SimulatedFrames, write_recording, write_world
-from torchcover.simulation.recorded_world import CELL_M, cell_mesh
-from torchcover.simulation.scene import Scene
+from torchcover.simulation import Rig, Scenario, SimulatedFrames, write_recording, write_scenario
+from torchcover.simulation.recorded_world import CELL_M, build_cell_mesh
+from torchcover.simulation.scene import SceneGeometry
 from torchcover.simulation.shapes import Box
 
 SPEED_MPS, CAR_MPS, SECONDS = 8.0, -6.0, 2.4
@@ -54,7 +54,7 @@ def drive(tmp_path_factory):
     frames = SimulatedFrames(
         Scenario.load(folder / "street.yaml"),
         Rig(name="one", sensors=[LIDAR]),
-        steps=round(SECONDS / 0.1) + 1,
+        num_frames=round(SECONDS / 0.1) + 1,
         frame_interval_s=0.1,
         boxes=True,
     )
@@ -67,16 +67,18 @@ def made(request, drive):
     recording = open_recording(drive / "recording")
     if request.param == "none":
         recording.read_boxes = lambda index: None
-    told = write_world(recording, drive / request.param)
-    return recording, told, Scenario.load(drive / request.param / "scenario.yaml").world()
+    told = write_scenario(recording, drive / request.param)
+    return recording, told, Scenario.load(drive / request.param / "scenario.yaml").build_scene()
 
 
 def test_the_ground_is_where_it_was(made):
     recording, _, world = made
-    ground, low_m = Scene(world).ground, np.array([[0.0, -3.0, 0.0], [30.0, -6.0, 0.0]])
+    ground, low_m = SceneGeometry(world).ground, np.array([[0.0, -3.0, 0.0], [30.0, -6.0, 0.0]])
     ground_m = low_m + UPHILL * low_m[:, :1] * np.array([0.0, 0.0, 1.0])
     placed_m = ground_m - recording.world_T_vehicle(0)[:3, 3]
-    np.testing.assert_allclose(ground.heights_m(placed_m + np.array([0.0, 0.0, 1.0]), np.eye(4)), 1.0, atol=0.05)
+    np.testing.assert_allclose(
+        ground.compute_heights_m(placed_m + np.array([0.0, 0.0, 1.0]), np.eye(4)), 1.0, atol=0.05
+    )
 
 
 def test_the_wall_stands_and_nothing_stands_where_anything_drives(made):
@@ -112,13 +114,13 @@ def test_the_vehicle_drives_as_it_did(made):
 
 
 def test_fewer_frames_make_a_shorter_world(drive):
-    write_world(open_recording(drive / "recording"), drive / "short", steps=6)
-    assert Scenario.load(drive / "short" / "scenario.yaml").world().steps == 6
+    write_scenario(open_recording(drive / "recording"), drive / "short", num_frames=6)
+    assert Scenario.load(drive / "short" / "scenario.yaml").build_scene().num_time_steps == 6
 
 
 def test_sides_of_cells_are_closed_and_as_large_as_those_of_the_block():
     cells = np.argwhere(np.ones((3, 4, 5), dtype=bool)) - [1, 2, 3]
-    mesh, block = cell_mesh(cells), Box(type="box", size_m=(3, 4, 5)).mesh()
+    mesh, block = build_cell_mesh(cells), Box(type="box", size_m=(3, 4, 5)).build_mesh()
     assert len(np.unique(mesh.vertices_m, axis=0)) == len(mesh.vertices_m)
     edges = np.concatenate([mesh.faces[:, [one, (one + 1) % 3]] for one in range(3)])
     np.testing.assert_array_equal(np.unique(edges, axis=0), np.unique(edges[:, ::-1], axis=0))
@@ -135,15 +137,15 @@ def test_sides_of_cells_are_closed_and_as_large_as_those_of_the_block():
 def test_what_no_world_can_be_made_of_is_told():
     alone = Drive(steps=8)
     with pytest.raises(ValueError, match="no ground is seen around the vehicle"):
-        write_world(alone, alone.path)
+        write_scenario(alone, alone.path)
     gap = Drive(steps=8)
     gap.times_s = gap.times_s + 60.0 * (np.arange(8) > 3)
     with pytest.raises(
         ValueError, match=r"nothing is recorded for 60\.1 s after f3, and a world needs .* 5 s; .*\(--num-frames 4\)"
     ):
-        write_world(gap, gap.path)
+        write_scenario(gap, gap.path)
     jumping = Drive(steps=8)
     place = jumping.get_world_T_vehicle
     jumping.get_world_T_vehicle = lambda index: place(index) + JUMP * (index > 4)
     with pytest.raises(ValueError, match=r"the poses jump within 2\.5 s of f"):
-        write_world(jumping, jumping.path)
+        write_scenario(jumping, jumping.path)

@@ -26,8 +26,8 @@ from torchcover import Rig, Scenario
 from torchcover.evaluation.task import compute_frame_interval_s
 from torchcover.geometry import BoundingBox, build_transform, invert
 from torchcover.simulation import PaperReference, SimulatedFrames, Simulator
-from torchcover.simulation.builtin import builtin_names, get_builtin_folder
-from torchcover.simulation.height_field import Slopes
+from torchcover.simulation.builtin import get_builtin_folder, list_builtin_names
+from torchcover.simulation.height_field import GroundHeightField
 
 FEW = PaperReference(rows=24, columns=48)
 LIDAR = {"name": "top", "mount": {"z_m": 2.0}, "channels": 8, "vertical_fov_deg": (-20, 0), "columns": 60,
@@ -78,7 +78,7 @@ def opened(written, kind):
 @pytest.mark.parametrize("kind", FORMATS)
 def test_everybody_is_where_a_slow_twin_says_at_instants_and_between(written, kind):
     drive, heights, recorded_s, atol = opened(written, kind)
-    world = drive.world()
+    world = drive.build_scene()
     ego = OTHERS[0] if kind == "commonroad" else EGO
     for time_s in (0.0, 0.4, 1.37, 2.05, 4.0):
         for one in (ego, *OTHERS):
@@ -104,20 +104,20 @@ def test_everybody_is_where_a_slow_twin_says_at_instants_and_between(written, ki
 @pytest.mark.parametrize("kind", FORMATS)
 def test_a_run_is_as_long_as_the_recording_and_then_the_same_again(written, kind):
     drive, *_ = opened(written, kind)
-    assert drive.repeats
-    assert (drive.steps, drive.instants) == (41, 41)
+    assert drive.is_repeating
+    assert (drive.num_time_steps, drive.num_distinct_time_steps) == (41, 41)
     assert [drive.locate(index) for index in (0, 40, 41, 100)] == [(0, 0), (0, 40), (0, 0), (0, 18)]
     simulator = Simulator(drive, {"rig": RIG}, FEW, frame_interval_s=0.3)
-    assert simulator.distinct_steps == 41
-    assert [simulator.block_index(index) for index in (0, 1, 13, 14, 41)] == [0, 3, 39, 1, 0]
-    assert simulator.run_of(1000) == 0
+    assert simulator.num_distinct_frames == 41
+    assert [simulator.get_block_index(index) for index in (0, 1, 13, 14, 41)] == [0, 3, 39, 1, 0]
+    assert simulator.get_run_index(1000) == 0
     assert round(compute_frame_interval_s(drive, None) / 0.1) == 25  # the golden share of its instants
 
 
 def test_an_instant_that_is_seen_again_is_counted_and_seen_as_before(written):
     drive, *_ = opened(written, "table")
     simulator = Simulator(drive, {"rig": RIG}, FEW)
-    first, again = simulator.step(3), simulator.step(3 + 41)
+    first, again = simulator.simulate_frame(3), simulator.simulate_frame(3 + 41)
     assert (first.counts["repeated_frames"], again.counts["repeated_frames"]) == (0, 1)
     np.testing.assert_array_equal(first.clouds["rig"], again.clouds["rig"])
     assert not np.array_equal(first.reference, again.reference)
@@ -126,8 +126,8 @@ def test_an_instant_that_is_seen_again_is_counted_and_seen_as_before(written):
 def test_nothing_is_drawn(written):
     drive, *_ = opened(written, "argoverse2")
     again, *_ = opened(written, "argoverse2")
-    one, other = drive.world(seed=1), again.world(seed=2, episode=5)
-    np.testing.assert_array_equal(one.static[0].vertices_m, other.static[0].vertices_m)
+    one, other = drive.build_scene(seed=1), again.build_scene(seed=2, run_index=5)
+    np.testing.assert_array_equal(one.static_meshes[0].vertices_m, other.static_meshes[0].vertices_m)
     for mine, its in zip((one.ego, *one.actors), (other.ego, *other.actors), strict=True):
         assert (mine.name, mine.category) == (its.name, its.category)
         np.testing.assert_array_equal(mine.trajectory.positions_m, its.trajectory.positions_m)
@@ -140,7 +140,9 @@ def heights_of(mesh, places_m):
     raster[np.searchsorted(corners[1], mesh.vertices_m[:, 1]), np.searchsorted(corners[0], mesh.vertices_m[:, 0])] = (
         mesh.vertices_m[:, 2]
     )
-    return Slopes(np.array([corners[0][0], corners[1][0]]), raster, np.empty((0, 0))).heights_m(places_m)
+    return GroundHeightField(np.array([corners[0][0], corners[1][0]]), raster, np.empty((0, 0))).compute_heights_m(
+        places_m
+    )
 
 
 def off_ground_m(world, others, heights=hill_m):
@@ -150,7 +152,7 @@ def off_ground_m(world, others, heights=hill_m):
 
 
 def test_the_ground_is_below_the_tracks_within_centimetres(written):
-    world = opened(written, "argoverse2")[0].world()
+    world = opened(written, "argoverse2")[0].build_scene()
     assert np.abs(off_ground_m(world, [EGO])).max() < 0.03
     # Of things, nobody knows whether they stand or hang; Argoverse's bicycles are without a rider.
     off_m = np.abs(off_ground_m(world, [one for one in OTHERS if one.category not in ("bollard", "bicycle")]))
@@ -160,7 +162,7 @@ def test_the_ground_is_below_the_tracks_within_centimetres(written):
 
 @pytest.mark.parametrize("kind", ["table", "argoverse2"])
 def test_wheels_stand_on_slopes_whether_or_not_tilts_were_recorded(written, kind):
-    world = opened(written, kind)[0].world()
+    world = opened(written, kind)[0].build_scene()
     for actor in world.actors:
         if actor.category not in ("car", "truck", "bus"):
             continue
@@ -176,8 +178,8 @@ def test_wheels_stand_on_slopes_whether_or_not_tilts_were_recorded(written, kind
 
 
 def test_the_ground_goes_on_beyond_the_tracks(written):
-    world = opened(written, "argoverse2")[0].world()
-    vertices_m = world.static[0].vertices_m
+    world = opened(written, "argoverse2")[0].build_scene()
+    vertices_m = world.static_meshes[0].vertices_m
     assert np.isfinite(vertices_m).all()
     assert (np.ptp(vertices_m[:, :2], axis=0) > 500).all()
     assert (np.abs(vertices_m[:, 2] - 31.0) < 8.0).all()
@@ -187,8 +189,8 @@ def test_a_few_boxes_that_are_wrong_do_not_lift_the_ground(tmp_path):
     drive = drive_of(write_csv(tmp_path))
     rewrite(tmp_path / "boxes.csv", lambda row: raised(row, 3.0, "a5", "a8"))
     good = [EGO, *(one for one in OTHERS if one.name in ("a1", "a2", "a3", "a4", "a6", "a7"))]
-    assert np.abs(off_ground_m(drive.world(), good)).max() < 0.08
-    assert np.abs(off_ground_m(drive.world(), [one for one in OTHERS if one.name == "a5"])).max() < 0.5
+    assert np.abs(off_ground_m(drive.build_scene(), good)).max() < 0.08
+    assert np.abs(off_ground_m(drive.build_scene(), [one for one in OTHERS if one.name == "a5"])).max() < 0.5
 
 
 def test_large_coordinates_change_nothing(tmp_path):
@@ -200,19 +202,19 @@ def test_large_coordinates_change_nothing(tmp_path):
                 folder / name,
                 lambda row: row if row[0] == "t" else [*row[:at], f"{float(row[at]) + shift_m:.9f}", *row[at + 1 :]],  # noqa: B023
             )
-        seen.append(Simulator(drive_of(folder), {"rig": RIG}, FEW).step(11).clouds["rig"])
+        seen.append(Simulator(drive_of(folder), {"rig": RIG}, FEW).simulate_frame(11).clouds["rig"])
     assert len(seen[0]) > 200
     for cloud in seen[1:]:
         np.testing.assert_allclose(cloud, seen[0], atol=2e-4)
 
 
 def test_where_nothing_has_a_height_the_ground_is_two_triangles(written):
-    assert len(opened(written, "commonroad")[0].world().static[0].faces) == 2
+    assert len(opened(written, "commonroad")[0].build_scene().static_meshes[0].faces) == 2
 
 
 def test_bodies_have_the_sizes_of_the_boxes(written):
     for kind, of_category in (("argoverse2", {"car", "truck", "bus", "pedestrian"}), ("nuscenes", {"cyclist"})):
-        world = opened(written, kind)[0].world()
+        world = opened(written, kind)[0].build_scene()
         for one in OTHERS:
             actor = of(world, one.name)
             np.testing.assert_allclose(BoundingBox.from_points(actor.mesh.vertices_m).size_m, one.size_m)
@@ -224,13 +226,13 @@ def test_bodies_have_the_sizes_of_the_boxes(written):
 
 
 def test_a_body_without_a_recorded_height_has_its_own(written):
-    world = opened(written, "commonroad")[0].world()
+    world = opened(written, "commonroad")[0].build_scene()
     size_m = BoundingBox.from_points(of(world, "3").mesh.vertices_m).size_m
     np.testing.assert_allclose(size_m, (9.5, 2.5, 1.07 * 3.45))  # of the lorry whose length is nearest
 
 
 def test_another_track_may_be_the_ego_and_then_the_recordings_own_is_one_of_the_others(written):
-    world = scenario(written / "argoverse2", ego_id="a1").world()
+    world = scenario(written / "argoverse2", ego_id="a1").build_scene()
     np.testing.assert_allclose(
         world.ego.trajectory.interpolate(1.0), poses(OTHERS[0], times_s=np.array([1.0]))[0], atol=2e-4
     )
@@ -241,10 +243,10 @@ def test_another_track_may_be_the_ego_and_then_the_recordings_own_is_one_of_the_
 
 
 def test_the_frame_of_the_ego_may_be_given(written):
-    known = scenario(written / "argoverse2").world().ego.trajectory.interpolate(1.0)
+    known = scenario(written / "argoverse2").build_scene().ego.trajectory.interpolate(1.0)
     given = (
         scenario(written / "argoverse2", ego_T_vehicle={"x_m": 0.339, "z_m": -0.3})
-        .world()
+        .build_scene()
         .ego.trajectory.interpolate(1.0)
     )
     np.testing.assert_allclose(given, known @ build_transform(np.eye(3), [-1.0, 0.0, 0.0]), atol=1e-9)
@@ -252,25 +254,25 @@ def test_the_frame_of_the_ego_may_be_given(written):
 
 def test_the_start_of_a_planning_problem_is_one_instant_unless_a_time_is_given(written):
     start = scenario(written / "commonroad.xml")
-    assert (start.steps, start.instants) == (1, 1)
-    np.testing.assert_allclose(start.world().ego.trajectory.interpolate(0.0)[:2, 3], ORIGIN_M)
+    assert (start.num_time_steps, start.num_distinct_time_steps) == (1, 1)
+    np.testing.assert_allclose(start.build_scene().ego.trajectory.interpolate(0.0)[:2, 3], ORIGIN_M)
     standing = scenario(written / "commonroad.xml", duration_s=1.0)
-    assert standing.steps == 11
-    world = standing.world()
+    assert standing.num_time_steps == 11
+    world = standing.build_scene()
     assert not world.ego.trajectory.is_moving
-    assert len(Simulator(standing, {"rig": RIG}, FEW).step(3).clouds["rig"]) > 200
+    assert len(Simulator(standing, {"rig": RIG}, FEW).simulate_frame(3).clouds["rig"]) > 200
 
 
 def test_who_was_not_seen_for_too_long_was_not_there(tmp_path):
     gap = (Somebody("a1", "car", (4.5, 1.8, 1.5), (24.0, 0.0), 0.0, 9.0), *OTHERS[1:])
     folder = write_csv(tmp_path, gap)
     rewrite(folder / "boxes.csv", lambda row: None if row[1] == "a1" and 1.1 < float(row[0]) < 2.5 else row)
-    world = drive_of(folder).world()
+    world = drive_of(folder).build_scene()
     times_s = np.array([0.9, 1.0, 1.1, 1.8, 2.5, 2.6, 3.0])
     there = [np.isfinite(of(world, name).trajectory.interpolate_positions_m(times_s)[:, 0]) for name in ("a1", "a1 #2")]
     np.testing.assert_array_equal(there, [[1, 1, 0, 0, 0, 0, 0], [0, 0, 0, 0, 0, 1, 1]])
     assert np.isfinite(
-        of(drive_of(folder, max_gap_s=2.0).world(), "a1").trajectory.interpolate_positions_m(times_s)
+        of(drive_of(folder, max_gap_s=2.0).build_scene(), "a1").trajectory.interpolate_positions_m(times_s)
     ).all()
 
 
@@ -280,7 +282,7 @@ def test_who_is_where_the_ego_is_is_left_out_and_named(tmp_path):
     folder = write_csv(tmp_path, (*OTHERS, inside, above))
     rewrite(folder / "boxes.csv", lambda row: raised(row, 5.0, "sign"))
     with pytest.warns(UserWarning, match=r"boxes.csv: 1 of 11 tracks are where the ego is at some time \('inside'\)"):
-        names = [actor.name for actor in drive_of(folder).world().actors]
+        names = [actor.name for actor in drive_of(folder).build_scene().actors]
     assert "inside" not in names
     assert "sign" in names
 
@@ -290,7 +292,7 @@ def test_who_is_seen_at_an_instant_is_there_whatever_is_subtracted_of_the_times(
         drive, *_ = opened(written, "table")
         world = Scenario.model_validate(
             {"name": "part", "traffic": drive.traffic.model_copy(update={"begin_s": begin_s}).model_dump()}
-        ).world()
+        ).build_scene()
         last = round((2.8 - begin_s) / 0.1)
         times_s = 0.1 * np.array([last, last + 1], dtype=np.float64)
         np.testing.assert_array_equal(
@@ -306,9 +308,9 @@ def test_who_is_seen_at_an_instant_is_there_whatever_is_subtracted_of_the_times(
 def test_whatever_recording_has_boxes_plays_as_traffic(tmp_path, layout, name, faces):
     recorded = Drive()
     drive = scenario(LAYOUTS[layout](recorded, tmp_path))
-    world = drive.world()
+    world = drive.build_scene()
     (car,) = world.actors
-    assert (drive.steps, car.name) == (5, name)
+    assert (drive.num_time_steps, car.name) == (5, name)
     np.testing.assert_allclose(BoundingBox.from_points(car.mesh.vertices_m).size_m, CAR_SIZE_M, atol=1e-6)
     assert len(car.mesh.faces) >= faces  # a plain folder calls it "car, red", which is no word for a road user
     for instant, time_s in enumerate(recorded.times_s):
@@ -316,11 +318,11 @@ def test_whatever_recording_has_boxes_plays_as_traffic(tmp_path, layout, name, f
         wanted = wanted @ build_transform(np.eye(3), [0.0, 0.0, -CAR_SIZE_M[2] / 2])
         found = invert(world.ego.trajectory.interpolate(time_s)) @ car.trajectory.interpolate(time_s)
         np.testing.assert_allclose(found, wanted, atol=1e-4, err_msg=str(instant))
-    assert len(Simulator(drive, {"rig": RIG}, FEW).step(2).clouds["rig"]) > 100
+    assert len(Simulator(drive, {"rig": RIG}, FEW).simulate_frame(2).clouds["rig"]) > 100
 
 
 def test_the_vehicle_of_a_recording_is_one_of_the_others_if_another_is_the_ego(tmp_path):
-    world = scenario(LAYOUTS["kitti_raw"](Drive(), tmp_path), ego_id="0").world()
+    world = scenario(LAYOUTS["kitti_raw"](Drive(), tmp_path), ego_id="0").build_scene()
     (own,) = world.actors
     assert own.name == "ego"
     np.testing.assert_allclose(BoundingBox.from_points(own.mesh.vertices_m).size_m, (4.774, 1.82, 1.93))
@@ -330,17 +332,17 @@ def test_one_scene_of_several_is_shown(tmp_path):
     folder = write_nuscenes(tmp_path / "v1.0-mini", scenes=("first", "second"))
     for path in (tmp_path, folder):
         for called in ("first", "s0"):
-            assert scenario(path, scene=called).steps == 41
+            assert scenario(path, scene=called).num_time_steps == 41
     with pytest.raises(ValueError, match="scene: one of first, second is needed; got none"):
-        scenario(tmp_path).world()
+        scenario(tmp_path).build_scene()
     with pytest.raises(ValueError, match="got 'third'"):
-        scenario(tmp_path, scene="third").world()
+        scenario(tmp_path, scene="third").build_scene()
 
 
 def test_what_a_run_means_depends_on_what_is_in_the_files(tmp_path):
     folder = write_argoverse2(tmp_path / "log")
-    before = scenario(folder).content()
-    assert before == scenario(write_argoverse2(tmp_path / "copy")).content()
+    before = scenario(folder).collect_content()
+    assert before == scenario(write_argoverse2(tmp_path / "copy")).collect_content()
     first = OTHERS[0]
     for others in (
         OTHERS[:-1],
@@ -348,9 +350,9 @@ def test_what_a_run_means_depends_on_what_is_in_the_files(tmp_path):
         (first._replace(size_m=(4.5, 1.8, 1.6)), *OTHERS[1:]),
         (first._replace(category="bus"), *OTHERS[1:]),
     ):
-        assert before != scenario(write_argoverse2(folder, others)).content()
-    assert before != scenario(write_argoverse2(tmp_path / "flat", heights=flat_m)).content()
-    assert before != scenario(tmp_path / "copy", begin_s=1.0).content()
+        assert before != scenario(write_argoverse2(folder, others)).collect_content()
+    assert before != scenario(write_argoverse2(tmp_path / "flat", heights=flat_m)).collect_content()
+    assert before != scenario(tmp_path / "copy", begin_s=1.0).collect_content()
 
 
 def test_the_built_in_ones_are_those_that_are_written_here(written):
@@ -358,31 +360,31 @@ def test_the_built_in_ones_are_those_that_are_written_here(written):
     for path in written.rglob("*.*"):
         if path.suffix in (".csv", ".json", ".xml"):
             assert path.read_text() == built_in.joinpath(path.relative_to(written)).read_text(), path
-    for name in builtin_names("scenarios"):
+    for name in list_builtin_names("scenarios"):
         if name.startswith("tracks_"):
             drive = Scenario.load(name)
-            drive.world()
+            drive.build_scene()
             Simulator(drive, {"rig": RIG}, FEW).check_run(4)
 
 
 def test_what_was_not_recorded_is_drawn_if_asked_for_and_stands_where_nobody_was(written):
     path = written / "argoverse2"
-    bare, drawn = scenario(path).world(0), scenario(path, built_share=1.0).world(0)
-    assert len(bare.static) == 1
-    assert len(drawn.static) == 3
-    assert len(scenario(path, built_share=0.0, roadside=0.0).world(0).static) == 1
-    np.testing.assert_array_equal(bare.static[0].vertices_m, drawn.static[0].vertices_m)
-    houses_m = drawn.static[1].vertices_m[:, :2]
+    bare, drawn = scenario(path).build_scene(0), scenario(path, built_share=1.0).build_scene(0)
+    assert len(bare.static_meshes) == 1
+    assert len(drawn.static_meshes) == 3
+    assert len(scenario(path, built_share=0.0, roadside=0.0).build_scene(0).static_meshes) == 1
+    np.testing.assert_array_equal(bare.static_meshes[0].vertices_m, drawn.static_meshes[0].vertices_m)
+    houses_m = drawn.static_meshes[1].vertices_m[:, :2]
     assert len(houses_m) > 100
     for actor in (drawn.ego, *drawn.actors):
         for place_m in actor.trajectory.positions_m[:, :2]:
             assert np.linalg.norm(houses_m - place_m, axis=1).min() > 2.0
     said = "Drawn, not recorded: what stands beside the tracks, with houses on 100% of the sides."
     for traffic, notes in ((scenario(path), []), (scenario(path, built_share=1.0), [said])):
-        record = SimulatedFrames(traffic, RIG, steps=1, reference_sensor=FEW).reference_record
+        record = SimulatedFrames(traffic, RIG, num_frames=1, reference_sensor=FEW).reference_record
         assert [note for note in record["notes"] if "own vehicle" not in note] == notes
     # They begin on the ground: beside hills, below the highest of them.
-    assert drawn.static[1].vertices_m[:, 2].min() < bare.static[0].vertices_m[:, 2].max()
+    assert drawn.static_meshes[1].vertices_m[:, 2].min() < bare.static_meshes[0].vertices_m[:, 2].max()
 
 
 @pytest.mark.parametrize("keys", [{"roadside": 2.0}, {"built_share": 1.0, "ground": "road.ply"}, {"built_share": 2.0}])

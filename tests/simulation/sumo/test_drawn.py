@@ -48,7 +48,7 @@ def test_a_seed_gives_one_world_in_every_process():
     there = subprocess.run(
         [sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True, cwd=ROOT
     )
-    world = drawn().world(7)
+    world = drawn().build_scene(7)
     assert there.stdout.strip() == fingerprint(world)
     assert len(world.objects) > 20
 
@@ -56,13 +56,17 @@ def test_a_seed_gives_one_world_in_every_process():
 def test_workers_see_the_same_frames_and_each_run_is_another_town():
     scenario = Scenario(name="town", traffic=drawn())
     frames = SimulatedFrames(
-        scenario, Rig.load("front_grille_128"), steps=6, seed=1, reference_sensor=PaperReference(rows=8, columns=16)
+        scenario,
+        Rig.load("front_grille_128"),
+        num_frames=6,
+        seed=1,
+        reference_sensor=PaperReference(rows=8, columns=16),
     )
     here = [frame.reference for frame in (frames[0], frames[5])]
     workers = DataLoader(frames, batch_size=None, sampler=[0, 5], num_workers=2)
     for one, other in zip(here, workers, strict=True):
         np.testing.assert_array_equal(one, other.reference)
-    towns = [frames.simulator.scene_of(index)[0].world.static[1] for index in (0, 5)]
+    towns = [frames.simulator.get_scene_geometry(index)[0].scene.static_meshes[1] for index in (0, 5)]
     assert len(towns[0].vertices_m) != len(towns[1].vertices_m)
 
 
@@ -98,13 +102,13 @@ def test_open_drive_brings_its_heights_and_sidewalks(tmp_path):
     (tmp_path / "road.xodr").write_text(XODR)
     (tmp_path / "r.xml").write_text(ROUTES.format(name="me", more=""))
     made = Sumo(net=tmp_path / "road.xodr", routes=(tmp_path / "r.xml",), ego_id="me", begin_s=0.0, duration_s=8.0)
-    world = made.world(0)
+    world = made.build_scene(0)
     x_m, _, z_m = world.ego.trajectory.positions_m.T
     assert np.ptp(x_m) > 60.0
     assert np.polyfit(x_m, z_m, 1)[0] == pytest.approx(0.04, abs=0.004)
     assert np.abs(world.ego.trajectory.positions_m[:, 1]).max() < 1.0  # no car goes onto the sidewalk
     np.testing.assert_allclose(world.ego.trajectory.angles_deg[:, 1].mean(), -np.rad2deg(np.arctan(0.04)), atol=0.5)
-    assert len(world.static) == 4  # ground, sidewalk, houses, trees
+    assert len(world.static_meshes) == 4  # ground, sidewalk, houses, trees
 
 
 @pytest.mark.parametrize(
@@ -163,8 +167,8 @@ def test_links_of_open_drive_that_lead_nowhere_are_named_and_may_be_left_out(tmp
     made = Sumo(net=tmp_path / "road.xodr", routes=(tmp_path / "r.xml",), ego_id="me", begin_s=0.0, duration_s=2.0)
     told = "road 1, predecessor road 7; junction 8, connection 0, connectingRoad .none.; `leave_out_links: true`"
     with pytest.raises(BadFileError, match=f"road.xodr: SUMO's netconvert fails: .*{told}"):
-        made.world(0)
-    assert made.model_copy(update={"leave_out_links": True}).world(0).ego.trajectory.is_moving
+        made.build_scene(0)
+    assert made.model_copy(update={"leave_out_links": True}).build_scene(0).ego.trajectory.is_moving
 
 
 @pytest.mark.parametrize(
@@ -179,7 +183,7 @@ def test_links_of_open_drive_that_lead_nowhere_are_named_and_may_be_left_out(tmp
 def test_a_road_that_netconvert_refuses_ends_with_its_message(text, message, tmp_path):
     (tmp_path / "road.xodr").write_text(text)
     with pytest.raises(BadFileError, match=f"road.xodr: .*{message}"):
-        Sumo(net=tmp_path / "road.xodr", random={}, duration_s=2.0).world(0)
+        Sumo(net=tmp_path / "road.xodr", random={}, duration_s=2.0).build_scene(0)
 
 
 def test_what_sumo_says_is_passed_on_and_entities_never_get_to_it(tmp_path):
@@ -188,13 +192,13 @@ def test_what_sumo_says_is_passed_on_and_entities_never_get_to_it(tmp_path):
     made = Sumo(net=net, routes=(routes,), duration_s=2.0)
     routes.write_text(ROUTES.format(name="me", more=""))
     with pytest.raises(ValueError, match=r"SUMO's sumo fails: .+") as failed:
-        made.world(0)
+        made.build_scene(0)
     assert "\n" not in str(failed.value)
     routes.write_text("<!DOCTYPE a [<!ENTITY e SYSTEM 'file:///etc/passwd'>]><routes>&e;</routes>")
     with pytest.raises(BadFileError, match=r"r\.xml: .*without entities"):
-        made.world(0)
+        made.build_scene(0)
     with pytest.raises(FileNotFoundError, match=r"none\.xml"):
-        Sumo(net=net, routes=(tmp_path / "none.xml",), duration_s=2.0).world(0)
+        Sumo(net=net, routes=(tmp_path / "none.xml",), duration_s=2.0).build_scene(0)
 
 
 OUTPUT = "x.out"
@@ -249,9 +253,9 @@ def test_scenarios_name_no_outputs_and_no_addresses(road, tmp_path, where, added
     route = f'<vehicle id="me" depart="0"><route edges="-1"/>{added * (where == "route")}</vehicle>'
     (tmp_path / "r.xml").write_text(f"<routes>{added * (where == 'root')}{route}</routes>")
     with pytest.raises(BadFileError, match=re.escape(told)):
-        Sumo(net=tmp_path / "a.net.xml", routes=(tmp_path / "r.xml",), ego_id="me", begin_s=0.0, duration_s=1.0).world(
-            0
-        )
+        Sumo(
+            net=tmp_path / "a.net.xml", routes=(tmp_path / "r.xml",), ego_id="me", begin_s=0.0, duration_s=1.0
+        ).build_scene(0)
     assert [one.read_text() for one in tmp_path.glob(OUTPUT)] == ["a user's file"]
 
 
@@ -262,7 +266,7 @@ def test_pictures_and_notes_of_scenarios_change_nothing(road, tmp_path):
         '<routes><vType id="t" imgFile="car.png" emissionClass="PHEMlight/../x" lcStrategic="1" jmTimegapMinor="1"/>'
         f'<vehicle id="me" type="t" depart="0"><route edges="-1"/>{notes}</vehicle></routes>'
     )
-    world = Sumo(net=road, routes=(routes,), ego_id="me", begin_s=1.0, duration_s=1.0).world(0)
+    world = Sumo(net=road, routes=(routes,), ego_id="me", begin_s=1.0, duration_s=1.0).build_scene(0)
     assert len(world.ego.trajectory.times_s)
 
 
@@ -291,22 +295,22 @@ def test_a_simulation_that_is_over_before_the_run_begins_is_refused(tmp_path):
     net, routes = DrawnStreets().build(tmp_path, np.random.default_rng(0)), tmp_path / "r.xml"
     routes.write_text("<routes/>")
     with pytest.raises(ValueError, match=r"the simulation is over before t = 60 s, where the run begins: .*begin_s"):
-        Sumo(net=net, routes=(routes,), duration_s=2.0).world(0)
+        Sumo(net=net, routes=(routes,), duration_s=2.0).build_scene(0)
 
 
 def test_without_sumo_one_line_says_what_to_install(monkeypatch):
     monkeypatch.setattr(simulating, "find_spec", lambda _: None)
     monkeypatch.setattr(simulating, "which", lambda _: None)
     with pytest.raises(ImportError, match=r"^traffic of type 'sumo' needs SUMO: pip install 'torchcover\[sumo\]'$"):
-        drawn().world(0)
+        drawn().build_scene(0)
 
 
 def test_a_net_without_ways_and_too_much_traffic_are_refused(tmp_path):
     net = write_net(tmp_path / "a.net.xml", street())
     with pytest.raises(ValueError, match="no street that cars may use and that leads on"):
-        Sumo(net=net, random={}, duration_s=2.0).world(0)
+        Sumo(net=net, random={}, duration_s=2.0).build_scene(0)
     with pytest.raises(ValueError, match=r"traffic of about [\d,]+ vehicles and people; at most 20,000 are drawn"):
-        drawn(traffic_per_km=200.0, people_per_km=1000.0, cyclists_per_km=1000.0, buses_per_km=200.0).world(0)
+        drawn(traffic_per_km=200.0, people_per_km=1000.0, cyclists_per_km=1000.0, buses_per_km=200.0).build_scene(0)
 
 
 def test_an_empty_town_is_a_world_a_hundred_times_as_much_is_refused_and_who_is_left_out_is_told(monkeypatch):
@@ -316,9 +320,9 @@ def test_an_empty_town_is_a_world_a_hundred_times_as_much_is_refused_and_who_is_
     monkeypatch.setattr(traffic, "possible", lambda bodies: bodies[:1])
     bare = {"built_share": 0.0, "parked_share": 0.0, "roadside": 0.0}
     with pytest.warns(UserWarning, match=r"the simulation has \d of \d road users where another one is"):
-        world = drawn(**dict.fromkeys(LITTLE, 0.0)).model_copy(update=bare).world(0)
+        world = drawn(**dict.fromkeys(LITTLE, 0.0)).model_copy(update=bare).build_scene(0)
     assert not world.objects
-    assert world.left_out > 0  # who could have been the ego
+    assert world.num_omitted_road_users > 0  # who could have been the ego
 
 
 def test_a_turn_is_driven_as_slowly_as_its_tightest_piece_asks_for():

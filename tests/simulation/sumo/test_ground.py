@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from torchcover.simulation.height_field import Plain, Slopes
+from torchcover.simulation.height_field import FlatGround, GroundHeightField
 from torchcover.simulation.sumo.ground import Pavement, decks, ground_of, tilts_deg
 from torchcover.simulation.sumo.network import Vicinity, read_network
 
@@ -19,21 +19,23 @@ def vicinity(folder, *edges, way_m=WAY, origin_m=(0.0, 0.0)):
 
 def hill():
     """Ground of random heights."""
-    return Slopes(np.array([-10.0, 5.0]), np.random.default_rng(0).normal(size=(9, 7)), np.ones((8, 6), dtype=bool))
+    return GroundHeightField(
+        np.array([-10.0, 5.0]), np.random.default_rng(0).normal(size=(9, 7)), np.ones((8, 6), dtype=bool)
+    )
 
 
 def test_a_network_of_one_height_has_plain_ground_of_two_triangles(tmp_path):
     ground = ground_of(vicinity(tmp_path, street(z=(3.0, 3.0))))
-    assert isinstance(ground, Plain)
-    assert len(ground.mesh().faces) == 2
-    assert (ground.mesh().vertices_m[:, 2] == 3.0).all()
-    assert (ground.heights_m(WAY) == 3.0).all()
+    assert isinstance(ground, FlatGround)
+    assert len(ground.build_mesh().faces) == 2
+    assert (ground.build_mesh().vertices_m[:, 2] == 3.0).all()
+    assert (ground.compute_heights_m(WAY) == 3.0).all()
 
 
 def test_a_street_that_climbs_takes_the_ground_with_it(tmp_path):
     ground = ground_of(vicinity(tmp_path, street(z=(0.0, 20.0))))
     along = np.column_stack([np.linspace(20.0, 380.0, 50), np.zeros(50)])
-    np.testing.assert_allclose(ground.heights_m(along), 0.05 * along[:, 0], atol=0.02)
+    np.testing.assert_allclose(ground.compute_heights_m(along), 0.05 * along[:, 0], atol=0.02)
     pitch, roll = tilts_deg(ground, along, np.zeros(50), (5.0, 2.0)).T
     np.testing.assert_allclose(pitch, -np.rad2deg(np.arctan(0.05)), atol=0.1)  # the nose is up
     np.testing.assert_allclose(roll, 0.0, atol=0.1)
@@ -44,8 +46,8 @@ def test_a_street_that_climbs_takes_the_ground_with_it(tmp_path):
 def test_bodies_stand_on_the_triangles_that_rays_hit():
     ground, generator = hill(), np.random.default_rng(1)
     places_m = generator.uniform([-10.0, 5.0], [20.0, 45.0], (200, 2))
-    corners_m = ground.mesh().vertices_m[ground.mesh().faces]
-    for place_m, height_m in zip(places_m, ground.heights_m(places_m), strict=True):
+    corners_m = ground.build_mesh().vertices_m[ground.build_mesh().faces]
+    for place_m, height_m in zip(places_m, ground.compute_heights_m(places_m), strict=True):
         a, b, c = corners_m[:, 0], corners_m[:, 1], corners_m[:, 2]
         sides = [
             (q - p)[:, 0] * (place_m[1] - p[:, 1]) - (q - p)[:, 1] * (place_m[0] - p[:, 0])
@@ -58,7 +60,7 @@ def test_bodies_stand_on_the_triangles_that_rays_hit():
 
 
 def test_the_ground_faces_up_and_has_no_holes():
-    mesh = trimesh.Trimesh(*hill().mesh(), process=False)
+    mesh = trimesh.Trimesh(*hill().build_mesh(), process=False)
     assert (mesh.face_normals[:, 2] > 0).all()
     assert mesh.area_faces @ mesh.face_normals[:, 2] == pytest.approx(8 * 6 * 25.0)
 
@@ -73,7 +75,7 @@ def test_kerbs_are_closed_and_as_high_as_they_should_be(z, tmp_path):
     assert body.is_watertight
     assert body.is_winding_consistent
     assert body.volume == pytest.approx(400.0 * 2.0 * (0.15 + 0.3), rel=1e-3)
-    above_m = mesh.vertices_m[:, 2] - ground.heights_m(mesh.vertices_m[:, :2])
+    above_m = mesh.vertices_m[:, 2] - ground.compute_heights_m(mesh.vertices_m[:, :2])
     np.testing.assert_allclose(np.unique(above_m.round(9)), [-0.3, 0.15])
     on, off = np.array([[50.0, -2.75], [399.0, -3.7]]), np.array([[50.0, -1.7], [50.0, 0.0], [50.0, -3.8]])
     assert pavement.holds(on).all()
@@ -98,8 +100,10 @@ def test_a_bridge_has_a_deck_and_the_ground_goes_below(tmp_path):
     over = edge("over", (DRIVE, 7.0, [(100, -150, 0), (100, -60, 6), (100, 60, 6), (100, 150, 0)]))
     near = vicinity(tmp_path, street(), over)
     ground = ground_of(near)
-    np.testing.assert_allclose(ground.heights_m(np.array([[80.0, 0.0], [100.0, 0.0], [120.0, 0.0]])), 0.0, atol=0.05)
-    np.testing.assert_allclose(ground.heights_m(np.array([[100.0, -55.0], [100.0, 55.0]])), 6.0, atol=0.1)
+    np.testing.assert_allclose(
+        ground.compute_heights_m(np.array([[80.0, 0.0], [100.0, 0.0], [120.0, 0.0]])), 0.0, atol=0.05
+    )
+    np.testing.assert_allclose(ground.compute_heights_m(np.array([[100.0, -55.0], [100.0, 55.0]])), 6.0, atol=0.1)
     (deck,) = decks(near)
     body = trimesh.Trimesh(*deck, process=False)
     assert body.is_watertight

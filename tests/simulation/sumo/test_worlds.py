@@ -23,8 +23,8 @@ def made(folder, *edges, steps=None, **options):
 
 
 def test_the_ego_drives_as_it_did_there(tmp_path):
-    world = made(tmp_path, ego_id="ego").world(0)
-    assert world.steps == 41
+    world = made(tmp_path, ego_id="ego").build_scene(0)
+    assert world.num_time_steps == 41
     positions_m = world.ego.trajectory.positions_m
     np.testing.assert_allclose(np.diff(positions_m[:, 0]), 1.0, atol=1e-9)
     np.testing.assert_array_equal(positions_m[:, 1:], 0.0)
@@ -38,7 +38,7 @@ def test_coordinates_of_utm_size_change_nothing(tmp_path):
     for folder, shift in ((here, (0.0, 0.0)), (there, UTM)):
         folder.mkdir()
         steps = together(drive(shift=shift), drive("b", y=3.0, start=70.0, shift=shift))
-        worlds.append(made(folder, street(z=(0.0, 8.0), shift=shift), steps=steps, ego_id="ego").world(3))
+        worlds.append(made(folder, street(z=(0.0, 8.0), shift=shift), steps=steps, ego_id="ego").build_scene(3))
     for one, other in zip(worlds[0].static, worlds[1].static, strict=True):
         np.testing.assert_allclose(one.vertices_m, other.vertices_m, atol=1e-6)
     for one, other in zip((worlds[0].ego, *worlds[0].actors), (worlds[1].ego, *worlds[1].actors), strict=True):
@@ -47,7 +47,7 @@ def test_coordinates_of_utm_size_change_nothing(tmp_path):
 
 def test_who_comes_and_goes_is_there_for_that_time_and_who_is_far_never(tmp_path):
     late = {t: row for t, row in drive("late", y=3.0).items() if 1.0 <= t <= 2.0}
-    world = made(tmp_path, steps=together(drive(), late, drive("far", y=260.0)), ego_id="ego").world(0)
+    world = made(tmp_path, steps=together(drive(), late, drive("far", y=260.0)), ego_id="ego").build_scene(0)
     (actor,) = world.actors
     assert (actor.category, actor.trajectory.is_transient) == ("car", True)
     there = np.isfinite(actor.trajectory.interpolate_positions_m(np.array([0.8, 1.0, 2.0, 2.2]))[:, 0])
@@ -59,7 +59,7 @@ def test_types_have_bodies_by_class_and_length(tmp_path):
     rows = [drive()] + [drive(f"{kind}", y=5.0 * k, type=kind) for kind, k in kinds.items()]
     routes = tmp_path / "r.xml"
     routes.write_text('<routes><vType id="passenger" length="6.2"/><vType id="truck" vClass="trailer"/></routes>')
-    world = made(tmp_path, steps=together(*rows), ego_id="ego", routes=(routes,)).world(0)
+    world = made(tmp_path, steps=together(*rows), ego_id="ego", routes=(routes,)).build_scene(0)
     words = [actor.name.removeprefix(REAR_OF).split() for actor in world.actors]
     assert {name: kind.partition("_")[0] for kind, name, _ in words} == {
         "bus": "bus", "truck": "truck", "bicycle": "cyclist", "motorcycle": "motorcycle", "pedestrian": "adult",
@@ -71,16 +71,16 @@ def test_whoever_is_where_another_one_is_is_left_out_with_a_count(tmp_path):
     pair = drive("one", start=90.0), drive("other", start=92.0)
     steps = together(drive(), drive("ghost", start=52.0), *pair, drive("free", start=120.0))
     with pytest.warns(UserWarning, match=r"has 2 of 4 road users where another one is.* \('ghost', 'other'\)"):
-        world = made(tmp_path, steps=steps, ego_id="ego").world(0)
+        world = made(tmp_path, steps=steps, ego_id="ego").build_scene(0)
     assert [actor.name.split()[1] for actor in world.actors] == ["one", "free"]
-    assert world.left_out == 2
+    assert world.num_omitted_road_users == 2
 
 
 def test_one_street_without_sidewalks_is_a_world_and_people_walk_where_they_are_told(tmp_path):
     bare = edge("east", (DRIVE, 3.5, [(0.0, 0.0, 0.0), (400.0, 0.0, 0.0)]))
     walker = drive("walker", speed=1.0, start=60.0, y=3.0, tag="person")
     rider = drive("rider", tag="person")  # and nothing else: where the ego is
-    world = made(tmp_path, bare, steps=together(drive(), walker, rider), ego_id="ego").world(0)
+    world = made(tmp_path, bare, steps=together(drive(), walker, rider), ego_id="ego").build_scene(0)
     (person,) = world.actors
     assert person.category == "pedestrian"
     np.testing.assert_allclose(np.ptp(person.trajectory.positions_m, axis=0), [4.0, 0.0, 0.0], atol=1e-9)
@@ -90,7 +90,7 @@ def test_a_vehicle_that_is_told_longer_than_its_street_is_as_long_as_the_longest
     (tmp_path / "r.xml").write_text('<routes><vType id="train" vClass="truck" length="900"/></routes>')
     steps = together(drive(), drive("long", start=320.0, y=9.0, type="train"))
     edges = street(), street("north", y=9.0)
-    world = made(tmp_path, *edges, steps=steps, ego_id="ego", routes=(tmp_path / "r.xml",)).world(0)
+    world = made(tmp_path, *edges, steps=steps, ego_id="ego", routes=(tmp_path / "r.xml",)).build_scene(0)
     assert [actor.name for actor in world.actors] in ([], ["truck long 0", "rear of truck long 0"])
     assert all(np.ptp(actor.mesh.vertices_m[:, 0]) < 14.0 for actor in world.actors)
 
@@ -100,7 +100,7 @@ def test_who_is_too_wide_for_the_lane_between_two_kerbs_is_left_out(tmp_path):
     lane = edge("east", kerbs[0], (DRIVE, 2.2, [(0.0, 0.0, 0.0), (400.0, 0.0, 0.0)]), kerbs[1])
     steps = together(drive(), drive("bus", start=90.0, type="bus"), drive("cyclist", start=120.0, type="bicycle"))
     with pytest.warns(UserWarning, match=r"has 1 of 2 road users .* \('bus'\)"):
-        world = made(tmp_path, lane, steps=steps, ego_id="ego").world(0)
+        world = made(tmp_path, lane, steps=steps, ego_id="ego").build_scene(0)
     assert [actor.category for actor in world.actors] == ["cyclist"]
 
 
@@ -108,7 +108,7 @@ def test_people_walk_on_the_pavement_and_step_down(tmp_path):
     walks = {
         t: vehicle("p", 60.0, -3.0 + 0.5 * t, 0.0, tag="person") for t in (round(0.2 * k, 1) for k in range(31))
     }  # fmt: skip
-    world = made(tmp_path, steps=together(drive(until=6.0, y=9.0), walks), ego_id="ego", duration_s=6.0).world(0)
+    world = made(tmp_path, steps=together(drive(until=6.0, y=9.0), walks), ego_id="ego", duration_s=6.0).build_scene(0)
     height_m = world.actors[0].trajectory.positions_m[:, 2]
     assert height_m[0] == pytest.approx(0.15)
     assert height_m[-1] == pytest.approx(0.0)
@@ -119,7 +119,9 @@ def test_people_walk_on_the_pavement_and_step_down(tmp_path):
 def test_on_a_bridge_one_stands_on_its_deck(tmp_path):
     over = edge("over", ("", 7.0, [(100, -150, 0), (100, -60, 6), (100, 60, 6), (100, 150, 0)]))
     above = {t: vehicle("up", 100.0, -20 + 10 * t, 0.0, z=6.0) for t in drive()}
-    world = made(tmp_path, street(), over, steps=together(drive(start=100.0, z=0.0), above), ego_id="ego").world(0)
+    world = made(tmp_path, street(), over, steps=together(drive(start=100.0, z=0.0), above), ego_id="ego").build_scene(
+        0
+    )
     np.testing.assert_allclose(world.actors[0].trajectory.positions_m[:, 2], 6.0, atol=0.15)
     np.testing.assert_allclose(world.ego.trajectory.positions_m[:, 2], 0.0, atol=0.1)
 
@@ -128,8 +130,8 @@ def test_on_a_bridge_one_stands_on_its_deck(tmp_path):
 def test_houses_stand_beside_streets_and_apart(z, tmp_path):
     # At right angles, so that lots of either lie on the other and on its lots.
     north = edge("north", ("", 3.5, [(100, -200, z[1] / 4), (100, 200, z[1] / 4)]))
-    world = made(tmp_path, street(z=z), north, built_share=1.0, ego_id="ego").world(0)
-    ground, _, houses, _ = world.static
+    world = made(tmp_path, street(z=z), north, built_share=1.0, ego_id="ego").build_scene(0)
+    ground, _, houses, _ = world.static_meshes
     outlines_m = corners_of(houses)
     polygons = shapely.polygons(outlines_m)
     assert len(polygons) > 25
@@ -148,8 +150,8 @@ def test_houses_stand_beside_streets_and_apart(z, tmp_path):
 
 def test_what_stands_beside_streets_keeps_off_them_and_off_houses(tmp_path):
     north = edge("north", ("", 3.5, [(100, -200, 0), (100, 200, 0)]))
-    world = made(tmp_path, street(), north, built_share=0.3, ego_id="ego").world(0)
-    houses, others = world.static[2:]
+    world = made(tmp_path, street(), north, built_share=0.3, ego_id="ego").build_scene(0)
+    houses, others = world.static_meshes[2:]
     standing = [shapely.Polygon(outline) for outline, low_m, _ in pieces(others) if low_m < 0.1]
     assert len(standing) > 100
     around = shapely.STRtree(standing)
@@ -166,8 +168,8 @@ def test_a_narrow_gap_between_carriageways_is_a_median_and_a_wide_one_is_not(tmp
         folder = tmp_path / str(gap)
         folder.mkdir()
         ways = [edge(name, ("", 3.5, [(0, y, 0), (400, y, 0)])) for name, y in (("a", 0.0), ("b", 3.5 + gap))]
-        world = made(folder, *ways, built_share=0.0, ego_id="ego").world(0)
-        raised = [mesh for mesh in world.static[1:] if np.ptp(mesh.vertices_m[:, 2]) < 0.5]
+        world = made(folder, *ways, built_share=0.0, ego_id="ego").build_scene(0)
+        raised = [mesh for mesh in world.static_meshes[1:] if np.ptp(mesh.vertices_m[:, 2]) < 0.5]
         assert len(raised) == found
         if raised:
             top_m = raised[0].vertices_m[raised[0].vertices_m[:, 2] > 0.1]
@@ -177,23 +179,23 @@ def test_a_narrow_gap_between_carriageways_is_a_median_and_a_wide_one_is_not(tmp
 
 
 def test_open_country_has_no_houses(tmp_path):
-    world = made(tmp_path, built_share=0.0, ego_id="ego").world(0)
-    assert len(world.static) == 3
-    assert world.static[2].vertices_m[:, 2].max() < 12.0
-    assert len(made(tmp_path, built_share=0.0, roadside=0.0, ego_id="ego").world(0).static) == 2
+    world = made(tmp_path, built_share=0.0, ego_id="ego").build_scene(0)
+    assert len(world.static_meshes) == 3
+    assert world.static_meshes[2].vertices_m[:, 2].max() < 12.0
+    assert len(made(tmp_path, built_share=0.0, roadside=0.0, ego_id="ego").build_scene(0).static_meshes) == 2
 
 
 def test_cars_are_parked_in_bays_only(tmp_path):
     line = [(0, 4), (400, 4)]
     bays = edge("bays", ('type="parking" disallow="all"', 2.3, line))
     far = [edge(name, (who, 2.3, line)) for name, who in (("s", 'disallow="all"'), ("d", ""))]
-    parked = made(tmp_path, street(), bays, ego_id="ego", parked_share=1.0).world(0).parked
+    parked = made(tmp_path, street(), bays, ego_id="ego", parked_share=1.0).build_scene(0).static_actors
     assert 40 < len(parked) < 80
     places_m = np.array([actor.trajectory.positions_m[0] for actor in parked])
     np.testing.assert_allclose(places_m[:, 1], 4.0)
     assert np.diff(np.sort(places_m[:, 0])).min() > 4.0
-    assert not made(tmp_path, street(), bays, ego_id="ego", parked_share=0.0).world(0).parked
-    assert not made(tmp_path, street(), *far, ego_id="ego", parked_share=1.0).world(0).parked
+    assert not made(tmp_path, street(), bays, ego_id="ego", parked_share=0.0).build_scene(0).static_actors
+    assert not made(tmp_path, street(), *far, ego_id="ego", parked_share=1.0).build_scene(0).static_actors
 
 
 @pytest.mark.parametrize(
@@ -224,7 +226,7 @@ def test_cars_are_parked_in_bays_only(tmp_path):
 )
 def test_without_an_ego_there_is_no_world(options, message, tmp_path):
     with pytest.raises(ValueError, match=message):
-        made(tmp_path, **options).world(0)
+        made(tmp_path, **options).build_scene(0)
 
 
 @pytest.mark.parametrize(
@@ -250,7 +252,7 @@ def test_files_lie_beside_the_document_and_count_as_content(tmp_path):
     document.write_text("name: s\ntraffic: {type: sumo, net: a.net.xml, fcd: fcd.xml, duration_s: 4.0}")
     traffic = Scenario.load(document).traffic
     assert isinstance(traffic, Procedural)
-    before = traffic.content()
-    assert traffic.world(0).actors == ()
+    before = traffic.collect_content()
+    assert traffic.build_scene(0).actors == ()
     (tmp_path / "fcd.xml").write_text(fcd(together(drive(), drive("b"))))
-    assert traffic.content() != before
+    assert traffic.collect_content() != before

@@ -27,12 +27,12 @@ KINDS = {
 @cache
 def boxes():
     sizes = {kind: BoundingBox.from_points(mesh.vertices_m).size_m for kind, mesh in load_bodies().items()}
-    return {kind: shapes.Box(type="box", size_m=size).mesh() for kind, size in sizes.items()}
+    return {kind: shapes.Box(type="box", size_m=size).build_mesh() for kind, size in sizes.items()}
 
 
 @cache
 def built(kind, seed):
-    return KINDS[kind].world(seed, bodies=boxes())
+    return KINDS[kind].build_scene(seed, bodies=boxes())
 
 
 @pytest.fixture(scope="session")

@@ -33,15 +33,17 @@ def test_along_a_line_the_angle_falls_as_in_the_closed_form_whatever_the_steps()
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_on_a_straight_both_parts_are_the_whole_vehicle(kind):
-    hitch, bodies, whole = DRAWS[kind], load_bodies(), Vehicle.load(kind).mesh()
+    hitch, bodies, whole = DRAWS[kind], load_bodies(), Vehicle.load(kind).build_mesh()
     front = np.array([[hitch.ahead_m, 0.0, 0.0]])
     (rear,) = rears_of([kind], [front])
-    parts = [bodies[part].moved(at(pose[0])) for part, pose in ((kind, front), (hitch.rear, rear))]
+    parts = [bodies[part].transform(at(pose[0])) for part, pose in ((kind, front), (hitch.rear, rear))]
     vertices_m = np.concatenate([mesh.vertices_m for mesh in parts])
     assert sorted(vertices_m.round(6).tolist()) == sorted(whole.vertices_m.round(6).tolist())
     assert Fleet(bodies, None, np.random.default_rng()).length_m(kind) == pytest.approx(np.ptp(vertices_m[:, 0]))
     # The axles are where those of the vehicle are, and the hitch is before them.
-    wheels_m = [mesh for part in Vehicle.load(kind).parts if part.name == "trailer wheels" for mesh in part.meshes()]
+    wheels_m = [
+        mesh for part in Vehicle.load(kind).parts if part.name == "trailer wheels" for mesh in part.build_meshes()
+    ]
     middle_m = np.mean([mesh.vertices_m[:, 0].mean() for mesh in wheels_m])
     assert hitch.ahead_m + hitch.hitch_m - hitch.rod_m == pytest.approx(middle_m, abs=1e-6)
 
@@ -51,7 +53,7 @@ def test_on_a_straight_both_parts_are_the_whole_vehicle(kind):
 def test_the_parts_of_a_vehicle_never_meet_however_it_turns(kind, turned_deg):
     bodies = load_bodies()
     (rear,) = rears_of([kind], [np.zeros((1, 3))], [np.deg2rad(turned_deg)])
-    meshes = bodies[kind], bodies[DRAWS[kind].rear].moved(at(rear[0]))
+    meshes = bodies[kind], bodies[DRAWS[kind].rear].transform(at(rear[0]))
     pieces = [Solids.of_static([mesh]) for mesh in meshes]
     both = Solids.of_static(meshes)
     part = np.repeat([0, 1], [len(solids.low) for solids in pieces])

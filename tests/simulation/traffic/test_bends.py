@@ -225,7 +225,7 @@ def test_what_is_built_in_the_hills_is_closed_and_stands_on_the_ground(kind, wor
         starts = np.column_stack([places, np.full(len(places), 90.0)]).astype(np.float32)
         down = np.tile(np.array([[0.0], [0.0], [-1.0]], dtype=np.float32), len(places))
         hits = ground.cast_from_each(starts, down, np.full(len(places), 200.0, dtype=np.float32))
-        assert (hits.body >= 0).all()
+        assert (hits.body_indices >= 0).all()
         return 90.0 - hits.range_m
 
     for actor in (w.ego, *w.actors, *w.parked):
@@ -255,6 +255,6 @@ def test_the_ego_turns_at_junctions(world):
 
 
 def test_open_country_has_no_houses():
-    w = Urban(duration_s=2.0, built_share=0.0, hills_m=0.0).world(1)
-    assert len(w.static) == 3
-    assert max(mesh.vertices_m[:, 2].max() for mesh in w.static) < 12.0
+    w = Urban(duration_s=2.0, built_share=0.0, hills_m=0.0).build_scene(1)
+    assert len(w.static_meshes) == 3
+    assert max(mesh.vertices_m[:, 2].max() for mesh in w.static_meshes) < 12.0

@@ -6,7 +6,7 @@ import shapely
 import trimesh
 from pydantic import TypeAdapter, ValidationError
 
-from torchcover.simulation.bodies import merge
+from torchcover.simulation.bodies import merge_meshes
 from torchcover.simulation.traffic import Urban
 from torchcover.simulation.traffic.frontage import HOUSES, KINDS, Side, Times, stand
 
@@ -37,7 +37,7 @@ def usual():
 
 
 def solids(meshes):
-    return trimesh.Trimesh(*merge(list(meshes))[:2], process=False).split(only_watertight=False)
+    return trimesh.Trimesh(*merge_meshes(list(meshes))[:2], process=False).split(only_watertight=False)
 
 
 def test_all_of_it_is_closed_and_stands_on_the_ground(usual):
@@ -76,7 +76,7 @@ def test_densities_are_times_as_much_down_to_none():
     assert stood(0.0)[0]
     hedges = stood({**OFF, "hedge": 1.0})[1]
     assert len(hedges) == 1
-    assert np.ptp(hedges[0].material) == 0
+    assert np.ptp(hedges[0].material_indices) == 0
     assert stood({**OFF, "hedge": 1.0}, "open") == ([], [])
 
 

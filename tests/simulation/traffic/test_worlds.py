@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from torchcover.simulation.patches import outward_faces
+from torchcover.simulation.patches import find_outward_faces
 from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.traffic import Highway, Parking, Urban, urban
@@ -34,9 +34,9 @@ def speeds(actor):
 def test_the_same_seed_gives_the_same_world_and_another_seed_another(kind, bodies):
     model = {"urban": Urban, "highway": Highway, "parking": Parking}.get(kind, Urban)
     options = {"lanes": 2} if kind == "narrow" else {}
-    first, again = (model(duration_s=3.0, **options).world(seed, bodies=bodies) for seed in (5, 5))
-    other = model(duration_s=3.0, **options).world(6, bodies=bodies)
-    for one, two in zip(first.static, again.static, strict=True):
+    first, again = (model(duration_s=3.0, **options).build_scene(seed, bodies=bodies) for seed in (5, 5))
+    other = model(duration_s=3.0, **options).build_scene(6, bodies=bodies)
+    for one, two in zip(first.static_meshes, again.static_meshes, strict=True):
         np.testing.assert_array_equal(one.vertices_m, two.vertices_m)
         np.testing.assert_array_equal(one.faces, two.faces)
     for one, two in zip([first.ego, *first.actors], [again.ego, *again.actors], strict=True):
@@ -83,7 +83,7 @@ def test_what_is_known_of_faces_is_what_would_be_found(kind, known, world):
     static = [mesh for mesh in world(kind, 0).static if mesh.outward is not None]
     assert len(static) == known  # the ground, pavements, houses, and what is smaller
     for mesh in static:
-        np.testing.assert_array_equal(mesh.outward, outward_faces(mesh._replace(outward=None)))
+        np.testing.assert_array_equal(mesh.outward, find_outward_faces(mesh._replace(outward=None)))
 
 
 @pytest.mark.parametrize("kind", [*WORLDS, "hilly", "motorway"])
@@ -101,10 +101,10 @@ def test_rays_always_hit_the_ground(kind, world):
         static = [Mesh(mesh.vertices_m - pose[:3, 3], mesh.faces) for mesh in w.static]
         limit = np.full(50_000, 1000.0, dtype=np.float32)
         hits = RayCaster(static).cast(origin, directions, limit)
-        assert (hits.body >= 0).all()
+        assert (hits.body_indices >= 0).all()
         # The ground alone has no holes either, whatever stands on it.
         on_ground = RayCaster(static[:1]).cast(origin, directions, limit)
-        assert (on_ground.body == 0).all()
+        assert (on_ground.body_indices == 0).all()
         if kind in WORLDS:
             assert (100.0 + hits.range_m * directions[2]).min() > -0.01
             np.testing.assert_allclose(on_ground.range_m * directions[2], -100.0, atol=0.01)
@@ -202,10 +202,11 @@ def test_people_cross_the_aisles_of_the_lot_and_cars_are_slow(world):
 
 def test_a_lot_is_surrounded_by_what_stands_beside_streets_and_that_keeps_off_it(bodies):
     full, bare = (
-        Parking(duration_s=1.0, **keys).world(0, bodies=bodies) for keys in ({}, {"built_share": 0, "roadside": 0})
+        Parking(duration_s=1.0, **keys).build_scene(0, bodies=bodies)
+        for keys in ({}, {"built_share": 0, "roadside": 0})
     )
-    *same, houses, others = full.static
-    assert len(bare.static) == len(same)
+    *same, houses, others = full.static_meshes
+    assert len(bare.static_meshes) == len(same)
     places_m = np.concatenate([houses.vertices_m, others.vertices_m])[:, :2]
     # Crowns hang over its edge, by less than half their width.
     least_m = np.abs(places_m / np.array([62.0, 36.0])).max(axis=1)[places_m[:, 1] > 0.0].min()
@@ -254,19 +255,19 @@ def test_impossible_parameters_are_errors(model, options):
 def test_a_missing_body_is_an_error_that_names_it(bodies):
     few = {kind: mesh for kind, mesh in bodies.items() if kind not in ("bus", "adult")}
     with pytest.raises(ValueError, match="none for adult, bus"):
-        Urban().world(0, bodies=few)
+        Urban().build_scene(0, bodies=few)
 
 
 def test_the_ego_may_have_a_body_of_its_own(bodies):
-    w = Urban(duration_s=2.0).world(0, ego=bodies["bus"], bodies=bodies)
+    w = Urban(duration_s=2.0).build_scene(0, ego_mesh=bodies["bus"], bodies=bodies)
     assert w.ego.mesh is bodies["bus"]
 
 
 def test_who_is_left_out_changes_nothing(monkeypatch, bodies):
-    few = Urban(duration_s=8.0).world(3, bodies=bodies)
+    few = Urban(duration_s=8.0).build_scene(3, bodies=bodies)
     monkeypatch.setattr(urban, "_who_matter", lambda lanes, agents, duration_s: agents)
     monkeypatch.setattr(urban, "come_near", lambda lanes, agents, place_m: np.arange(len(agents)))
-    everybody = Urban(duration_s=8.0).world(3, bodies=bodies)
+    everybody = Urban(duration_s=8.0).build_scene(3, bodies=bodies)
     assert [actor.name for actor in few.actors] == [actor.name for actor in everybody.actors]
     for one, other in zip((few.ego, *few.actors), (everybody.ego, *everybody.actors), strict=True):
         np.testing.assert_array_equal(one.trajectory.positions_m, other.trajectory.positions_m)
@@ -277,7 +278,7 @@ def test_nobody_is_where_the_street_is_not_built(monkeypatch, bodies):
     # Farther on a street may come back, through what stands beside it here.
     for name, way_m in {"BEHIND_M": 30.0, "AHEAD_M": 60.0, "ASIDE_M": 20.0}.items():
         monkeypatch.setattr(urban, name, way_m)
-    city = Urban(bend_deg=0.5, turn_share=0.0, duration_s=4.0, time_step_s=0.5).world(0, bodies=bodies)
+    city = Urban(bend_deg=0.5, turn_share=0.0, duration_s=4.0, time_step_s=0.5).build_scene(0, bodies=bodies)
     first_m, last_m = city.ego.trajectory.positions_m[[0, -1], 0]
     along = [actor for actor in city.actors if abs(np.sin(np.deg2rad(actor.trajectory.angles_deg[0, 0]))) < 0.1]
     x_m = np.concatenate([actor.trajectory.positions_m[:, 0] for actor in along])
@@ -289,7 +290,7 @@ def test_nobody_is_where_the_street_is_not_built(monkeypatch, bodies):
 def test_cross_streets_have_a_share_of_the_traffic(bodies):
     def across(share):
         city = Urban(bend_deg=0.0, turn_share=0.0, cross_share=share, duration_s=2.0, time_step_s=0.5)
-        drivers = [actor for actor in city.world(0, bodies=bodies).actors if actor.category != "pedestrian"]
+        drivers = [actor for actor in city.build_scene(0, bodies=bodies).actors if actor.category != "pedestrian"]
         return sum(abs(np.sin(np.deg2rad(actor.trajectory.angles_deg[0, 0]))) > 0.9 for actor in drivers)
 
     assert across(0.0) == 0

@@ -14,7 +14,14 @@ from torchcover.geometry.arrays import Float64
 from torchcover.recordings.formats.tracks import check_gaps, read_box_tracks
 from torchcover.recordings.objects import Track
 from torchcover.simulation.bodies import Vehicle
-from torchcover.simulation.height_field import CELL_M, MARGIN_M, Plain, Slopes, corners_of, middles_m
+from torchcover.simulation.height_field import (
+    CELL_M,
+    MARGIN_M,
+    FlatGround,
+    GroundHeightField,
+    compute_cell_centers_m,
+    count_corners,
+)
 from torchcover.simulation.shapes import Box, Mesh
 from torchcover.simulation.traffic.assemble import HORIZON_M
 from torchcover.simulation.traffic.fleet import CATEGORIES, VehicleType, load_bodies
@@ -31,7 +38,7 @@ LEFT_OF = np.array([[0.0, 1.0], [-1.0, 0.0]])
 SCALES_M = tuple(CELL_M * factor for factor in (16.0, 8.0, 4.0, 2.0, 1.0))
 
 
-def ground_below(places_m: Float64, ego_m: Float64) -> Plain | Slopes:
+def ground_below(places_m: Float64, ego_m: Float64) -> FlatGround | GroundHeightField:
     """The ground around the ego's way: plain if everybody stands at one height.
 
     The (T, 3) places on which the ego stood are believed; of the (N, 3) of others some may be wrong.
@@ -43,17 +50,19 @@ def ground_below(places_m: Float64, ego_m: Float64) -> Plain | Slopes:
     trusted = np.arange(len(places_m)) < len(ego_m)
     base_m = float(ego_m[0, 2])
     if (places_m[:, 2] == base_m).all():
-        return Plain(base_m, lower_m, upper_m)
+        return FlatGround(base_m, lower_m, upper_m)
     inside = ((places_m[:, :2] > lower_m) & (places_m[:, :2] < upper_m)).all(axis=1)
     across_m, over_m = places_m[inside, :2] - lower_m, places_m[inside, 2] - base_m
-    rows, columns = corners_of(lower_m, upper_m)
+    rows, columns = count_corners(lower_m, upper_m)
     field = fit_height_field(across_m, over_m, upper_m - lower_m, SCALES_M, trusted_mask=trusted[inside])
     corners: Float64 = CELL_M * np.indices((rows, columns))[::-1].reshape(2, -1).T.astype(np.float64)
     way_m = ego_m[:, :2] if len(ego_m) > 1 else np.repeat(ego_m[:, :2], 2, axis=0)
     way = shapely.LineString(way_m - lower_m).simplify(0.5)
     shapely.prepare(way)
-    seen = shapely.dwithin(shapely.points(middles_m(np.zeros(2), rows, columns)), way, HORIZON_M + BEYOND_M)
-    return Slopes(
+    seen = shapely.dwithin(
+        shapely.points(compute_cell_centers_m(np.zeros(2), rows, columns)), way, HORIZON_M + BEYOND_M
+    )
+    return GroundHeightField(
         lower_m, base_m + field.compute_heights_m(corners).reshape(rows, columns), seen.reshape(rows - 1, columns - 1)
     )
 
@@ -72,15 +81,17 @@ def stood_on(tracks: Sequence[Float64]) -> Float64:
     return np.concatenate([np.empty((0, 3)), *map(thinned, tracks)])
 
 
-def tilted(body: Actor, ground: Plain | Slopes) -> Actor:
+def tilted(body: Actor, ground: FlatGround | GroundHeightField) -> Actor:
     """The body with the slope of the ground below its wheels, if its own was not recorded; people stand upright."""
     own = body.trajectory
-    if isinstance(ground, Plain) or body.category == "pedestrian" or own.angles_deg[:, 1:].any():
+    if isinstance(ground, FlatGround) or body.category == "pedestrian" or own.angles_deg[:, 1:].any():
         return body
     angles_deg, yaw = own.angles_deg.copy(), np.deg2rad(own.angles_deg[:, 0])
     ahead, (length, width, _) = np.stack([np.cos(yaw), np.sin(yaw)], axis=1), np.ptp(body.mesh.vertices_m, axis=0)
     for axis, way, apart_m, sign in ((1, ahead, WHEELS * length, -1), (2, ahead @ LEFT_OF, WHEELS * width, 1)):
-        over_m, under_m = (ground.heights_m(own.positions_m[:, :2] + end * apart_m / 2 * way) for end in (1, -1))
+        over_m, under_m = (
+            ground.compute_heights_m(own.positions_m[:, :2] + end * apart_m / 2 * way) for end in (1, -1)
+        )
         angles_deg[:, axis] = sign * np.rad2deg(np.arctan((over_m - under_m) / apart_m))
     return replace(body, trajectory=replace(own, angles_deg=angles_deg))
 
@@ -125,7 +136,7 @@ class Bodies:
 
     def __init__(self) -> None:
         # A box is all of a truck.
-        self._meshes = {**load_bodies(), "truck": Vehicle.load("truck").mesh()}
+        self._meshes = {**load_bodies(), "truck": Vehicle.load("truck").build_mesh()}
         self._sizes_m = {
             kind: np.array(BoundingBox.from_points(mesh.vertices_m).size_m) for kind, mesh in self._meshes.items()
         }
@@ -149,7 +160,7 @@ class Bodies:
 
     def _scaled(self, kind: str | None, size_m: tuple[float, float, float]) -> Mesh:
         if kind is None:
-            return Box(type="box", size_m=size_m).mesh().made_of("car_paint")
+            return Box(type="box", size_m=size_m).build_mesh().assign_material("car_paint")
         mesh = self._meshes[kind]
         return mesh._replace(vertices_m=mesh.vertices_m * (np.array(size_m) / self._sizes_m[kind]))
 

@@ -15,8 +15,8 @@ from torchcover.geometry.trajectory import Trajectory
 from torchcover.recordings.formats import read_objects
 from torchcover.recordings.formats.tracks import read_trajectory
 from torchcover.recordings.objects import Ego, RecordedObjects
-from torchcover.simulation.bodies import sound_mesh
-from torchcover.simulation.documents import PathBeside, Pose, builtin_hashes
+from torchcover.simulation.bodies import build_checked_mesh
+from torchcover.simulation.documents import Pose, RelativePath, hash_builtin_documents
 from torchcover.simulation.recorded.bodies import Bodies, ground_below, sides_of, stood_on, tilted
 from torchcover.simulation.recorded.run import Excerpt, cast_of, excerpt_of, pieces, poses_at_all
 from torchcover.simulation.shapes import Mesh, MeshFile
@@ -25,7 +25,7 @@ from torchcover.simulation.traffic.fleet import EGO, load_bodies
 from torchcover.simulation.traffic.frontage import Times, stand
 from torchcover.simulation.traffic.kind import Traffic
 from torchcover.simulation.traffic.scenery import few
-from torchcover.simulation.world import Actor, World, steps_of
+from torchcover.simulation.world import Actor, Scene, count_time_steps
 
 # A time that is so near to an instant is that instant.
 SNAP_S = 1e-6
@@ -58,18 +58,18 @@ class RecordedTraffic(Traffic):
         time_step_s: Time between two frames.
     """
 
-    repeats: ClassVar[bool] = True
+    is_repeating: ClassVar[bool] = True
 
     type: Literal["tracks"] = "tracks"
-    path: PathBeside
+    path: RelativePath
     scene: str | None = None
     ego_id: Annotated[str | None, BeforeValidator(_as_id)] = None
-    ego_trajectory: PathBeside | None = None
+    ego_trajectory: RelativePath | None = None
     ego_T_vehicle: Pose | None = None
     begin_s: Annotated[float, Field(ge=0.0)] = 0.0
     duration_s: Annotated[float | None, Field(ge=0.0)] = None
     max_gap_s: Annotated[float, Field(gt=0.0)] = 1.0
-    ground: PathBeside | None = None
+    ground: RelativePath | None = None
     built_share: Annotated[float | None, Field(ge=0.0, le=1.0)] = None
     roadside: Times = 1.0
 
@@ -93,26 +93,26 @@ class RecordedTraffic(Traffic):
         )
 
     @property
-    def steps(self) -> int:
+    def num_time_steps(self) -> int:
         """Number of instants."""
-        return steps_of(self._run.duration_s, self.time_step_s)
+        return count_time_steps(self._run.duration_s, self.time_step_s)
 
-    def content(self) -> dict[str, Any]:
+    def collect_content(self) -> dict[str, Any]:
         """Its keys, what was recorded, and the bodies that may stand for boxes."""
         return {
-            **Traffic.content(self.model_copy(update={"path": None})),
+            **Traffic.collect_content(self.model_copy(update={"path": None})),
             "objects": self._objects.compute_digest(),
-            "vehicles": builtin_hashes("vehicles"),
+            "vehicles": hash_builtin_documents("vehicles"),
         }
 
-    def world(self, seed: int, ego: Mesh | None = None) -> World:
+    def build_scene(self, seed: int, ego_mesh: Mesh | None = None) -> Scene:
         """Build the world in the frame of the recording, and draw what stands beside streets if that is asked for.
 
         Who is where the ego is at an instant is left out, with a warning.
         """
         run = self._run
         drive = self._shown(run.drive)
-        mesh = load_bodies()["suv"] if ego is None else ego
+        mesh = load_bodies()["suv"] if ego_mesh is None else ego_mesh
         driver = Actor(EGO, "car", mesh, Trajectory(drive.times_s, drive.positions_m, drive.angles_deg))
         others = list(self._actors(driver.trajectory, Bodies()))
         shown = self._apart(driver, others)
@@ -126,12 +126,18 @@ class RecordedTraffic(Traffic):
             if self.built_share is not None:
                 generator = np.random.default_rng(seed)
                 sides, driven, walked = sides_of(driver, shown, self.built_share, generator)
-                stood = few(*stand(sides, driven, walked, (), below.heights_m, self.roadside, generator))
-            ground, driver, shown = below.mesh(), tilted(driver, below), [tilted(other, below) for other in shown]
+                stood = few(*stand(sides, driven, walked, (), below.compute_heights_m, self.roadside, generator))
+            ground, driver, shown = below.build_mesh(), tilted(driver, below), [tilted(other, below) for other in shown]
         else:
             ground = self._read(self.ground)
-        return World(
-            (ground, *stood), driver, tuple(shown), self.time_step_s, run.duration_s, ground=(0,), left_out=left_out
+        return Scene(
+            (ground, *stood),
+            driver,
+            tuple(shown),
+            self.time_step_s,
+            run.duration_s,
+            ground_mesh_indices=(0,),
+            num_omitted_road_users=left_out,
         )
 
     @cached_property
@@ -147,7 +153,7 @@ class RecordedTraffic(Traffic):
             drive = read_trajectory(self.ego_trajectory)
             driven = Ego(self.ego_trajectory.name, drive.times_s, poses_at_all(drive), np.eye(4))
             recording = RecordedObjects(recording.tracks, (driven,))
-        frame = None if self.ego_T_vehicle is None else self.ego_T_vehicle.matrix()
+        frame = None if self.ego_T_vehicle is None else self.ego_T_vehicle.to_matrix()
         try:
             return excerpt_of(cast_of(recording, self.ego_id, frame), self.begin_s, self.duration_s, self.max_gap_s)
         except ValueError as error:
@@ -163,7 +169,7 @@ class RecordedTraffic(Traffic):
     @property
     def _times_s(self) -> Matrix:
         """(T,) the instants."""
-        return self.time_step_s * np.arange(self.steps, dtype=np.float64)
+        return self.time_step_s * np.arange(self.num_time_steps, dtype=np.float64)
 
     def _actors(self, drive: Trajectory, bodies: Bodies) -> Iterator[Actor]:
         """Everybody who is there during the run and ever comes within the range of sensors."""
@@ -201,4 +207,4 @@ class RecordedTraffic(Traffic):
 
     @staticmethod
     def _read(ground: Path) -> Mesh:
-        return sound_mesh(MeshFile(type="mesh", path=ground), str(ground))
+        return build_checked_mesh(MeshFile(type="mesh", path=ground), str(ground))

@@ -11,7 +11,15 @@ from numpy.typing import NDArray
 from torchcover.geometry import accumulate_heights
 from torchcover.geometry.arrays import Bools, Float64
 from torchcover.geometry.trajectory import Trajectory
-from torchcover.simulation.height_field import CELL_M, MARGIN_M, Ground, Plain, Slopes, corners_of, middles_m
+from torchcover.simulation.height_field import (
+    CELL_M,
+    MARGIN_M,
+    FlatGround,
+    Ground,
+    GroundHeightField,
+    compute_cell_centers_m,
+    count_corners,
+)
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.sumo.motion import Motion, corners_m, rounded
 from torchcover.simulation.sumo.network import Vicinity
@@ -30,16 +38,16 @@ GAP_M, CROSSING_GAP_M = 0.3, 1.3
 SLIVER_M = 0.1
 
 
-def ground_of(vicinity: Vicinity) -> Plain | Slopes:
+def ground_of(vicinity: Vicinity) -> FlatGround | GroundHeightField:
     """The ground around the ego's way: plain if all lanes are of one height, else through all that are no bridges."""
     lower_m, upper_m = vicinity.lower_m - MARGIN_M, vicinity.upper_m + MARGIN_M
     places_m = vicinity.samples_m[~vicinity.on_deck]
     if np.ptp(vicinity.samples_m[:, 2]) == 0.0:
-        return Plain(float(places_m[0, 2]), lower_m, upper_m)
-    rows, columns = corners_of(lower_m, upper_m)
+        return FlatGround(float(places_m[0, 2]), lower_m, upper_m)
+    rows, columns = count_corners(lower_m, upper_m)
     total, weight = accumulate_heights((places_m[:, :2] - lower_m) / CELL_M, places_m[:, 2], rows, columns)
-    wanted = vicinity.sees(middles_m(lower_m, rows, columns)).reshape(rows - 1, columns - 1)
-    return Slopes(lower_m, _filled(total, weight), wanted)
+    wanted = vicinity.sees(compute_cell_centers_m(lower_m, rows, columns)).reshape(rows - 1, columns - 1)
+    return GroundHeightField(lower_m, _filled(total, weight), wanted)
 
 
 def _filled(total: Float64, weight: Float64) -> Float64:
@@ -68,7 +76,7 @@ def tilts_deg(ground: Ground, places_m: Float64, yaw_deg: Float64, size_m: tuple
     forward = np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
     left = np.stack([-forward[:, 1], forward[:, 0]], axis=1)
     rises = [
-        ground.heights_m(places_m + half * way) - ground.heights_m(places_m - half * way)
+        ground.compute_heights_m(places_m + half * way) - ground.compute_heights_m(places_m - half * way)
         for way, half in ((forward, size_m[0] / 3), (left, size_m[1] / 2))
     ]
     # Up at the front is a negative pitch; up at the left lowers the right side.
@@ -94,8 +102,8 @@ class Pavement:
 
     def meshes(self) -> list[Mesh]:
         """One for each piece that is not connected to another."""
-        pieces = self.parts if isinstance(self._ground, Plain) else shapely.segmentize(self.parts, CELL_M)
-        return [plateau(piece, self._ground.heights_m) for piece in pieces]
+        pieces = self.parts if isinstance(self._ground, FlatGround) else shapely.segmentize(self.parts, CELL_M)
+        return [plateau(piece, self._ground.compute_heights_m) for piece in pieces]
 
     def holds(self, places_m: Float64) -> Bools:
         """(N,) whether (N, 2) places are on it."""
@@ -135,7 +143,7 @@ def _strip(line_m: Float64, width_m: float) -> Mesh:
             faces += [[here + a, there + a, there + b], [here + a, there + b, here + b]]
     last = len(vertices_m) - 4
     faces += [[0, 1, 2], [0, 2, 3], [last + 2, last + 1, last], [last + 3, last + 2, last]]
-    return Mesh(vertices_m, np.array(faces)).made_of("road")
+    return Mesh(vertices_m, np.array(faces)).assign_material("road")
 
 
 # Who is so far above the ground is on a bridge.
@@ -178,7 +186,7 @@ class Placing:
         back_m = 0.0 if track.on_foot else motion.user.sizes_m[0][0] / 2
         # What is drawn along is behind.
         back_m = back_m + np.linalg.norm(middle_m - motion.poses[:, :2], axis=1)
-        heights_m = self._ground.heights_m(middle_m)
+        heights_m = self._ground.compute_heights_m(middle_m)
         told_m, slope_deg = (
             np.interp(motion.times_s, track.times_s, told) for told in (track.places_m[:, 2], track.slope_deg)
         )
@@ -188,7 +196,7 @@ class Placing:
         if track.on_foot:
             raised_m = np.where(self._pavement.holds(middle_m) & ~up, PAVEMENT_M, 0.0)
             heights_m = heights_m + rounded(raised_m[:, None], STEP_POSES)[:, 0]
-        elif not isinstance(self._ground, Plain):
+        elif not isinstance(self._ground, FlatGround):
             angles_deg[:, 1:] = tilts_deg(self._ground, middle_m, yaw_deg, size_m)
             angles_deg[up, 1], angles_deg[up, 2] = -slope_deg[up], 0.0
         return np.column_stack([middle_m, np.where(up, on_deck_m, heights_m)]), angles_deg
@@ -214,7 +222,7 @@ def park(
             way_m += length_m
     for kind, drawn in poses.items():
         places = np.array(drawn).reshape(-1, 3)
-        heights_m = ground.heights_m(places[:, :2])
+        heights_m = ground.compute_heights_m(places[:, :2])
         size_m = fleet.length_m(kind), fleet.width_m(kind)
         tilts = tilts_deg(ground, places[:, :2], places[:, 2], size_m)
         turned = np.column_stack([places[:, :2], np.deg2rad(places[:, 2])])

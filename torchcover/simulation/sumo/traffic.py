@@ -12,7 +12,7 @@ from pydantic import Field, model_validator
 from torchcover.files import BadFileError
 from torchcover.geometry.arrays import Bools, Float64
 from torchcover.recordings.other_formats import find_remedy
-from torchcover.simulation.documents import PathBeside
+from torchcover.simulation.documents import RelativePath
 from torchcover.simulation.sumo.crowd import crowd, read_types
 from torchcover.simulation.sumo.floating import Recorded, TimeWindow, read_floating, record
 from torchcover.simulation.sumo.ground import Pavement, Placing, decks, ground_of, park
@@ -73,10 +73,10 @@ class Sumo(Procedural):
     """
 
     type: Literal["sumo"] = "sumo"
-    net: PathBeside | None = None
+    net: RelativePath | None = None
     leave_out_links: bool = False
-    routes: tuple[PathBeside, ...] = ()
-    fcd: PathBeside | None = None
+    routes: tuple[RelativePath, ...] = ()
+    fcd: RelativePath | None = None
     random: DrawnStreets | None = None
     ego_id: str | None = None
     ego_type: str | None = None
@@ -131,9 +131,9 @@ class Sumo(Procedural):
         ground = ground_of(vicinity)
         pavement = Pavement(vicinity, ground)
         sides, taken = sides_of(vicinity, self.built_share, generator)
-        stood = stand(sides, taken, taken, (), ground.heights_m, self.roadside, generator)
+        stood = stand(sides, taken, taken, (), ground.compute_heights_m, self.roadside, generator)
         raised = few(pavement.meshes(), decks(vicinity))
-        static = (ground.mesh(), *raised, *few(*stood))
+        static = (ground.build_mesh(), *raised, *few(*stood))
         parked = park(vicinity, ground, fleet, self.parked_share, generator)
         obstacles = shapely.difference(np.concatenate([pavement.parts, parked]), vicinity.bridges(BELOW_M))
         moved = motions([ego, *others], duration_s, origin_m, obstacles, pavement.walked)

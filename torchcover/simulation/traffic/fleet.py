@@ -152,10 +152,10 @@ def load_bodies() -> Mapping[str, Mesh]:
     truck = Vehicle.load("truck")
     behind = [part.name.startswith("trailer") for part in truck.parts]
     called = {kind: kind for kind in BODIES if kind not in ("truck", "trailer")} | {"child": "child_120cm"}
-    meshes = {kind: Vehicle.load(name).mesh() for kind, name in called.items()}
+    meshes = {kind: Vehicle.load(name).build_mesh() for kind, name in called.items()}
     for kind, is_rear in (("truck", False), ("trailer", True)):
         parts = tuple(part for part, at_rear in zip(truck.parts, behind, strict=True) if at_rear is is_rear)
-        meshes[kind] = truck.model_copy(update={"parts": parts}).mesh()
+        meshes[kind] = truck.model_copy(update={"parts": parts}).build_mesh()
     for kind, sizes in SIZES.items():
         for number, shares in enumerate(sizes, 2):
             meshes[f"{kind}_{number}"] = meshes[kind]._replace(vertices_m=meshes[kind].vertices_m * np.array(shares))

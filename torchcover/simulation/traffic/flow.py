@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from torchcover.geometry.arrays import Bools, Float64, Int64
-from torchcover.simulation.memory import check_fits
+from torchcover.simulation.memory import check_memory_fits
 from torchcover.simulation.traffic.alignment import Beside, Polyline
 from torchcover.simulation.traffic.idm import Driver, Quantity, acceleration_in, advance, tightness
 
@@ -285,7 +285,7 @@ class _Limits:
 
 def check_crowd(agents: float, steps: int) -> None:
     """Refuse more agents than a simulation has memory for, before any of them is made."""
-    check_fits(
+    check_memory_fits(
         f"traffic of about {agents:,.0f} for {steps:,} time steps",
         BYTES_PER_STATE * agents * steps,
         "shorten the duration, or let there be fewer to a kilometre",

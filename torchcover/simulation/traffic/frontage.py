@@ -13,8 +13,8 @@ import shapely
 from pydantic import AfterValidator
 
 from torchcover.geometry.arrays import Bools, Float64, Int64
-from torchcover.simulation.bodies import merge
-from torchcover.simulation.shapes import Mesh, circle
+from torchcover.simulation.bodies import merge_meshes
+from torchcover.simulation.shapes import Mesh, compute_circle_points
 from torchcover.simulation.traffic.scenery import PAVEMENT_M, block, prism
 
 Bounds = tuple[float, float]
@@ -299,7 +299,7 @@ def _copies(form: Mesh, outlines_m: Float64, bottom_m: Float64, base_m: Float64,
     return Mesh(
         np.concatenate([places_m, heights_m[..., None]], axis=2).reshape(-1, 3),
         faces.reshape(-1, 3),
-        np.tile(form.materials, count),
+        np.tile(form.filled_material_indices, count),
         np.ones(len(faces) * len(form.faces), dtype=bool),  # as all forms are closed
     )
 
@@ -308,7 +308,7 @@ def _copies(form: Mesh, outlines_m: Float64, bottom_m: Float64, base_m: Float64,
 def _form(name: str) -> Mesh:
     """A form over the unit square with the street beyond y = 1, from z = 0 to 1."""
     whole = ((0.0, 1.0), (0.0, 1.0), (0.0, 1.0))
-    ring = 0.5 * circle(6)
+    ring = 0.5 * compute_circle_points(6)
     middle = np.array([0.5, 0.5])
 
     def turned(levels: Sequence[float], sizes: Sequence[float]) -> Mesh:
@@ -321,23 +321,23 @@ def _form(name: str) -> Mesh:
 
     parts = {
         "house": [block(*whole)],
-        "hedge": [block(*whole).made_of("vegetation")],
-        "fence": [block(*whole).made_of("wood")],
-        "bin": [block(*whole).made_of("metal")],
-        "bollard": [turned([0.0, 1.0], [1.0, 1.0]).made_of("metal")],
-        "lamp": [turned([0.0, 0.97], [1.0, 0.7]).made_of("metal"), block((0.2, 0.8), (0.0, 11.0), (0.975, 1.0))],
+        "hedge": [block(*whole).assign_material("vegetation")],
+        "fence": [block(*whole).assign_material("wood")],
+        "bin": [block(*whole).assign_material("metal")],
+        "bollard": [turned([0.0, 1.0], [1.0, 1.0]).assign_material("metal")],
+        "lamp": [turned([0.0, 0.97], [1.0, 0.7]).assign_material("metal"), block((0.2, 0.8), (0.0, 11.0), (0.975, 1.0))],
         "tree": [
-            turned([0.0, 0.42], [TRUNK, TRUNK]).made_of("wood"),
-            turned([0.42, 0.6, 0.8, 1.0], [0.45, 1.0, 0.9, 0.3]).made_of("vegetation"),
+            turned([0.0, 0.42], [TRUNK, TRUNK]).assign_material("wood"),
+            turned([0.42, 0.6, 0.8, 1.0], [0.45, 1.0, 0.9, 0.3]).assign_material("vegetation"),
         ],
-        "bush": [turned([0.0, 0.4, 0.8, 1.0], [0.7, 1.0, 0.9, 0.4]).made_of("vegetation")],
+        "bush": [turned([0.0, 0.4, 0.8, 1.0], [0.7, 1.0, 0.9, 0.4]).assign_material("vegetation")],
         "sign": [
-            block((0.0, 1.0), (0.45, 0.55), (0.0, 0.75)).made_of("metal"),
-            block((0.2, 0.8), (0.0, 1.0), (0.755, 1.0)).made_of("sign"),
+            block((0.0, 1.0), (0.45, 0.55), (0.0, 0.75)).assign_material("metal"),
+            block((0.2, 0.8), (0.0, 1.0), (0.755, 1.0)).assign_material("sign"),
         ],
         "bicycle": [
             wheel(0.0), wheel(0.6), block((0.42, 0.58), (0.44, 0.56), (0.25, 0.88)),
             block((0.66, 0.7), (0.0, 1.0), (0.94, 1.0)),
         ],
     }  # fmt: skip
-    return merge(parts[name])
+    return merge_meshes(parts[name])

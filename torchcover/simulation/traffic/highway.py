@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from pydantic import Field
 
 from torchcover.geometry.arrays import Bools, Float64
-from torchcover.simulation.shapes import Mesh, prism_faces
+from torchcover.simulation.shapes import Mesh, build_prism_faces
 from torchcover.simulation.traffic.alignment import Alignment
 from torchcover.simulation.traffic.assemble import HORIZON_M, Paths, actors, ahead_of, ego_actor
 from torchcover.simulation.traffic.fleet import EGO, HEAVY, KIND_OF, Fleet
@@ -102,8 +102,8 @@ def _prisms(outlines_m: Float64, z_m: tuple[float, float]) -> Mesh:
     vertices = np.empty((count, 2, corners, 3))
     vertices[..., :2] = outlines_m[:, None]
     vertices[..., 2] = np.reshape(z_m, (2, 1))
-    faces = prism_faces(2, corners) + 2 * corners * np.arange(count)[:, None, None]
-    return Mesh(vertices.reshape(-1, 3), faces.reshape(-1, 3)).made_of("metal")
+    faces = build_prism_faces(2, corners) + 2 * corners * np.arange(count)[:, None, None]
+    return Mesh(vertices.reshape(-1, 3), faces.reshape(-1, 3)).assign_material("metal")
 
 
 def _wall(x_m: Float64, y_m: Float64, there: Bools, width_m: float, z_m: tuple[float, float]) -> list[Mesh]:
@@ -299,7 +299,7 @@ class Highway(Procedural):
         shares = [1.0, 1.0, 1.0, RAMP_SHARE] * 2
         check_crowd(
             self.traffic_per_km * sum(share * np.ptp(span) for share, span in zip(shares, spans_m, strict=True)) / 1000,
-            self.steps,
+            self.num_time_steps,
         )
         for lane, (share, span) in enumerate(zip(shares, spans_m, strict=True)):
             users = LANE_USERS[lane % LANES]

@@ -6,7 +6,7 @@ import numpy as np
 import shapely
 
 from torchcover.geometry.arrays import Float32, Float64
-from torchcover.simulation.bodies import merge
+from torchcover.simulation.bodies import merge_meshes
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.traffic.alignment import Alignment, Territory, squared_distances
 from torchcover.simulation.traffic.scenery import PAVEMENT_M, slab
@@ -89,7 +89,7 @@ class Hills:
         used, number = np.flatnonzero(wanted), np.cumsum(wanted) - 1
         places_m = square_m * (lower + np.stack([used % (columns + 1), used // (columns + 1)], axis=1))
         vertices_m, outward = np.column_stack([places_m, self.heights_m(places_m)]), np.zeros(len(faces), dtype=bool)
-        return Mesh(vertices_m, number[faces], outward=outward).made_of("road")
+        return Mesh(vertices_m, number[faces], is_outward=outward).assign_material("road")
 
 
 Bounds = tuple[float, float]
@@ -111,7 +111,7 @@ def bent(street: Alignment, hills: Hills, pieces: Sequence[Mesh]) -> list[Mesh]:
     """
     if (street.is_straight and hills.are_flat) or not pieces:
         return list(pieces)
-    merged = merge(list(pieces))
+    merged = merge_meshes(list(pieces))
     x_m, y_m, height_m = merged.vertices_m.T
     places_m = street.poses(x_m, y_m)[:, :2]
     if not hills.are_flat:
@@ -143,7 +143,7 @@ class BuildingSite:
             below, above = mesh.vertices_m.reshape(2, -1, 3)
             ground_m = self._hills.heights_m(above[:, :2])
             below[:, 2], above[:, 2] = ground_m - FOOT_M, ground_m + PAVEMENT_M
-        return mesh.made_of("pavement"), outline
+        return mesh.assign_material("pavement"), outline
 
     def depth_m(self, x_m: Float64, side: int, kerb_m: float, depth_m: float) -> Float64:
         """(N,) how deep a block is there that is not deeper than given."""

@@ -8,11 +8,11 @@ import numpy as np
 from pydantic import Field
 
 from torchcover.geometry.arrays import Float64
-from torchcover.simulation.documents import Document, builtin_hashes
+from torchcover.simulation.documents import Document, hash_builtin_documents
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.traffic.fleet import Fleet, load_bodies
 from torchcover.simulation.traffic.scenery import Scenery
-from torchcover.simulation.world import Actor, World, steps_of
+from torchcover.simulation.world import Actor, Scene, count_time_steps
 
 MIN_TIME_STEP_S = 0.01
 
@@ -25,7 +25,7 @@ class Traffic(Document):
     """
 
     # Whether a run is followed by the same again, which says nothing new, or by another world.
-    repeats: ClassVar[bool]
+    is_repeating: ClassVar[bool]
 
     time_step_s: Annotated[float, Field(ge=MIN_TIME_STEP_S)] = 0.1
 
@@ -36,14 +36,14 @@ class Traffic(Document):
 
     @property
     @abstractmethod
-    def steps(self) -> int:
+    def num_time_steps(self) -> int:
         """Number of instants of a run."""
 
     def check(self) -> None:
         """Find out before a run whether a world can be built; ImportError if something is not installed."""
 
     @abstractmethod
-    def world(self, seed: int, ego: Mesh | None = None) -> World:
+    def build_scene(self, seed: int, ego_mesh: Mesh | None = None) -> Scene:
         """Build the world; the same for the same seed of whatever is drawn, and ego, the built-in SUV if not given."""
 
 
@@ -64,40 +64,40 @@ class Procedural(Traffic):
         time_step_s: Time between two frames.
     """
 
-    repeats: ClassVar[bool] = False
+    is_repeating: ClassVar[bool] = False
 
     duration_s: Annotated[float, Field(gt=0.0, le=MAX_DURATION_S)] = 60.0
 
-    def world(self, seed: int, ego: Mesh | None = None, bodies: Mapping[str, Mesh] | None = None) -> World:
+    def build_scene(self, seed: int, ego_mesh: Mesh | None = None, bodies: Mapping[str, Mesh] | None = None) -> Scene:
         """Build the world; the same for the same seed and meshes, of the ego and of each kind in `CATEGORIES`.
 
         Those that are not given are built in. Without hills the ground is z = 0; nobody ever overlaps anybody, and the
         ego is followed closely enough for sensors of up to 250 m range.
         """
         generator = np.random.default_rng(seed)
-        fleet = Fleet(load_bodies() if bodies is None else bodies, ego, generator)
+        fleet = Fleet(load_bodies() if bodies is None else bodies, ego_mesh, generator)
         steps = max(1, int(np.ceil(self.duration_s / self.time_step_s - 1e-9)))
         times_s = self.time_step_s * np.arange(steps + 1, dtype=np.float64)
         scenery, driver, others = self._build(fleet, times_s, generator)
-        return World(
-            static=scenery.static,
+        return Scene(
+            static_meshes=scenery.static,
             ego=driver,
             actors=others,
             time_step_s=self.time_step_s,
             duration_s=self.duration_s,
-            parked=tuple(fleet.parked),
-            ground=scenery.ground,
-            left_out=fleet.left_out,
+            static_actors=tuple(fleet.parked),
+            ground_mesh_indices=scenery.ground,
+            num_omitted_road_users=fleet.left_out,
         )
 
-    def content(self) -> dict[str, Any]:
+    def collect_content(self) -> dict[str, Any]:
         """Its keys, and the vehicles that may be in it."""
-        return {**super().content(), "vehicles": builtin_hashes("vehicles")}
+        return {**super().collect_content(), "vehicles": hash_builtin_documents("vehicles")}
 
     @property
-    def steps(self) -> int:
+    def num_time_steps(self) -> int:
         """Number of instants."""
-        return steps_of(self.duration_s, self.time_step_s)
+        return count_time_steps(self.duration_s, self.time_step_s)
 
     @abstractmethod
     def _build(self, fleet: Fleet, times_s: Float64, generator: np.random.Generator) -> Built:

@@ -103,7 +103,9 @@ class Lot:
             ends = sorted((side * (STALLS_M / 2 + 0.3), side * (STALLS_M / 2 + 0.3 + ISLAND_END_M)))
             for half in (1, -1):
                 across = sorted((half * MIDDLE_WALKWAY_M / 2, half * (ISLAND_M - 0.5)))
-                kerbs.append(block((ends[0], ends[1]), (across[0], across[1]), (0.0, PAVEMENT_M)).made_of("pavement"))
+                kerbs.append(
+                    block((ends[0], ends[1]), (across[0], across[1]), (0.0, PAVEMENT_M)).assign_material("pavement")
+                )
                 trees += tree((sum(ends) / 2, sum(across) / 2), PAVEMENT_M, 2.3, 5.5, 1.3)
         return kerbs, trees
 

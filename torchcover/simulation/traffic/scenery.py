@@ -9,9 +9,9 @@ from numpy.typing import ArrayLike
 
 from torchcover.geometry import build_transform, convert_euler_to_rotation
 from torchcover.geometry.arrays import Float64
-from torchcover.simulation.bodies import merge
-from torchcover.simulation.patches import outward_faces
-from torchcover.simulation.shapes import Mesh, band, circle, prism_faces
+from torchcover.simulation.bodies import merge_meshes
+from torchcover.simulation.patches import find_outward_faces
+from torchcover.simulation.shapes import Mesh, build_band_faces, build_prism_faces, compute_circle_points
 
 PAVEMENT_M = 0.15
 # Kerbs go on below the ground, as far as it may rise between two of their corners.
@@ -32,7 +32,7 @@ def ground(lower_m: ArrayLike, upper_m: ArrayLike) -> Mesh:
     """The one plane at z = 0 under everything: two triangles, so there is no seam for a ray to slip through."""
     (x0, y0), (x1, y1) = np.asarray(lower_m, dtype=np.float64), np.asarray(upper_m, dtype=np.float64)
     corners = np.array([[x0, y0, 0.0], [x1, y0, 0.0], [x1, y1, 0.0], [x0, y1, 0.0]])
-    return Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]), outward=np.zeros(2, dtype=bool)).made_of("road")
+    return Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]), is_outward=np.zeros(2, dtype=bool)).assign_material("road")
 
 
 def prism(outlines_m: Sequence[ArrayLike], heights_m: Sequence[float]) -> Mesh:
@@ -42,7 +42,7 @@ def prism(outlines_m: Sequence[ArrayLike], heights_m: Sequence[float]) -> Mesh:
     rings = np.empty((levels, corners, 3))
     rings[..., :2] = outlines
     rings[..., 2] = np.reshape(heights_m, (-1, 1))
-    return Mesh(rings.reshape(-1, 3), prism_faces(levels, corners))
+    return Mesh(rings.reshape(-1, 3), build_prism_faces(levels, corners))
 
 
 def rectangle(x_m: tuple[float, float], y_m: tuple[float, float]) -> Float64:
@@ -68,10 +68,10 @@ def slab(corners_m: Float64, z_m: tuple[float, float]) -> Mesh:
         [np.stack(three, axis=-1).reshape(-1, 3) for three in ((here, ahead, across), (here, across, aside))]
     )
     around = np.concatenate([number[:-1, 0], number[-1, :-1], number[:0:-1, -1], number[0, :0:-1]])
-    sides, up = band(around, np.roll(around, -1), rows * columns), rows * columns
+    sides, up = build_band_faces(around, np.roll(around, -1), rows * columns), rows * columns
     places_m = np.tile(corners_m.reshape(-1, 2), (2, 1))
     faces = np.concatenate([over[:, ::-1], over + up, sides])
-    return Mesh(np.column_stack([places_m, np.repeat(z_m, up)]), faces, outward=np.ones(len(faces), dtype=bool))
+    return Mesh(np.column_stack([places_m, np.repeat(z_m, up)]), faces, is_outward=np.ones(len(faces), dtype=bool))
 
 
 def plateau(pieces: ArrayLike, heights_m: Callable[[Float64], Float64]) -> Mesh:
@@ -90,34 +90,34 @@ def plateau(pieces: ArrayLike, heights_m: Callable[[Float64], Float64]) -> Mesh:
     key, back = edges[:, 0] * count + edges[:, 1], edges[:, 1] * count + edges[:, 0]
     here, following = edges[~np.isin(key, back)].T
     vertices_m = [np.column_stack([places_m, above_m + up_m]) for up_m in (PAVEMENT_M, -SUNK_M)]
-    faces = np.concatenate([faces, faces[:, ::-1] + count, band(here + count, following + count, -count)])
-    mesh = Mesh(np.concatenate(vertices_m), faces).made_of("pavement")
+    faces = np.concatenate([faces, faces[:, ::-1] + count, build_band_faces(here + count, following + count, -count)])
+    mesh = Mesh(np.concatenate(vertices_m), faces).assign_material("pavement")
     # Where places that are alike have become one, it may be open.
-    return mesh._replace(outward=outward_faces(mesh))
+    return mesh._replace(is_outward=find_outward_faces(mesh))
 
 
 def box(centre_m: ArrayLike, size_m: ArrayLike, bottom_m: float = 0.0, yaw_deg: float = 0.0) -> Mesh:
     """A box about a point (x, y), turned."""
     length, width, height = np.asarray(size_m, dtype=np.float64)
     shape = block((-length / 2, length / 2), (-width / 2, width / 2), (bottom_m, bottom_m + height))
-    return shape.moved(build_transform(convert_euler_to_rotation(yaw_deg, 0.0, 0.0), [*np.asarray(centre_m), 0.0]))
+    return shape.transform(build_transform(convert_euler_to_rotation(yaw_deg, 0.0, 0.0), [*np.asarray(centre_m), 0.0]))
 
 
 def post(centre_m: ArrayLike, radius_m: float, bottom_m: float, height_m: float) -> Mesh:
     """An upright post."""
-    outline = np.asarray(centre_m) + radius_m * circle(POST_SIDES)
-    return prism([outline, outline], [bottom_m, bottom_m + height_m]).made_of("metal")
+    outline = np.asarray(centre_m) + radius_m * compute_circle_points(POST_SIDES)
+    return prism([outline, outline], [bottom_m, bottom_m + height_m]).assign_material("metal")
 
 
 def tree(centre_m: ArrayLike, bottom_m: float, clear_m: float, height_m: float, crown_radius_m: float) -> list[Mesh]:
     """A trunk, and on it a crown as wide as given."""
-    shape, centre = circle(CROWN_SIDES), np.asarray(centre_m)
+    shape, centre = compute_circle_points(CROWN_SIDES), np.asarray(centre_m)
     outlines = [centre + share * crown_radius_m * shape for share in (0.45, 1.0, 0.9, 0.3)]
     levels = bottom_m + clear_m + np.array([0.0, 0.3, 0.65, 1.0]) * (height_m - clear_m)
-    crown = prism(outlines, levels.tolist()).made_of("vegetation")
-    return [post(centre, 0.15, bottom_m, clear_m).made_of("wood"), crown]
+    crown = prism(outlines, levels.tolist()).assign_material("vegetation")
+    return [post(centre, 0.15, bottom_m, clear_m).assign_material("wood"), crown]
 
 
 def few(*kinds: Sequence[Mesh]) -> tuple[Mesh, ...]:
     """One mesh for each kind of thing that there is."""
-    return tuple(merge(list(pieces)) for pieces in kinds if pieces)
+    return tuple(merge_meshes(list(pieces)) for pieces in kinds if pieces)

@@ -143,7 +143,9 @@ class Urban(Procedural):
         ]
         # Who has left a cross street's junction far behind does not come back.
         ends_m = [2 * streets.reach_m] * (len(lanes) - len(cross)) + [streets.reach_m + AHEAD_M] * len(cross)
-        check_crowd(sum(per_km * end / 1000 for (per_km, _), end in zip(per_lane, ends_m, strict=True)), self.steps)
+        check_crowd(
+            sum(per_km * end / 1000 for (per_km, _), end in zip(per_lane, ends_m, strict=True)), self.num_time_steps
+        )
         agents = self._ego_and_leader(streets, fleet, generator)
         for index, ((per_km, drivers), end) in enumerate(zip(per_lane, ends_m, strict=True)):
             agents += fleet.fill(index, (0.0, end), per_km, drivers, gates=lanes[index].gates, keep_free=agents[:2])
