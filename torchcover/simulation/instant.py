@@ -147,7 +147,7 @@ class SceneSnapshot:
 
         def struck() -> HitAttributes:
             parts = [
-                self.compute_hit_attributes(of.body[there], of.triangle[there], towards(tile))
+                self.compute_hit_attributes(of.body_indices[there], of.triangle_indices[there], towards(tile))
                 for tile, (of, there) in enumerate(zip(hits, seen, strict=True))
             ]
             return HitAttributes._make(np.concatenate(column) for column in zip(*parts, strict=True))
@@ -157,7 +157,7 @@ class SceneSnapshot:
             ray_indices=np.flatnonzero(np.concatenate(seen)),
             range_m=np.concatenate(range_m),
             num_rays=sum(tile.directions.shape[1] for tile in tiles),
-            self_hits=sum(int(np.count_nonzero(of.body == self.ego_index)) for of in hits),
+            self_hits=sum(int(np.count_nonzero(of.body_indices == self.ego_index)) for of in hits),
             num_body_casts=sum(casts),
             find_attributes=struck,
             compute_directions=lambda: np.concatenate([towards(tile) for tile in range(len(tiles))], axis=1).T,
