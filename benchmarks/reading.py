@@ -15,7 +15,7 @@ import torch
 from benchmarks import compare, table
 from torchcover.data import AccumulatedReference, RecordedFrames, open_recording
 from torchcover.recordings.formats.kitti import vehicle_T_velodyne
-from torchcover.recordings.in_vehicle import transform_to_vehicle
+from torchcover.recordings.vehicle_cloud import transform_to_vehicle
 
 POINTS, SWEEPS, LONG = 120_000, 50, 100_000
 LINKS = 50_000  # files that may be one file

@@ -17,7 +17,7 @@ from benchmarks import table
 from torchcover import BevGrid, CoverageMetric
 from torchcover.data import SimulatedFrames, open_recording
 from torchcover.geometry import invert, transform_points
-from torchcover.recordings.in_vehicle import transform_to_vehicle
+from torchcover.recordings.vehicle_cloud import transform_to_vehicle
 from torchcover.simulation import Lidar, Material, PaperReference, Rig, Scenario, Simulator
 from torchcover.simulation.recorded_returns import HALF_LANES_M, count_ground_rays, fit_returns, fit_road_profile
 from torchcover.simulation.returns import compute_log_excess, compute_return_probability

@@ -58,7 +58,7 @@ def test_a_recording_that_was_ended_is_not_evaluated_and_gone_on_with(torchcover
     assert said.endswith("torchcover: 1 of 3 frames are kept; go on by --resume\ntorchcover: interrupted\n")
     code, _, said = torchcover("evaluate", "--frames", out, "--set", "cell_m=8", "--out", worlds / "out")
     assert code == 2
-    assert f"{out}: a part of a recording, 1 frames: whatever wrote it was ended; go on with `torchcover record" in said
+    assert f"{out}: an incomplete recording with 1 frames; continue it with `torchcover record" in said
     monkeypatch.setattr(writing, "_step", step)
     code, printed, _ = torchcover(*command, "--out", out, "--resume")
     assert (code, printed.startswith("Wrote 3 frames to ")) == (0, True)

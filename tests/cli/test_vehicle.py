@@ -71,7 +71,7 @@ def test_pictures_and_recordings_are_of_the_vehicle_too(torchcover, free, monkey
             code, _, error = torchcover(*evaluated, "--files", "numbers")
         assert (code, "front has no point" in error) == (0, vehicle != "suv")
         summary = json.loads((free / "out" / "summary.json").read_text())
-        dropped.append(summary["frame_counts"]["sensor_own_vehicle"])
+        dropped.append(summary["frame_counts"]["sensor_ego_vehicle"])
     assert dropped[1] > 100 > dropped[0] == 0
     code, _, error = torchcover("evaluate", "--frames", free / "drive", "--vehicle", "1,2,3", "--out", free / "out")
     assert (code, "x0,x1,y0,y1,z0,z1 in metres are needed" in error) == (2, True)

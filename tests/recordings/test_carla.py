@@ -107,7 +107,7 @@ def test_parts_of_a_turn_are_joined_where_the_world_stands_still(tmp_path):
         np.testing.assert_allclose(recording.get_world_T_vehicle(index)[:3, 3], [2.0 * last, 0.0, 0.0], atol=1e-12)
     frames = RecordedFrames(recording, reference=AccumulatedReference(1.0))
     assert len(frames[0].sensor) == 2
-    assert frames[0].counts["sensor_own_vehicle"] == 2
+    assert frames[0].counts["sensor_ego_vehicle"] == 2
 
 
 @pytest.mark.parametrize(

@@ -446,7 +446,7 @@ def mislabelled_member():
         (
             ".pcd",
             pcd_header(3, "binary_compressed") + struct.pack("<II", 30, 36) + b"\xff" * 30,
-            r"the compressed block does not grow to the 36 bytes that it claims",
+            r"the compressed block does not decompress to the 36 bytes that it claims",
         ),
         (
             ".pcd",

@@ -6,7 +6,7 @@ from scipy.spatial import cKDTree
 from torchcover import BevGrid, CoverageMetric
 from torchcover.data import RecordedFrames, Scan
 from torchcover.geometry import BoundingBox, build_transform, convert_euler_to_rotation
-from torchcover.recordings.in_vehicle import transform_to_vehicle
+from torchcover.recordings.vehicle_cloud import transform_to_vehicle
 
 MOUNT = build_transform(convert_euler_to_rotation(1.0, -0.5, 0.2), [0.943, 0.02, 1.84])
 GRID = BevGrid(x_m=(-20.0, 20.0), y_m=(-15.0, 15.0), cell_m=0.5)
@@ -69,6 +69,6 @@ def test_weights_stay_with_their_points_where_own_ones_are_left_out():
     scan = Scan(points_m, None, "", weights=np.arange(9000.0))
     kept = transform_to_vehicle(scan, BoundingBox((-2, -1, 0), (2, 1, 2)))
     own = ((points_m > [-2, -1, 0]) & (points_m < [2, 1, 2])).all(axis=1)
-    assert kept.excluded_counts["own_vehicle"] == own.sum() > 100
+    assert kept.excluded_counts["ego_vehicle"] == own.sum() > 100
     np.testing.assert_array_equal(kept.points_m, points_m[~own].astype(np.float32))
     np.testing.assert_array_equal(kept.weights, np.flatnonzero(~own))

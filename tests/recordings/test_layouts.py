@@ -150,7 +150,7 @@ def test_a_missing_pose_costs_its_sweep_only(layout, tmp_path):
     path = LAYOUTS[layout](drive, tmp_path)
     whole = open_recording(path)
     remove_second_pose(layout, path)
-    with pytest.warns(UserWarning, match=r"1 of 4 sweeps are left out, for there is no pose .* first is "):
+    with pytest.warns(UserWarning, match=r"1 of 4 sweeps are excluded, since there is no pose .* first is "):
         partial = open_recording(path)
     assert list(partial.frame_names) == [whole.frame_names[index] for index in (0, 2, 3)]
     np.testing.assert_allclose(partial.times_s, whole.times_s[[0, 2, 3]], atol=1e-6)

@@ -10,7 +10,7 @@ from tests.recordings.drives import Drive
 from torchcover.data import AccumulatedReference, BadFrameError, RecordedFrames, collate_frames
 from torchcover.geometry.rigid import build_transform, convert_euler_to_rotation, transform_points
 
-WHY = ("nonfinite", "no_return", "own_vehicle")
+WHY = ("nonfinite", "no_return", "ego_vehicle")
 CLOUD = np.array([[1.0, 2.0, 3.0], [-4.0, 5.0, 0.5]], dtype=np.float32)
 
 

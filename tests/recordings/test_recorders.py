@@ -111,7 +111,7 @@ def test_kittis_layout_is_read_as_kittis(tmp_path):
     # What is drawn in KITTI's own car the reader takes for that car.
     points = written.get_measured_points().numpy().astype(np.float64)
     own = ((points > BODY.lower_m) & (points < BODY.upper_m)).all(axis=1)
-    assert read.counts["sensor_own_vehicle"] == own.sum()
+    assert read.counts["sensor_ego_vehicle"] == own.sum()
     np.testing.assert_allclose(read.sensor, points[~own], atol=1e-5)
     np.testing.assert_allclose(read.reference, written.reference, atol=1e-5)
     torch.testing.assert_close(read.boxes.rows[:, :6], written.boxes.rows[:, :6], rtol=0, atol=1e-4)
@@ -216,7 +216,9 @@ def test_a_part_of_a_recording_is_never_read_and_gone_on_with(both, simulated_on
     simulated_once.clear()
     with pytest.raises(ZeroDivisionError):
         write_recording(both, tmp_path / "part", layout, progress=until(2, lambda: 1 / 0))
-    with pytest.raises(ValueError, match=r"part: a part of a recording, 2 frames: .* `torchcover record --resume`"):
+    with pytest.raises(
+        ValueError, match=r"part: an incomplete recording with 2 frames; .* `torchcover record --resume`"
+    ):
         open_recording(tmp_path / "part")
     with pytest.raises(ValueError, match=r"holds a part of a recording, 2 frames; go on with it \(--resume\), or"):
         write_recording(both, tmp_path / "part", layout)
@@ -281,7 +283,7 @@ def test_a_kill_at_any_file_operation_costs_a_frame_at_most(tmp_path, monkeypatc
     for folder in (copies / str(at) for at in range(count)):
         manifest = read_manifest(folder / RECORDING) or {}
         if manifest.get(WRITING):
-            with pytest.raises(ValueError, match="a part of a recording"):
+            with pytest.raises(ValueError, match="an incomplete recording"):
                 open_recording(folder)
             kept.add(len(manifest.get("steps", ())))
         with contextlib.suppress(ValueError, FileNotFoundError):  # of nothing that is known: it had not begun

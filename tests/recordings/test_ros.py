@@ -16,7 +16,7 @@ from torchcover.files import BadFileError
 from torchcover.geometry import build_transform, convert_euler_to_rotation, invert, transform_points
 from torchcover.recordings.formats.bag import Bag
 from torchcover.recordings.formats.ros import RosBag
-from torchcover.recordings.in_vehicle import transform_to_vehicle
+from torchcover.recordings.vehicle_cloud import transform_to_vehicle
 
 CORNERS_M = np.array([[5.0, 1.0, 0.5], [8.0, -2.0, 0.25], [-4.0, 0.5, 1.0], [6.0, 6.0, 2.0]])
 FAR_CORNERS_M = CORNERS_M + np.array([1e5, -4e5, 0.0])
@@ -678,5 +678,5 @@ def test_an_index_that_lies_is_found_out(tmp_path):
     data = path.read_bytes()
     count = data.rindex((2).to_bytes(8, "little"))
     path.write_bytes(data[:count] + (3).to_bytes(8, "little") + data[count + 8 :])
-    with pytest.raises(BadFileError, match="no index of its messages, or only of some"):
+    with pytest.raises(BadFileError, match="the index of its messages is missing or incomplete"):
         RosBag(path)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torchcover.detection import Boxes, find_points_in_boxes
 from torchcover.neighbors import nearest
 from torchcover.recordings.ground_model import GroundModel, extract_low_surfaces
-from torchcover.recordings.in_vehicle import transform_to_vehicle
+from torchcover.recordings.vehicle_cloud import transform_to_vehicle
 from torchcover.recordings.pose_checks import (
     check_frozen_poses,
     check_pose_conventions,

@@ -18,7 +18,7 @@ from torchcover.files import allow_links, find_link_roots
 from torchcover.frames.frame import Frame
 from torchcover.frames.source import BadFrameError, FrameDataset
 from torchcover.geometry import transform_points
-from torchcover.recordings.in_vehicle import VehicleCloud, join_clouds, transform_to_vehicle
+from torchcover.recordings.vehicle_cloud import VehicleCloud, join_clouds, transform_to_vehicle
 from torchcover.recordings.recording import Recording
 from torchcover.recordings.reference import AccumulatedReference, RecordedReference, Reference
 from torchcover.recordings.sweeps import SweepWindow
@@ -223,7 +223,7 @@ class RecordedFrames(FrameDataset):
         counts = {
             f"{side}_{why}": number[why]
             for side, number in (("sensor", dropped), ("reference", reference.excluded_counts))
-            for why in sorted({"nonfinite", "no_return", "own_vehicle", *number})
+            for why in sorted({"nonfinite", "no_return", "ego_vehicle", *number})
         }
         tensors = {rig: torch.from_numpy(cloud.points_m) for rig, cloud in clouds.items()}
         if boxes is not None:

@@ -1,4 +1,4 @@
-"""What every reader of recordings gives: scans of named sensors at instants, and where the vehicle was."""
+"""Interface of recordings: scans of named sensors, poses and labels by frame."""
 
 import warnings
 from collections.abc import Mapping, Sequence
@@ -13,162 +13,184 @@ from torchcover.cameras.calibration import Calibration
 from torchcover.detection.boxes import Boxes
 from torchcover.files import RECORDING, WRITING, guard_reader, read_manifest
 from torchcover.geometry import BoundingBox
+from torchcover.geometry.arrays import Float32, Float64
 from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.clouds.arrays import Points
 
-# A return from so near to the origin of its frame is one that never came, which drivers store as zeros.
+# Drivers store zeros for rays without a return, so points this close to the origin are no returns.
 NO_RETURN_M = 1e-3
-# Steps that are longer are counts of milliseconds, microseconds or nanoseconds.
-LONGEST_STEP_S = 3600.0
-# Steps that are longer and shorter than these, in s and m/s, are milliseconds of somebody who moves.
-LONG_STEP_S = 10.0
-SLOW_MPS = 0.2
-# Times may be off by this share of a step.
-COARSEST = 0.01
 
 
 @dataclass(frozen=True)
 class Scan:
-    """What a sensor recorded at one instant, as it was stored.
+    """Points of one sensor in one frame, as stored.
 
     Args:
-        points_m: (N, 3) points in the frame of the sensor; those that are not finite or lie in the sensor itself are
-            returns that never came.
-        vehicle_T_sensor: (4, 4) where the sensor was; None: the points are in the vehicle frame already.
-        source: Where it was read from, for messages.
-        min_range_m: What is nearer to the sensor is a return that never came.
-        weights: (N,) what each point of a reference counts for, positive; None if all count the same.
-        heights_m: (N,) height of each point of a reference above the local ground, NaN where there is none at or below;
-            None if it is unknown.
-        rings: (N,) number of the laser of each point; None if it is unknown.
-        offsets_s: (N,) when each point was measured, after the instant that it was moved to; None: as measured, or
-            nobody says it.
+        points_m: (N, 3) points in the sensor frame; points that are not finite or at the origin are missing returns.
+        vehicle_T_sensor: (4, 4) extrinsics of the sensor; None if the points are in the vehicle frame.
+        source: File or message that the scan was read from, for messages.
+        min_range_m: Points closer to the sensor are missing returns.
+        weights: (N,) positive area weights of reference points; None if all points count the same.
+        heights_m: (N,) heights of reference points above the local ground, NaN where there is no ground; None if
+            unknown.
+        rings: (N,) channel of each point; None if unknown.
+        offsets_s: (N,) measurement time of each point minus the time to which motion compensation moved it; None if
+            unknown or not compensated.
     """
 
     points_m: Points
     vehicle_T_sensor: Matrix | None
     source: str
     min_range_m: float = 0.0
-    weights: NDArray[np.float64] | None = None
-    heights_m: NDArray[np.float32] | None = None
+    weights: Float64 | None = None
+    heights_m: Float32 | None = None
     rings: NDArray[np.integer] | None = None
-    offsets_s: NDArray[np.float64] | None = None
+    offsets_s: Float64 | None = None
 
 
-def check_times(times_s: NDArray[np.float64], num_frames: int, source: str) -> NDArray[np.float64]:
-    """Return the times of instants in seconds, if they can be those.
+@dataclass(frozen=True)
+class TimeCheckParams:
+    """Limits of plausible times in seconds.
 
-    ValueError: another number of them, or two that do not follow each other.
+    Args:
+        max_interval_s: Longer median intervals are counts of milliseconds, microseconds or nanoseconds.
+        max_slow_interval_s: Longer median intervals are implausible for a vehicle slower than `min_speed_mps`.
+        min_speed_mps: A moving vehicle that seems slower has times in milliseconds.
+        max_rounding_share: Times may be rounded by this share of the median interval.
+    """
+
+    max_interval_s: float = 3600.0
+    max_slow_interval_s: float = 10.0
+    min_speed_mps: float = 0.2
+    max_rounding_share: float = 0.01
+
+
+def check_times(times_s: Float64, num_frames: int, source: str) -> Float64:
+    """Check that there is one time per frame, ascending and in seconds.
+
+    Args:
+        times_s: (F,) times of the frames.
+        num_frames: Number of frames of the recording.
+        source: File or topic of the times, for messages.
+
+    Returns:
+        `times_s`.
+
+    Raises:
+        ValueError: The number of times is wrong, they do not ascend, or their unit is not the second.
     """
     if len(times_s) != num_frames:
-        raise ValueError(f"{source}: {len(times_s):,} times for {num_frames:,} scans; one each is needed")
+        raise ValueError(f"{source}: {len(times_s):,} times for {num_frames:,} scans; each scan needs one time")
     bad = np.flatnonzero(~(np.diff(times_s) > 0))
     if len(bad):
         first = int(bad[0])
         raise ValueError(
-            f"{source}: times have to ascend; {len(bad)} do not, the first after instant {first}: "
-            f"{times_s[first]:.6f} s, then {times_s[first + 1]:.6f} s; leave such instants out, or correct their times"
+            f"{source}: times have to ascend; {len(bad)} do not, the first after frame {first}: "
+            f"{times_s[first]:.6f} s, then {times_s[first + 1]:.6f} s; remove such frames, or correct their times"
         )
     check_seconds(times_s, f"{source}: ")
     return times_s
 
 
 def check_seconds(
-    times_s: NDArray[np.floating], source: str = "", positions_m: NDArray[np.floating] | None = None
+    times_s: NDArray[np.floating],
+    source: str = "",
+    positions_m: NDArray[np.floating] | None = None,
+    params: TimeCheckParams = TimeCheckParams(),
 ) -> None:
-    """Refuse ascending times that are in another unit than seconds, or too coarse.
+    """Check that ascending times are in seconds and not rounded too coarsely.
 
     Args:
-        times_s: (K,) times as they were stored.
-        source: What begins the message.
-        positions_m: (K, 3) positions at these times, whose speed tells milliseconds from seconds.
+        times_s: (K,) times as stored.
+        source: Prefix of the message.
+        positions_m: (K, 3) positions at these times; their speed distinguishes milliseconds from seconds.
+        params: Limits of plausible times.
 
     Raises:
-        ValueError: Their median step is longer than an hour, or than 10 s at a crawl, or they are float32 and as far
-            apart as its digits.
+        ValueError: The median interval is longer than an hour, or than 10 s at a crawl, or float32 rounds the times.
     """
-    step_s = float(np.median(np.diff(times_s))) if len(times_s) > 1 else 0.0
+    interval_s = float(np.median(np.diff(times_s))) if len(times_s) > 1 else 0.0
     speed_mps = 0.0
-    if positions_m is not None and step_s:
+    if positions_m is not None and interval_s:
         speed_mps = float(np.median(np.linalg.norm(np.diff(positions_m, axis=0), axis=1) / np.diff(times_s)))
-    if step_s > LONGEST_STEP_S or (step_s > LONG_STEP_S and 0.0 < speed_mps < SLOW_MPS):
+    is_slow = 0.0 < speed_mps < params.min_speed_mps
+    if interval_s > params.max_interval_s or (interval_s > params.max_slow_interval_s and is_slow):
         raise ValueError(
-            f"{source}times in seconds are needed; the usual step of these is {step_s:g}: divide them by 1e3, 1e6 or "
-            "1e9 if they count milliseconds, microseconds or nanoseconds"
+            f"{source}times in seconds are needed; their median interval is {interval_s:g}: divide them by 1e3, 1e6 "
+            "or 1e9 if they count milliseconds, microseconds or nanoseconds"
         )
-    digits_s = float(np.spacing(np.abs(times_s).max(initial=0.0)))
-    if step_s and digits_s > COARSEST * step_s:
+    rounding_s = float(np.spacing(np.abs(times_s).max(initial=0.0)))
+    if interval_s and rounding_s > params.max_rounding_share * interval_s:
         raise ValueError(
-            f"{source}times of {times_s.dtype} are up to {digits_s:g} s off, with a usual step of {step_s:g} s; store "
-            "them as float64, or count them from the first one"
+            f"{source}times of {times_s.dtype} are rounded to {rounding_s:g} s, with a median interval of "
+            f"{interval_s:g} s; store them as float64, or relative to the first one"
         )
 
 
 class Recording(Protocol):
-    """A drive as somebody recorded it. A reader of a layout is a class like this, made from a path; see `FORMATS`.
+    """Logged sensor data with poses; a reader of a format is a class with these members, see `FORMATS`.
 
-    Instants are numbered in time. What a reader opens at once is small: names, times, calibrations. Scans are read one
-    by one.
+    Frames are ordered by time. A reader loads names, times and calibrations when it is created, and scans on request.
 
     Args:
-        ego_box: The vehicle itself, in its own frame; None if unknown. Whoever knows it may say so.
+        ego_box: Bounding box of the ego vehicle in the vehicle frame; None if unknown. Callers may set it.
     """
 
     ego_box: BoundingBox | None
 
     @property
     def path(self) -> Path:
-        """Where it is."""
+        """Folder or file of the recording."""
 
     @property
     def frame_names(self) -> Sequence[str]:
-        """What a user calls the instants; so many there are."""
+        """Name of each frame."""
 
     @property
     def key_frames(self) -> Sequence[int]:
-        """Numbers of the instants that are meant to be looked at, ascending; the others serve a reference only."""
+        """Ascending indices of the frames to evaluate; the other frames only contribute to the reference."""
 
     @property
-    def times_s(self) -> NDArray[np.float64] | None:
-        """(F,) when they were, ascending; None if unknown."""
+    def times_s(self) -> Float64 | None:
+        """(F,) ascending times of the frames; None if unknown."""
 
     @property
     def sensors(self) -> Sequence[str]:
-        """Names of the sensors that belong to the vehicle."""
+        """Names of the sensors on the vehicle."""
 
     @property
     def rigs(self) -> Mapping[str, Sequence[str]]:
-        """Name of each rig -> its sensors, unless others are asked for."""
+        """Default rigs: name and sensors of each."""
 
     @property
     def reference_sensors(self) -> Sequence[str]:
-        """Sensors that were recorded to be the reference; empty where there was none."""
+        """Sensors that were recorded as the reference; empty if there are none."""
 
     @property
     def has_area_weights(self) -> bool:
-        """Whether the scans of the reference sensors have weights, the square metres that their points stand for."""
+        """True if the scans of the reference sensors have area weights."""
 
     @property
     def block_indices(self) -> Sequence[int] | None:
-        """`Frame.block_index` of each instant, for standard errors; None: no two of them are known to be alike."""
+        """`Frame.block_index` of each frame for standard errors; None: every frame is its own block."""
 
     def read_scan(self, sensor: str, index: int, /) -> Scan:
-        """Read what a sensor recorded at an instant.
+        """Read the scan of a sensor in a frame.
 
         Raises:
-            OSError: It is not there.
-            ValueError: It is not what it is meant to be.
+            OSError: The file is missing.
+            ValueError: The file is invalid.
         """
 
     def get_world_T_vehicle(self, index: int, /) -> Matrix | None:
-        """(4, 4) where the vehicle was, in a world that does not move; None if unknown."""
+        """Return the (4, 4) pose of the vehicle in a fixed world frame; None if unknown."""
 
     def read_boxes(self, index: int, /) -> Boxes | None:
-        """The labelled objects of an instant in the vehicle frame; None where it is not labelled."""
+        """Read the labeled objects of a frame in the vehicle frame; None if the frame has no labels."""
 
 
 class RecordingBase:
-    """What most layouts have in common: every instant is looked at, and no reference was recorded."""
+    """Defaults that most formats share: all frames are key frames, and there is no reference sensor."""
 
     frame_names: Sequence[str]
     reference_sensors: Sequence[str] = ()
@@ -178,15 +200,17 @@ class RecordingBase:
 
     @property
     def key_frames(self) -> range:
-        """All instants."""
+        """Indices of all frames."""
         return range(len(self.frame_names))
 
 
 class SensorCalibrations(NamedTuple):
-    """Mounts of LiDARs, and cameras.
+    """Extrinsics of LiDARs and calibrations of cameras.
 
-    `source`: where it is from, for people; `mounts`: name of a LiDAR -> (4, 4) `vehicle_T_lidar`, where its scans do
-    not say it; `cameras`: with their places in the vehicle frame.
+    Args:
+        source: Origin of the calibrations, for messages.
+        mounts: Name of a LiDAR and its (4, 4) `vehicle_T_lidar`.
+        cameras: Cameras with their extrinsics in the vehicle frame.
     """
 
     source: str
@@ -196,35 +220,35 @@ class SensorCalibrations(NamedTuple):
 
 @runtime_checkable
 class CalibratedRecording(Protocol):
-    """A recording that knows more of its sensors."""
+    """Recording that includes calibrations of its sensors."""
 
     def read_calibrations(self) -> SensorCalibrations:
-        """Read them; cameras are those of the images as the data set ships them.
+        """Read the calibrations; cameras match the images that the data set ships.
 
         Raises:
-            OSError: They are not there.
-            ValueError: They are not what they are meant to be.
+            OSError: A calibration file is missing.
+            ValueError: A calibration file is invalid.
         """
 
 
 @runtime_checkable
 class UndistortedRecording(Protocol):
-    """A recording that ships undistorted or rectified images, and knows the distortion of the lenses, too."""
+    """Recording with undistorted or rectified images that includes the original distortion as well."""
 
     def read_raw_cameras(self) -> tuple[Calibration, ...]:
-        """Read the cameras with their lenses as calibrated, before images were undistorted.
+        """Read the cameras with their distortion before images were undistorted.
 
         Raises:
-            OSError: They are not there.
-            ValueError: They are not what they are meant to be.
+            OSError: A calibration file is missing.
+            ValueError: A calibration file is invalid.
         """
 
 
-def warn_of_missing_poses(path: Path, frames_without_pose: Sequence[str], num_frames: int) -> None:
-    """Warn of the sweeps that are left out because the vehicle's pose at their time is not known.
+def warn_about_missing_poses(path: Path, frames_without_pose: Sequence[str], num_frames: int) -> None:
+    """Warn about sweeps that are excluded because the pose of the vehicle at their time is unknown.
 
     Args:
-        path: The file or folder of poses.
+        path: File or folder of the poses.
         frames_without_pose: Names of these sweeps.
         num_frames: Number of all sweeps.
 
@@ -237,20 +261,26 @@ def warn_of_missing_poses(path: Path, frames_without_pose: Sequence[str], num_fr
         )
     if frames_without_pose:
         warnings.warn(
-            f"{path}: {len(frames_without_pose):,} of {num_frames:,} sweeps are left out, for there is no pose at their time; the first "
-            f"is {frames_without_pose[0]}",
+            f"{path}: {len(frames_without_pose):,} of {num_frames:,} sweeps are excluded, since there is no pose at "
+            f"their time; the first is {frames_without_pose[0]}",
             stacklevel=3,
         )
 
 
 @guard_reader("the manifest of a recording")
 def read_recording_manifest(path: Path) -> dict[str, Any]:
-    """Read `recording.json`, which lists the `files` of a recording that torchcover has written, and its `frames`.
+    """Read `recording.json`, which lists the `files` of a recording that torchcover wrote, and its `frames`.
 
-    While it is written, `writing` is true, and `steps` are those that are complete.
+    While a recording is being written, `writing` is true and `steps` holds the complete frames.
+
+    Args:
+        path: Manifest file.
+
+    Returns:
+        The manifest, with defaults for missing keys.
 
     Raises:
-        BadFileError: Another content.
+        BadFileError: The content is not a manifest.
     """
     manifest = {"content": {}, "steps": [], "frames": None, **(read_manifest(path.resolve()) or {})}
     if not isinstance(manifest["steps"] if manifest.get(WRITING) else manifest["frames"], list):
@@ -259,18 +289,24 @@ def read_recording_manifest(path: Path) -> dict[str, Any]:
 
 
 def read_complete_manifest(folder: Path) -> dict[str, Any] | None:
-    """Read the manifest of a complete recording that torchcover has written; None of any other one.
+    """Read the manifest of a recording that torchcover wrote completely.
+
+    Args:
+        folder: Folder of the recording.
+
+    Returns:
+        The manifest; None if another program wrote the recording.
 
     Raises:
-        BadFileError: A `recording.json` that cannot be read.
-        ValueError: A part of a recording.
+        BadFileError: `recording.json` is invalid.
+        ValueError: The recording is incomplete.
     """
     if not (folder / RECORDING).exists():
         return None
     manifest = read_recording_manifest(folder / RECORDING)
     if manifest.get(WRITING):
         raise ValueError(
-            f"{folder}: a part of a recording, {len(manifest['steps']):,} frames: whatever wrote it was ended; go on "
-            "with `torchcover record --resume`"
+            f"{folder}: an incomplete recording with {len(manifest['steps']):,} frames; continue it with "
+            "`torchcover record --resume`"
         )
     return manifest

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from torchcover.detection.boxes import Boxes
 from torchcover.geometry import BoundingBox, invert, transform_points
 from torchcover.recordings.free_space import ScanKey, estimate_surface_areas_m2, estimate_visible_share
-from torchcover.recordings.in_vehicle import VehicleCloud, find_points_in_box, join_clouds, transform_to_vehicle
+from torchcover.recordings.vehicle_cloud import VehicleCloud, find_points_in_box, join_clouds, transform_to_vehicle
 from torchcover.recordings.movers import COMPARED_S, WITHIN_M, MovingCluster, find_moving_clusters
 from torchcover.recordings.recording import Recording
 from torchcover.recordings.sweeps import (
@@ -231,7 +231,7 @@ class AccumulatedReference:
         )
         part = np.repeat(np.arange(1 + len(bodies)), [len(first), *(len(body.points_m) for body in bodies)])
         own = _beneath_or_in(points_m, recording.ego_box)
-        dropped["own_vehicle"] += len(own)
+        dropped["ego_vehicle"] += len(own)
         points_m, level_m, part = (np.ascontiguousarray(np.delete(of, own, axis=0)) for of in (points_m, level_m, part))
         share = estimate_visible_share(level_m, recording.ego_box or USUAL_BODY, self.voxel_m, index)
         seen = share > 0

@@ -17,7 +17,7 @@ from torchcover.geometry import build_transform, convert_euler_to_rotation, inve
 from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.free_space import FreeSpaceCounter, RangeImage, ScanKey
 from torchcover.recordings.ground_model import GroundModel, extract_low_surfaces
-from torchcover.recordings.in_vehicle import transform_to_vehicle
+from torchcover.recordings.vehicle_cloud import transform_to_vehicle
 from torchcover.recordings.recording import Recording, Scan
 
 # What is slower stands: between a time before and one after.

@@ -27,7 +27,7 @@ from torchcover.files import BadFileError, guard_reader, parse_yaml, read_short_
 from torchcover.geometry import build_transform, convert_euler_to_rotation, convert_quaternion_to_rotation
 from torchcover.geometry.arrays import Float64
 from torchcover.geometry.rigid import warn_about_radians
-from torchcover.recordings.other_formats import find_remedy
+from torchcover.recordings.unsupported_formats import find_remedy
 from torchcover.simulation.builtin import get_builtin_folder, list_builtin_names
 
 # Mistakes of one document that a message tells, and characters of what arrived.

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.files import check_memory, check_regular, run_isolated
-from torchcover.recordings.other_formats import find_remedy
+from torchcover.recordings.unsupported_formats import find_remedy
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]

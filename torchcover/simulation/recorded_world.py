@@ -23,7 +23,7 @@ from torchcover.geometry.rigid import Matrix
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.recordings.formats.tracks import BOX_COLUMNS, TRAJECTORY_COLUMNS
 from torchcover.recordings.free_space import RangeImage
-from torchcover.recordings.in_vehicle import find_points_in_box
+from torchcover.recordings.vehicle_cloud import find_points_in_box
 from torchcover.recordings.movers import COMPARED_S, WITHIN_M, MovingCluster, find_moving_clusters
 from torchcover.recordings.objects import extract_objects
 from torchcover.recordings.recording import Recording

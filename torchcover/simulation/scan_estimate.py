@@ -13,7 +13,7 @@ from torchcover.geometry import convert_rotation_to_quaternion, invert, transfor
 from torchcover.geometry.arrays import Bools, Float64, Int64
 from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.formats.ros_poses import PoseSeries
-from torchcover.recordings.in_vehicle import find_points_in_box
+from torchcover.recordings.vehicle_cloud import find_points_in_box
 from torchcover.recordings.recording import NO_RETURN_M, Recording
 
 # Elevations are counted in bins of this width and blurred with one width after the other.

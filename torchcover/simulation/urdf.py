@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from torchcover.files import AtomicOutput, guard_reader, parse_xml, to_yaml
 from torchcover.geometry import BoundingBox, build_transform, convert_quaternion_to_rotation
 from torchcover.geometry.arrays import Float64
-from torchcover.recordings.other_formats import find_remedy
+from torchcover.recordings.unsupported_formats import find_remedy
 from torchcover.simulation.bodies import merge_meshes
 from torchcover.simulation.documents import format_validation_error
 from torchcover.simulation.gazebo_sensors import PlacedSensor, read_numbers, read_pose, read_sensors

@@ -60,7 +60,7 @@ def test_recordings_without_objects_over_time(tmp_path):
     log = kitti_raw(drive, tmp_path / "kitti")
     fails(scenario(log, scene="a"), "scene: is for tables of nuScenes")
     (log / "tracklet_labels.xml").unlink()
-    fails(scenario(log), rf"{log}: no instant of it has labelled objects", BadFileError)
+    fails(scenario(log), rf"{log}: no frame has labeled objects", BadFileError)
     folder = plain_folder(drive, tmp_path / "folder")
     boxes = folder / "boxes" / "f1.csv"
     boxes.write_text(boxes.read_text().replace(",car,", ",,"))

@@ -25,7 +25,13 @@ from torchcover.recordings.objects import (
     build_track,
     group_by_name,
 )
-from torchcover.recordings.recording import RecordingBase, Scan, SensorCalibrations, check_times, warn_of_missing_poses
+from torchcover.recordings.recording import (
+    RecordingBase,
+    Scan,
+    SensorCalibrations,
+    check_times,
+    warn_about_missing_poses,
+)
 
 # The ego frame lies in the rear axle, 0.30 m above the ground; the centre of a Ford Fusion is 1.339 m before it, as in
 # the rig `argoverse2`, where the source is.
@@ -74,7 +80,7 @@ class Argoverse2(RecordingBase):
         self.rigs = {"argoverse2": self.sensors}
         self._poses, has_pose = self._read_poses(np.array([_time_ns(file) for file in self._files]))
         missing = [file.stem for file, posed in zip(self._files, has_pose, strict=True) if not posed]
-        warn_of_missing_poses(self.path / POSES, missing, len(self._files))
+        warn_about_missing_poses(self.path / POSES, missing, len(self._files))
         self._files = [file for file, posed in zip(self._files, has_pose, strict=True) if posed]
         self._times_ns = np.array([_time_ns(file) for file in self._files])
         self.frame_names = tuple(file.stem for file in self._files)

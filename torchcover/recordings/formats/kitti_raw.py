@@ -34,7 +34,13 @@ from torchcover.recordings.formats.kitti import (
     read_transform,
     vehicle_T_velodyne,
 )
-from torchcover.recordings.recording import RecordingBase, Scan, SensorCalibrations, check_times, warn_of_missing_poses
+from torchcover.recordings.recording import (
+    RecordingBase,
+    Scan,
+    SensorCalibrations,
+    check_times,
+    warn_about_missing_poses,
+)
 
 # In synchronized drives, the GPS and IMU's record of a frame and its scan are some milliseconds apart.
 MAX_CLOCK_GAP_S = 0.1
@@ -62,7 +68,7 @@ class KittiRaw(RecordingBase):
         self._clouds = find_frame_files(self.path / "velodyne_points" / "data")
         check_same_names(self.path, {"velodyne_points/data": self._clouds})
         missing = [name for name in self._clouds if not self._oxts_path(name).exists()]
-        warn_of_missing_poses(self.path / "oxts" / "data", missing, len(self._clouds))
+        warn_about_missing_poses(self.path / "oxts" / "data", missing, len(self._clouds))
         self.rigs = {"kitti": self.sensors}
         scanned = parse_frame_numbers(self.path, tuple(self._clouds))
         self.frame_names = tuple(name for name in self._clouds if name not in set(missing))

@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 
 from torchcover.files import BadFileError
 from torchcover.geometry.arrays import Bools, Float64
-from torchcover.recordings.other_formats import find_remedy
+from torchcover.recordings.unsupported_formats import find_remedy
 from torchcover.simulation.documents import RelativePath
 from torchcover.simulation.sumo.crowd import crowd, read_types
 from torchcover.simulation.sumo.floating import Recorded, TimeWindow, read_floating, record
