@@ -148,7 +148,7 @@ def test_shown_directions_are_looked_at_by_their_pixels(camera, directions):
     pixels, visible = camera.project(3.0 * directions)
     # Also far outside the image, but not at the horizon, 1e16 px away, nor straight back, where azimuth is rounding.
     shown = (pixels.abs() < 1e5).all(dim=1) & (directions[:, 2] > -0.999)
-    rays, valid = camera.compute_rays(pixels[shown])
+    rays, valid = camera.rays(pixels[shown])
     assert shown[visible].all()
     assert valid.all()
     torch.testing.assert_close(rays, directions[shown], rtol=0, atol=1e-7)

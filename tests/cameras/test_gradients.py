@@ -38,7 +38,7 @@ def test_rays_by_intrinsics_coefficients_and_pixels(lens):
     build, intrinsics, coefficients = lens
     pixels = PIXELS.clone().requires_grad_()
     inputs = (intrinsics, coefficients, pixels)
-    assert torch.autograd.gradcheck(lambda i, k, p: build(i, k).compute_rays(p)[0], inputs, fast_mode=True)
+    assert torch.autograd.gradcheck(lambda i, k, p: build(i, k).rays(p)[0], inputs, fast_mode=True)
 
 
 def test_projection_by_intrinsics_coefficients_and_points(lens):

@@ -20,14 +20,14 @@ def grid(camera):
 
 
 def test_every_valid_pixel_comes_back_to_a_billionth(camera):
-    rays, valid = camera.compute_rays(dtype=torch.float64)
+    rays, valid = camera.rays(dtype=torch.float64)
     pixels, visible = camera.project(rays[valid])
     assert visible.all()
     assert (pixels - grid(camera)[valid]).norm(dim=1).max() <= 1e-9
 
 
 def test_rays_are_unit_where_valid_and_nan_elsewhere(camera):
-    rays, valid = camera.compute_rays(dtype=torch.float64)
+    rays, valid = camera.rays(dtype=torch.float64)
     assert ((rays[valid].norm(dim=1) - 1.0).abs() < 1e-14).all()
     assert rays[~valid].isnan().all()
 
@@ -35,13 +35,13 @@ def test_rays_are_unit_where_valid_and_nan_elsewhere(camera):
 def test_every_pixel_is_accounted_for_and_none_is_given_up(camera):
     counts = camera.count_pixels()
     assert sum(counts.values()) == camera.width * camera.height
-    assert counts["pixels_valid"] == int(camera.compute_rays()[1].sum()) > 0
+    assert counts["pixels_valid"] == int(camera.rays()[1].sum()) > 0
     assert counts["pixels_unconverged"] == 0
 
 
 def test_single_pixels_equal_the_table(camera):
-    table, valid = camera.compute_rays(dtype=torch.float64)
-    single, answered = camera.compute_rays(grid(camera)[::5, ::7])
+    table, valid = camera.rays(dtype=torch.float64)
+    single, answered = camera.rays(grid(camera)[::5, ::7])
     assert torch.equal(answered, valid[::5, ::7])
     torch.testing.assert_close(single, table[::5, ::7], rtol=0, atol=1e-7, equal_nan=True)
 
@@ -181,7 +181,7 @@ def test_an_edge_whose_image_turns_back_is_within_reach():
 
 def test_of_two_images_the_one_nearer_the_axis_is_chosen(make_camera):
     camera = make_camera("fold")
-    rays, valid = camera.compute_rays(dtype=torch.float64)
+    rays, valid = camera.rays(dtype=torch.float64)
     fold = (1.0 / 0.9) ** 0.5  # d(r - 0.3 r^3)/dr = 0
     radius = rays[..., :2].norm(dim=-1) / rays[..., 2]
     assert 0.0 < valid.double().mean() < 1.0
@@ -214,14 +214,14 @@ def test_where_kornia_diverges_the_answer_is_right():
 
 
 def test_nan_pixels_have_no_ray(camera):
-    rays, valid = camera.compute_rays(torch.tensor([[float("nan"), 1.0], [float("inf"), 1.0]]))
+    rays, valid = camera.rays(torch.tensor([[float("nan"), 1.0], [float("inf"), 1.0]]))
     assert not valid.any()
     assert rays.isnan().all()
 
 
 def test_the_size_of_the_chunks_changes_nothing(make_camera, monkeypatch):
-    whole = make_camera("crooked fold").compute_rays(dtype=torch.float64)
+    whole = make_camera("crooked fold").rays(dtype=torch.float64)
     monkeypatch.setattr(inverse, "_CHUNK", 1000)
-    pieces = make_camera("crooked fold").compute_rays(dtype=torch.float64)
+    pieces = make_camera("crooked fold").rays(dtype=torch.float64)
     assert torch.equal(whole[1], pieces[1])
     assert torch.equal(whole[0].nan_to_num(9.0), pieces[0].nan_to_num(9.0))

@@ -20,12 +20,12 @@ def depth_for(camera, dtype=torch.float64):
 def test_distance_is_the_length_of_the_point(camera):
     depth = depth_for(camera)
     points = camera.unproject(depth, "distance")
-    torch.testing.assert_close(points.norm(dim=1), depth[camera.compute_rays()[1]])
+    torch.testing.assert_close(points.norm(dim=1), depth[camera.rays()[1]])
 
 
 def test_z_depth_is_the_third_coordinate(camera):
     depth = depth_for(camera)
-    rays, valid = camera.compute_rays(dtype=torch.float64)
+    rays, valid = camera.rays(dtype=torch.float64)
     front = valid & (rays[..., 2] > 0)
     torch.testing.assert_close(camera.unproject(depth, "z")[:, 2], depth[front])
     assert camera.count_excluded(depth)["no_ray"] == int((~front).sum())
@@ -98,7 +98,7 @@ def test_a_pickled_camera_is_small_and_the_same():
     table = camera.rays()[0]
     payload = pickle.dumps(camera)
     assert len(payload) < table.nbytes / 2
-    assert torch.equal(pickle.loads(payload).compute_rays()[0], table)
+    assert torch.equal(pickle.loads(payload).rays()[0], table)
 
 
 def test_points_move_between_camera_and_vehicle():

@@ -53,7 +53,7 @@ class Camera:
 
     Example:
         >>> camera = Camera(640, 480, 500.0, 500.0, 319.5, 239.5, "brown_conrady", [-0.3, 0.1, 0.0, 0.0])
-        >>> rays, valid = camera.compute_rays()
+        >>> rays, valid = camera.rays()
         >>> rays.shape, bool(valid.all())
         (torch.Size([480, 640, 3]), True)
         >>> pixels, visible = camera.project(10.0 * rays[:2, 0].double())
