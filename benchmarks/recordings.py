@@ -31,7 +31,7 @@ from torchcover.data import (
 )
 from torchcover.detection import find_points_in_boxes
 from torchcover.geometry import build_transform, convert_euler_to_rotation, invert, transform_points
-from torchcover.recordings.movers import COMPARED_S, WITHIN_M, find_moving_clusters
+from torchcover.recordings.moving_clusters import MovingClusterParams, find_moving_clusters
 from torchcover.simulation import Lidar, PaperReference, Rig, Scenario
 
 EVERY_S = 0.1
@@ -210,8 +210,8 @@ def found_movers(recording, reference, frame):
     for (_, index), (points_m, told) in reference.told_apart(recording, instant).items():
         own_m = transform_points(vehicle_T_local, points_m[told > 0])
         since_s = recording.times_s[index] - time_s
-        if abs(since_s) <= COMPARED_S:
-            loose_m.append(own_m[np.linalg.norm(own_m[:, :2], axis=1) < WITHIN_M])
+        if abs(since_s) <= MovingClusterParams().max_compared_s:
+            loose_m.append(own_m[np.linalg.norm(own_m[:, :2], axis=1) < MovingClusterParams().max_range_m])
             apart_s.append(since_s)
     found = find_moving_clusters(loose_m, np.array(apart_s))
     places_m = torch.from_numpy(np.concatenate([np.empty((0, 3)), *(of.points_m for of in found)])).float()
@@ -223,7 +223,7 @@ def found_movers(recording, reference, frame):
     for number in np.flatnonzero(count >= POINTS):
         velocity_mps, far_m = boxes.velocity_mps[number].numpy(), np.linalg.norm(boxes.centre_m[number, :2])
         moves = np.linalg.norm(velocity_mps) > MOVES_MPS and boxes.size_m[number, 0] > LEAST_LENGTH_M
-        if moves and far_m < WITHIN_M:
+        if moves and far_m < MovingClusterParams().max_range_m:
             own = whose[inside.point_indices[inside.box_indices == number].numpy()]
             of = found[np.bincount(own).argmax()].velocity_mps if len(own) else np.inf
             off_mps.append(float(np.linalg.norm(of - velocity_mps)))

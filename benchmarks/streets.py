@@ -17,8 +17,8 @@ from torchcover.data import open_recording, read_cloud, read_objects
 from torchcover.geometry import BoundingBox, transform_points
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.recordings.ground_model import GroundModel, extract_low_surfaces
-from torchcover.recordings.vehicle_cloud import transform_to_vehicle
 from torchcover.recordings.recording import Scan
+from torchcover.recordings.vehicle_cloud import transform_to_vehicle
 from torchcover.simulation import PaperReference, Rig, Scenario, Simulator
 from torchcover.simulation.returns import get_material_index
 from torchcover.simulation.scene import SceneGeometry as Scenery

@@ -87,7 +87,7 @@ class OnARoad(Drive):
 def test_the_farther_away_the_higher_may_the_ground_be_by_errors_of_poses():
     drive = OnARoad(labelled=False)
     points_m = np.array([[10.0, 0.0, 0.34], [10.0, 0.0, 0.36], [100.0, 0.0, -0.78], [100.0, 0.0, 0.82]])
-    level_m = AccumulatedReference(10.0)._on_ground(drive, 0, points_m)
+    level_m = AccumulatedReference(10.0)._flatten_ground(drive, 0, points_m)
     assert level_m[:, 2] == pytest.approx([0.0, 0.36, 0.0, 0.82], abs=1e-6)
     assert level_m[:, :2] == pytest.approx(points_m[:, :2])
 
@@ -117,7 +117,7 @@ def test_objects_without_a_name_are_left_out_and_counted():
     drive = Drive(named=False)
     frame = RecordedFrames(drive, reference=AccumulatedReference(10.0, voxel_m=0.05))[2]
     assert len(frame.reference) == len(drive.wall_m)
-    assert frame.counts["reference_gone"] == 4 * len(drive.back_m)  # not the sensor's own scan of that instant
+    assert frame.counts["reference_unlabeled"] == 4 * len(drive.back_m)  # not the sensor's own scan of that instant
 
 
 def test_a_judged_sensor_takes_no_part_at_the_instant_itself():
@@ -125,11 +125,11 @@ def test_a_judged_sensor_takes_no_part_at_the_instant_itself():
     alone = RecordedFrames(drive, rigs={"left": ("left",)}, reference=AccumulatedReference(0.0, voxel_m=0.05))
     both = len(standing(drive, 1)) + len(moving(drive, 1))
     assert len(alone[1].reference) == both  # of the right one
-    assert alone.reference_record["judged_among_them"] == []
+    assert alone.reference_record["evaluated_sensors"] == []
     later = RecordedFrames(drive, rigs={"left": ("left",)}, reference=AccumulatedReference(1.0))
-    assert later.reference_record["judged_among_them"] == ["left"]
-    assert "took part" in later.reference_record["notes"][-1]
-    with pytest.raises(ValueError, match=r"window 0 s\) needs a sensor that is not judged; all are \(left, right\)"):
+    assert later.reference_record["evaluated_sensors"] == ["left"]
+    assert "also built the reference" in later.reference_record["notes"][-1]
+    with pytest.raises(ValueError, match=r"window 0 s\) needs a sensor that is not evaluated; all are \(left, right\)"):
         RecordedFrames(drive, reference=AccumulatedReference(0.0))
 
 
@@ -147,7 +147,7 @@ def test_a_frame_does_not_depend_on_those_read_before():
     copied = [pickle.loads(pickle.dumps(one))[index].reference for index in range(5)]
     for others in zip(forward, backward, fresh, copied, strict=True):
         assert all(torch.equal(others[0], other) for other in others[1:])
-    assert len(one.reference.sweep_window._kept) <= 2 * 5
+    assert len(one.reference.sweep_window._scans) <= 2 * 5
 
 
 def test_one_reference_serves_several_recordings():
@@ -166,18 +166,18 @@ def test_where_the_vehicle_stands_is_no_reference():
     assert 0 < beside.sum() < len(beside)
     assert frame.counts["reference_ego_vehicle"] > 0 < frame.counts["sensor_own_vehicle"]
     nothing = Drive(ego_box=BoundingBox((-90.0, -90.0, -9.0), (90.0, 90.0, 9.0)))
-    with pytest.raises(ValueError, match=r"no reference point is left of the scans within 5 s of this instant"):
+    with pytest.raises(ValueError, match=r"no reference point remains of the scans within 5 s of this frame"):
         RecordedFrames(nothing, reference=AccumulatedReference(10.0))[2]
 
 
 def test_what_a_recording_does_not_say_is_named():
     drive = Drive()
     drive.times_s = None
-    with pytest.raises(ValueError, match=r"cannot be accumulated, .* does not say when its scans were made"):
+    with pytest.raises(ValueError, match=r"no reference can be accumulated because .* has no times of its scans"):
         RecordedFrames(drive)
     drive = Drive()
     drive.get_world_T_vehicle = lambda index: None
-    with pytest.raises(ValueError, match="does not say where the vehicle was"):
+    with pytest.raises(ValueError, match="has no poses of the vehicle"):
         RecordedFrames(drive)
     with pytest.raises(ValueError, match=r"no sensor roof; it has left, right"):
         RecordedFrames(Drive(), reference=AccumulatedReference(sensors=("roof",)))
@@ -190,7 +190,7 @@ def test_what_is_left_out_is_counted_and_points_have_square_metres():
     frame = RecordedFrames(Drive(steps=12, labelled=False), reference=AccumulatedReference(10.0, voxel_m=0.05))[5]
     counts = {name.removeprefix("reference_"): count for name, count in frame.counts.items()}
     assert counts["sweeps"] == 2 * 11  # all but the two of the instant
-    assert counts["rays"] > counts["seen_past"] + counts["passing"] > 0
+    assert counts["rays"] > counts["free_space"] + counts["transient"] > 0
     assert frame.reference_weights.shape == frame.reference.shape[:1]
     assert frame.reference_weights.min() > 0
 
@@ -236,9 +236,9 @@ def test_memory_does_not_grow_with_the_drive():
         _ = frames[index]
     sweeps = frames.reference.sweep_window
     kept = 2 * (2 * 12 + 1)
-    assert len(sweeps._kept) <= kept
-    assert len(sweeps._votes._counted) <= kept
-    assert len(sweeps._votes._images) <= kept
+    assert len(sweeps._scans) <= kept
+    assert len(sweeps._counter._counted) <= kept
+    assert len(sweeps._counter._images) <= kept
 
 
 def test_one_bad_sweep_costs_its_own_frame():

@@ -220,7 +220,7 @@ def test_a_vehicle_that_stands_still_has_no_reference_of_its_own():
             warnings.simplefilter("always")
             result = torchcover.evaluate(frames=frames, cell_m=2.0)
         told = [str(warning.message) for warning in caught if "the vehicle moves less" in str(warning.message)]
-        return result.coverage.scalars()["detection_0.4m/20m/obstacle"], result.run.counts["reference_standing"], told
+        return result.coverage.scalars()["detection_0.4m/20m/obstacle"], result.run.counts["reference_stationary"], told
 
     drive = Striped(steps=30)
     right = np.mean([drive.share_near_stripes(index) for index in range(30)])

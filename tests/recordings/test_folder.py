@@ -184,7 +184,7 @@ def test_a_mount_is_said_once(tmp_path):
 
 def test_a_folder_without_a_reference_needs_poses_to_accumulate_one(tmp_path):
     clouds(tmp_path, sensor=CLOUD)
-    with pytest.raises(ValueError, match=r"cannot be accumulated, .* does not say when its scans were made"):
+    with pytest.raises(ValueError, match=r"no reference can be accumulated because .* has no times of its scans"):
         RecordedFrames(tmp_path)
     assert len(RecordedFrames(driven(tmp_path))[0].reference) == 0  # a vehicle that stands sees nothing from elsewhere
     ahead = np.eye(4)

@@ -5,14 +5,13 @@ import pytest
 
 from torchcover.geometry import BoundingBox, build_transform, convert_euler_to_rotation, invert
 from torchcover.recordings import free_space
-from torchcover.recordings import movers as moved
+from torchcover.recordings import moving_clusters as moved
 from torchcover.recordings.free_space import (
     FreeSpaceCounter,
     RangeImage,
-    estimate_surface_areas_m2,
-    estimate_visible_share,
 )
-from torchcover.recordings.movers import find_moving_clusters
+from torchcover.recordings.moving_clusters import find_moving_clusters
+from torchcover.recordings.visibility import estimate_surface_areas_m2, estimate_visible_share, mark_hidden_by_arrays
 
 CAR = BoundingBox((-2.4, -0.95, 0.0), (2.4, 0.95, 1.7))
 
@@ -84,7 +83,7 @@ def test_votes_do_not_depend_on_the_way_to_an_instant():
 
 def test_loops_do_what_arrays_do():
     pytest.importorskip("numba")
-    from torchcover.recordings import loops
+    from torchcover.recordings import compiled_kernels as loops
 
     generator = np.random.default_rng(0)
     points_m = generator.normal(0.0, 20.0, (5000, 3))
@@ -93,19 +92,23 @@ def test_loops_do_what_arrays_do():
     image = RangeImage.from_points(generator.normal(0.0, 30.0, (40_000, 3)), sensor_T_local)
     one, other = np.zeros((2, 5000), np.int16)
     for kernel, votes in ((loops.count_votes_by_loop, one), (free_space.count_votes_by_arrays, other)):
-        kernel(points_m, *image, votes, 2)
+        arrays = (image.free_range_m, image.first_row, image.sensor_T_local, image.max_free_range_m)
+        kernel(points_m, *arrays, image.params.columns, image.params.rows, votes, 2)
     np.testing.assert_array_equal(one, other)
     assert 0 < one.sum() < 2 * len(one)
 
     hidden = np.zeros((2, 5000), np.bool_)
     reach_m = np.array([np.inf, 70.0, 30.0, 10.0])
-    for kernel, of in zip((loops.mark_hidden_by_loop, free_space.mark_hidden_by_arrays), hidden, strict=True):
+    for kernel, of in zip((loops.mark_hidden_by_loop, mark_hidden_by_arrays), hidden, strict=True):
         kernel(
             points_m,
             np.array([0.1, 3.2, 0.3]),
             np.array([[-2.0, -1.0, -1.0], [2.0, 1.0, 1.5]]),
-            free_space.BINS_RAD,
+            np.deg2rad([0.2, 0.4, 0.8, 1.6]),
             reach_m,
+            0.4,
+            0.12,
+            0.15,
             of,
         )
     np.testing.assert_array_equal(*hidden)

@@ -9,7 +9,7 @@ import torchcover
 from tests.recordings.drives import CAR_SIZE_M, Drive
 from torchcover.data import AccumulatedReference, RecordedFrames
 from torchcover.geometry import build_transform, convert_euler_to_rotation, invert, transform_points
-from torchcover.recordings.ground_model import CELL_M, GroundModel, extract_low_surfaces
+from torchcover.recordings.ground_model import GroundModel, GroundModelParams, extract_low_surfaces
 
 NOISE_M = 0.03
 HERE_M = np.zeros(3)
@@ -160,7 +160,7 @@ def test_neither_the_order_of_points_nor_of_sweeps_matters():
 def test_large_coordinates_change_nothing():
     road, places_m = seen(hills), seen(hills, 300, seed=3)
     expected_m = ground_of(road).compute_heights_m(places_m)
-    shift_m = np.array([4096 * CELL_M, -8192 * CELL_M, 512.0])
+    shift_m = np.array([4096, -8192, 0]) * GroundModelParams().column_m + [0.0, 0.0, 512.0]
     shifted = ground_of(road + shift_m, place_m=shift_m)
     np.testing.assert_allclose(shifted.compute_heights_m(places_m + shift_m), expected_m, atol=1e-8)
 

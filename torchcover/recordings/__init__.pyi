@@ -1,3 +1,4 @@
+from .accumulated_reference import AccumulatedReference as AccumulatedReference
 from .checks import check_recording as check_recording
 from .clouds import read_cloud as read_cloud
 from .formats import FORMATS as FORMATS
@@ -9,7 +10,6 @@ from .recorded_frames import create_reference as create_reference
 from .recorders import RECORDERS as RECORDERS
 from .recording import Recording as Recording
 from .recording import Scan as Scan
-from .reference import AccumulatedReference as AccumulatedReference
 from .reference import RecordedReference as RecordedReference
 from .reference import Reference as Reference
 from .settings import RecordingSettings as RecordingSettings

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from torchcover.detection import Boxes, find_points_in_boxes
 from torchcover.neighbors import nearest
+from torchcover.recordings.accumulated_reference import AccumulatedReference
 from torchcover.recordings.ground_model import GroundModel, extract_low_surfaces
-from torchcover.recordings.vehicle_cloud import transform_to_vehicle
 from torchcover.recordings.pose_checks import (
     check_frozen_poses,
     check_pose_conventions,
@@ -21,7 +21,8 @@ from torchcover.recordings.pose_checks import (
     read_pose_segments,
 )
 from torchcover.recordings.recording import Recording, read_complete_manifest
-from torchcover.recordings.reference import AccumulatedReference, RecordedReference, Reference
+from torchcover.recordings.reference import RecordedReference, Reference
+from torchcover.recordings.vehicle_cloud import transform_to_vehicle
 
 Cloud = NDArray[np.float32]
 

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from torchcover.geometry import invert, transform_points
 from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.corrections import correct_poses
-from torchcover.recordings.vehicle_cloud import transform_to_vehicle
 from torchcover.recordings.recording import Recording
 from torchcover.recordings.settings import RecordingSettings
-from torchcover.recordings.sweeps import compute_voxel_indices, find_pose_discontinuities
+from torchcover.recordings.sweep_window import compute_voxel_indices, find_pose_discontinuities
+from torchcover.recordings.vehicle_cloud import transform_to_vehicle
 
 
 @dataclass(frozen=True)

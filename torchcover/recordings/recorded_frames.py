@@ -18,10 +18,11 @@ from torchcover.files import allow_links, find_link_roots
 from torchcover.frames.frame import Frame
 from torchcover.frames.source import BadFrameError, FrameDataset
 from torchcover.geometry import transform_points
-from torchcover.recordings.vehicle_cloud import VehicleCloud, join_clouds, transform_to_vehicle
+from torchcover.recordings.accumulated_reference import AccumulatedReference
 from torchcover.recordings.recording import Recording
-from torchcover.recordings.reference import AccumulatedReference, RecordedReference, Reference
-from torchcover.recordings.sweeps import SweepWindow
+from torchcover.recordings.reference import RecordedReference, Reference
+from torchcover.recordings.sweep_window import SweepWindow
+from torchcover.recordings.vehicle_cloud import VehicleCloud, join_clouds, transform_to_vehicle
 
 NO_GROUND = "Ground: none was found near the vehicle, so heights are z of the vehicle frame."
 SEEN_GROUND = "Ground: a height field through what all sensors saw of it; unknown farther than 10 m from that."
@@ -35,7 +36,7 @@ class RecordedFrames(FrameDataset):
     Points that are not finite, never came back (they lie in the sensor) or lie on the vehicle itself are in neither
     cloud; `Frame.counts` says how many (`sensor_nonfinite`, `reference_no_return`, ...). An empty sensor cloud is a
     blind step; an empty reference cloud is an error, for nothing was measured, unless the vehicle stands still in the
-    window of an `AccumulatedReference`: such a frame says nothing, and `Frame.counts` has `reference_standing`.
+    window of an `AccumulatedReference`: such a frame says nothing, and `Frame.counts` has `reference_stationary`.
 
     Args:
         recording: A recording, or the path of one; see `open_recording`.

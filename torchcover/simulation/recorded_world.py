@@ -21,18 +21,20 @@ from torchcover.geometry import (
 from torchcover.geometry.arrays import Bools, Float64, Int64
 from torchcover.geometry.rigid import Matrix
 from torchcover.geometry.trajectory import Trajectory
+from torchcover.recordings.accumulated_reference import DEFAULT_EGO_BOX, AccumulatedReference, AccumulationParams
 from torchcover.recordings.formats.tracks import BOX_COLUMNS, TRAJECTORY_COLUMNS
 from torchcover.recordings.free_space import RangeImage
-from torchcover.recordings.vehicle_cloud import find_points_in_box
-from torchcover.recordings.movers import COMPARED_S, WITHIN_M, MovingCluster, find_moving_clusters
+from torchcover.recordings.moving_clusters import MovingCluster, find_moving_clusters
 from torchcover.recordings.objects import extract_objects
 from torchcover.recordings.recording import Recording
-from torchcover.recordings.reference import KNOWN_POINTS, ON_GROUND_M, USUAL_BODY, VOTES, AccumulatedReference
-from torchcover.recordings.sweeps import MOVES_MPS, compute_voxel_indices, find_first_occurrences
+from torchcover.recordings.sweep_window import compute_voxel_indices, find_first_occurrences
+from torchcover.recordings.vehicle_cloud import find_points_in_box
 from torchcover.simulation.height_field import GroundHeightField
 from torchcover.simulation.recorded.run import pieces
 from torchcover.simulation.shapes import Mesh
 
+# Parameters of the reference that separates static points from moving ones.
+ACCUMULATION = AccumulationParams()
 # Scans so near in time tell together what stands; those so far apart look at all of it once more.
 WINDOW_S, LOOK_EVERY_S = 5.0, 1.0
 # Instants of the world, and of those that movers are looked for at; how long one may be unseen.
@@ -120,7 +122,7 @@ def write_scenario(recording: Recording, folder: Path, *, num_frames: int | None
     poses = np.array(
         [reference.sweep_window.compute_local_T_vehicle(recording, instant) for instant in range(last + 1)]
     )
-    body = recording.ego_box or USUAL_BODY
+    body = recording.ego_box or DEFAULT_EGO_BOX
     beside_m = np.array([BESIDE_M, BESIDE_M, 0.0])
     own = BoundingBox.from_points(np.array([body.lower_m - beside_m, body.upper_m + beside_m]))
     seen = _seen(recording, reference, times_s, poses, own)
@@ -239,7 +241,7 @@ def _cells(seen: MappedDrive, driven: Sequence[tuple[Matrix, BoundingBox]]) -> I
     """(N, 3) the cells, in steps of `CELL_M`, that something fills; none of where anything drives."""
     field = HeightField(seen.ground.origin_m, seen.ground.corner_heights_m, SQUARE_M)
     above_m = seen.static_points_m[:, 2] - field.compute_heights_m(seen.static_points_m[:, :2])
-    stands = ~(above_m < ON_GROUND_M)
+    stands = ~(above_m < ACCUMULATION.max_ground_height_m)
     places_m, above_m = seen.static_points_m[stands], above_m[stands]
     cells = np.floor(places_m / CELL_M).astype(np.int64)
     order = np.lexsort(cells.T[::-1])
@@ -256,7 +258,7 @@ def _cells(seen: MappedDrive, driven: Sequence[tuple[Matrix, BoundingBox]]) -> I
     votes = np.zeros(len(cells), np.int16)
     for image in seen.range_images:
         image.add_votes(places_m, votes)
-    cells = cells[votes < VOTES]
+    cells = cells[votes < ACCUMULATION.min_votes]
     cells = cells[np.argsort(cells[:, 0], kind="stable")]
     free = np.ones(len(cells), np.bool_)
     for pose, box in driven:
@@ -327,16 +329,17 @@ def _found(seen: MappedDrive, drive: Trajectory) -> Iterator[TableRow]:
         if time_s - before_s < FOUND_EVERY_S - 1e-6:
             continue
         before_s, ego_m = time_s, drive.interpolate_positions_m(np.array([time_s]))[0]
-        near = np.flatnonzero(np.abs(scan_s - time_s) <= COMPARED_S)
+        near = np.flatnonzero(np.abs(scan_s - time_s) <= ACCUMULATION.clusters.max_compared_s)
         scans_m = [seen.dynamic_scans[scan][1] for scan in near]
-        scans_m = [of_m[np.linalg.norm(of_m[:, :2] - ego_m[:2], axis=1) < WITHIN_M] for of_m in scans_m]
+        max_range_m = ACCUMULATION.clusters.max_range_m
+        scans_m = [of_m[np.linalg.norm(of_m[:, :2] - ego_m[:2], axis=1) < max_range_m] for of_m in scans_m]
         _go_on(tracks, time_s, find_moving_clusters(scans_m, scan_s[near] - time_s))
     number = 0
     for track in tracks:
         way_m = track[-1][1] - track[0][1]
         if len(track) < LEAST_TIMES or np.linalg.norm(way_m) < LEAST_WAY_M:
             continue
-        if max(len(moved.points_m) for *_, moved in track) < KNOWN_POINTS:
+        if max(len(moved.points_m) for *_, moved in track) < ACCUMULATION.min_cluster_points:
             continue
         boxes = _boxes(track, drive, seen.ground)
         if _seen_past(seen, scan_s, [time_s for time_s, *_ in track], boxes) < PAST:
@@ -391,7 +394,7 @@ def _boxes(
     times_s = np.array([time_s for time_s, *_ in track])
     middles_m = np.array([middle_m for _, middle_m, _ in track])
     way = _steadied(np.array([moved.velocity_mps for *_, moved in track]))
-    goes = np.linalg.norm(way, axis=1) > MOVES_MPS
+    goes = np.linalg.norm(way, axis=1) > ACCUMULATION.sweeps.min_object_speed_mps
     if not goes.any():
         way[:], goes[:] = middles_m[-1] - middles_m[0], True
     # Who stands looks where it went, or will go.

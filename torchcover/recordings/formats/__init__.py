@@ -18,9 +18,9 @@ from torchcover.recordings.formats.nuscenes import NuScenes
 from torchcover.recordings.formats.ros import RosBag
 from torchcover.recordings.formats.tracks import read_box_tracks, read_commonroad
 from torchcover.recordings.objects import RecordedObjects, extract_objects
-from torchcover.recordings.unsupported_formats import find_remedy
 from torchcover.recordings.recording import Recording, read_complete_manifest
 from torchcover.recordings.settings import RecordingSettings, merge_recording_settings
+from torchcover.recordings.unsupported_formats import find_remedy
 
 
 class RecordingFormat(Protocol):
