@@ -25,15 +25,15 @@ def _slow_coverage(grid, steps, thresholds_m=(0.4,), max_radius=math.inf):
 
     shape = grid.shape
     maps = {name: np.full(shape, np.nan) for name in ("radius", "radius_maximum_m", "radius_pooled_m")}
-    maps |= {name: np.zeros(shape, dtype=int) for name in ("observed_frames", "points")}
-    maps["detection"] = np.full((len(thresholds), *shape), np.nan)
+    maps |= {name: np.zeros(shape, dtype=int) for name in ("observed_frames", "point_counts")}
+    maps["detection"] = np.full((len(thresholds_m), *shape), np.nan)
     for cell, in_steps in per_cell.items():
         radii = [np.minimum(distances, max_radius) for distances in in_steps]
         maps["radius"][cell] = np.mean([r.mean() for r in radii])
-        maps["detection"][(slice(None), *cell)] = [np.mean([(d <= t).mean() for d in in_steps]) for t in thresholds]
+        maps["detection"][(slice(None), *cell)] = [np.mean([(d <= t).mean() for d in in_steps]) for t in thresholds_m]
         maps["radius_maximum_m"][cell] = np.concatenate(radii).max()
         maps["radius_pooled_m"][cell] = np.concatenate(radii).mean()
-        maps["observed_frames"][cell], maps["points"][cell] = len(radii), sum(map(len, radii))
+        maps["observed_frames"][cell], maps["point_counts"][cell] = len(radii), sum(map(len, radii))
     return maps
 
 

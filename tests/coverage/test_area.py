@@ -15,7 +15,7 @@ HEIGHTS = {"low": (0.0, 1.0), "high": (1.0, 2.0)}
 
 
 def grid(cell_m=1.0):
-    return BevGrid(x_m=(0.0, 8.0), y_m=(0.0, 4.0), cell_m=cell, heights=HEIGHTS)
+    return BevGrid(x_m=(0.0, 8.0), y_m=(0.0, 4.0), cell_m=cell_m, heights=HEIGHTS)
 
 
 def steps_of(count, seed=0, points=40):
@@ -33,7 +33,7 @@ def steps_of(count, seed=0, points=40):
 
 
 def metric_over(steps, index=None, cell_m=1.0, **options):
-    metric = CoverageMetric(grid(cell), (0.4, 0.8), has_area_weights=True, **options)
+    metric = CoverageMetric(grid(cell_m), (0.4, 0.8), has_area_weights=True, **options)
     for number, (sensor, reference, m2) in zip(index or range(len(steps)), steps, strict=True):
         metric.update(sensor, reference, weights=m2, block_index=number)
     return metric
@@ -53,7 +53,7 @@ def by_hand(steps, low, high):
 @pytest.mark.parametrize("cell", [0.25, 1.0, 4.0])
 def test_it_is_the_ratio_of_sums_whatever_the_cells(cell):
     steps = steps_of(9)
-    coverage = metric_over(steps, cell=cell).compute()
+    coverage = metric_over(steps, cell_m=cell).compute()
     for height, band in HEIGHTS.items():
         estimate = coverage.estimate(REGION, height, "area")
         torch.testing.assert_close(estimate.value, by_hand(steps, *band), rtol=1e-6, atol=1e-9)

@@ -205,7 +205,7 @@ def test_the_error_of_a_difference_is_that_of_the_paired_values():
     for radii in (shared, shared + own):
         steps = [{"clouds": clouds_of({0: [r]}), "more": {"block_index": at}} for at, r in enumerate(radii.tolist())]
         estimates.append(metric_over(steps).compute().estimate(EVERYWHERE, "all"))
-    difference = estimates[1].minus(estimates[0])
+    difference = estimates[1].subtract(estimates[0])
     assert float(difference.value[0]) == pytest.approx(own.mean(), rel=1e-4)
     assert float(difference.error[0]) == pytest.approx(own.std(ddof=1) / 4, rel=1e-3)
     assert float(difference.error[0]) < 0.05 * float(estimates[0].error[0])

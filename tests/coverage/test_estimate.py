@@ -116,5 +116,5 @@ def test_numbers_without_maps_are_those_of_the_result_to_the_last_bit(measure):
     for place, found in zip(places, metric.estimate_regions(places, measure), strict=True):
         expected = metric.compute().estimate(*place, measure)
         assert found.quantities == expected.quantities
-        for name in ("value", "left_out", "steps"):
+        for name in ("value", "jackknife_values", "frame_counts"):
             torch.testing.assert_close(getattr(found, name), getattr(expected, name), rtol=0, atol=0)

@@ -31,7 +31,7 @@ def index_of(grid, point):
 @pytest.mark.parametrize("axis", ["x", "y"])
 def test_cells_are_half_open_wherever_the_range_lies(bounds, axis):
     other = "y" if axis == "x" else "x"
-    grid = BevGrid(**{axis: bounds, other: (0.0, 1.0)}, cell_m=0.5, heights=ONE_BAND)
+    grid = BevGrid(**{f"{axis}_m": bounds, f"{other}_m": (0.0, 1.0)}, cell_m=0.5, heights=ONE_BAND)
     count = round((bounds[1] - bounds[0]) / 0.5)
     place = {"x": 2, "y": 1}[axis]
     for cell in range(count):
@@ -207,7 +207,7 @@ def test_a_grid_does_not_change_with_its_arguments():
 
 @pytest.mark.parametrize("cell", [0.0, -0.5, math.nan, math.inf])
 def test_a_cell_without_a_length_is_refused(cell):
-    with pytest.raises(ValueError, match=f"cell: a positive length in metres is needed; got {cell}"):
+    with pytest.raises(ValueError, match=f"cell_m: a positive length in metres is needed; got {cell}"):
         BevGrid(x_m=(0, 1), y_m=(0, 1), cell_m=cell)
 
 
@@ -229,8 +229,8 @@ def test_a_cell_without_a_length_is_refused(cell):
 )
 def test_bounds_that_do_not_make_cells_are_refused(axis, bounds, message):
     other = "y" if axis == "x" else "x"
-    with pytest.raises(ValueError, match=f"^{axis}: {message}"):
-        BevGrid(**{axis: bounds, other: (0.0, 1.0)}, cell_m=0.5)
+    with pytest.raises(ValueError, match=f"^{axis}_m: {message}"):
+        BevGrid(**{f"{axis}_m": bounds, f"{other}_m": (0.0, 1.0)}, cell_m=0.5)
 
 
 @pytest.mark.parametrize(
@@ -248,7 +248,7 @@ def test_bands_that_make_no_sense_are_refused(heights, message):
 
 
 def test_a_grid_too_large_for_the_memory_is_refused_before_it_is_made():
-    with pytest.raises(ValueError, match=r"x: inf cells of 1e-310 m, over 100,000,000: use larger cells"):
+    with pytest.raises(ValueError, match=r"x_m: inf cells of 1e-310 m, over 100,000,000: use larger cells"):
         BevGrid(x_m=(0.0, 1.0), y_m=(0.0, 1.0), cell_m=1e-310)
     with pytest.raises(ValueError, match="the grid has 200,000,000 cells, over 100,000,000: use larger cells"):
         BevGrid(x_m=(0, 10_000), y_m=(0, 10_000), cell_m=1.0)

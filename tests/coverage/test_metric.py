@@ -187,7 +187,7 @@ def test_everything_that_happened_is_counted():
     }
 
 
-@pytest.mark.parametrize("max_radius_m", [0.5, 1e39, 1e300])
+@pytest.mark.parametrize("max_radius", [0.5, 1e39, 1e300])
 def test_max_radius_saturates_every_number(max_radius):
     steps = [(ORIGIN, points_at(0.25, 0.75))]
     result = coverage(steps, ONE_CELL, (0.4,), max_radius_m=max_radius, **OPTIONS)
@@ -208,14 +208,14 @@ def test_without_radii_only_points_near_the_reference_matter_to_the_last_bit():
     steps = random_steps(11, steps=6)
     near = [(sensor[torch.cdist(sensor, reference).amin(dim=1) <= 0.6], reference) for sensor, reference in steps]
     assert sum(len(sensor) for sensor, _ in near) < 0.5 * sum(len(sensor) for sensor, _ in steps)
-    whole, less = coverage(steps, GRID, (0.25, 0.5)), coverage(near, GRID, (0.25, 0.5), radii=False)
+    whole, less = coverage(steps, GRID, (0.25, 0.5)), coverage(near, GRID, (0.25, 0.5), needs_radii=False)
     assert torch.equal(whole.detection.nan_to_num(-1), less.detection.nan_to_num(-1))
     assert less.radius.isnan().all()
     assert less.counts["saturated_points"] == 0
     with pytest.raises(ValueError, match="radii: aggregations and sensors need them"):
-        CoverageMetric(GRID, (0.25,), radii=False, aggregations=[Maximum()])
+        CoverageMetric(GRID, (0.25,), needs_radii=False, aggregations=[Maximum()])
     with pytest.raises(ValueError, match="by another metric"):
-        CoverageMetric(GRID, (0.25,)).merge_state(CoverageMetric(GRID, (0.25,), radii=False))
+        CoverageMetric(GRID, (0.25,)).merge_state(CoverageMetric(GRID, (0.25,), needs_radii=False))
 
 
 # Against plain loops
@@ -240,7 +240,7 @@ def test_shorter_types_give_what_their_rounded_coordinates_give(slow_coverage, d
     result = coverage(steps, GRID)
     assert result.radius.dtype == result.detection.dtype == torch.float64
     np.testing.assert_allclose(result.radius.numpy(), expected["radius"], rtol=1e-6)
-    np.testing.assert_array_equal(result.point_counts.numpy(), expected["points"])
+    np.testing.assert_array_equal(result.point_counts.numpy(), expected["point_counts"])
 
 
 @pytest.mark.parametrize(
@@ -280,7 +280,7 @@ def test_numbers_that_mean_something_else_than_they_seem_are_warned_of_once():
 def assert_same(one, other):
     assert one.counts == other.counts
     assert one.layers.keys() == other.layers.keys()
-    for name in ("observed_frames", "points", *one.layers):
+    for name in ("observed_frames", "point_counts", *one.layers):
         torch.testing.assert_close(map_of(one, name), map_of(other, name), rtol=1e-12, atol=0, equal_nan=True)
 
 
@@ -402,7 +402,7 @@ def test_parameters_that_make_no_sense_are_refused(options, message):
         CoverageMetric(ONE_CELL, **options)
 
 
-@pytest.mark.parametrize("thresholds_m", [0.4, "0.4", ("0.4",), {0.4: 1}])
+@pytest.mark.parametrize("thresholds", [0.4, "0.4", ("0.4",), {0.4: 1}])
 def test_what_is_no_sequence_of_thresholds_is_refused(thresholds):
     with pytest.raises(TypeError, match=r"thresholds: a sequence of metres, as in \(0.4,\), is needed; got"):
         CoverageMetric(ONE_CELL, thresholds)

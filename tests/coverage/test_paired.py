@@ -12,7 +12,7 @@ NEAR = Region("near", (0.0, 5.0), (-5.0, 5.0))
 
 
 def measured(*, weighed=False, steps=(0, 1), radius=1.0, more=0, num_blocks=8):
-    metric = CoverageMetric(SQUARE, num_blocks=blocks, has_area_weights=weighed)
+    metric = CoverageMetric(SQUARE, num_blocks=num_blocks, has_area_weights=weighed)
     for at in steps:
         reference = torch.tensor([[0.5, 0.5, 0.0], [3.5, 0.5, 0.0], [3.6, 0.5, 0.0]])[: 2 + more]
         weights = {"weights": torch.ones(len(reference))} if weighed else {}

@@ -28,7 +28,7 @@ def steps(count=16, empty=()):
 
 
 def measured(of_steps, *, without=None, by_sensor=True, **options):
-    metric = CoverageMetric(GRID, **{**OPTIONS, **options}, sensors=SENSORS if by_sensor else ())
+    metric = CoverageMetric(GRID, **{**OPTIONS, **options}, sensor_names=SENSORS if by_sensor else ())
     for clouds, reference, weights in of_steps:
         rest = torch.cat([cloud for name, cloud in clouds.items() if name != without])
         metric.update(clouds if by_sensor else rest, reference, weights=weights)
@@ -137,7 +137,7 @@ def test_a_region_that_the_metric_was_not_told_of_has_no_redundancy_by_area():
 )
 def test_other_clouds_are_refused(sensor, message):
     with pytest.raises(ValueError, match=message):
-        CoverageMetric(GRID, sensors=SENSORS).update(sensor, torch.zeros(1, 3))
+        CoverageMetric(GRID, sensor_names=SENSORS).update(sensor, torch.zeros(1, 3))
 
 
 def test_clouds_by_name_need_a_metric_that_knows_the_names():

@@ -63,7 +63,7 @@ def test_a_region_beyond_the_grid_is_refused(bounds, message):
 @pytest.mark.parametrize("axis", ["x", "y"])
 def test_bounds_without_inside_are_refused(axis, bounds):
     with pytest.raises(ValueError, match=f"region 'r': {axis} needs finite bounds, lower first; got"):
-        Region("r", **{"x_m": (0.0, 1.0), "y_m": (0.0, 1.0), axis: bounds})
+        Region("r", **{"x_m": (0.0, 1.0), "y_m": (0.0, 1.0), f"{axis}_m": bounds})
 
 
 def test_a_region_needs_a_name():

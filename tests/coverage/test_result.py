@@ -35,10 +35,10 @@ def a_coverage(seed=0, thresholds_m=(0.4, 0.8), grid=GRID, frames=None):
 
     return Coverage(
         grid=grid,
-        thresholds_m=thresholds,
+        thresholds_m=thresholds_m,
         max_radius_m=30.0,
         observed_cells=known,
-        layers=[Layer(quantity, values()) for quantity in MeanOfMeans(thresholds).quantities],
+        layers=[Layer(quantity, values()) for quantity in MeanOfMeans(thresholds_m).quantities],
         counts=COUNTS,
     )
 
@@ -129,7 +129,7 @@ def test_a_table_has_the_scalars_and_errors_where_there_are_blocks(blocks, error
     for _ in range(8):
         metric.update(torch.rand(9, 3, generator=random), 10 * torch.rand(60, 3, generator=random))
     result = metric.compute()
-    table = result.to_dataframe().set_index(["region", "height"])
+    table = result.to_dataframe().set_index(["region", "band"])
     assert {f"{key}/{'/'.join(row)}": value for row, each in table.iterrows() for key, value in each.items()} == {
         key: pytest.approx(value, rel=0, abs=0, nan_ok=True) for key, value in result.scalars().items()
     }
@@ -171,13 +171,14 @@ def assert_same(one, other):
     assert list(one.grid.heights) == list(other.grid.heights)
     for name in ("thresholds_m", "max_radius_m", "quantities", "counts"):
         assert getattr(one, name) == getattr(other, name), name
-    pairs = [(getattr(one, name), getattr(other, name)) for name in ("observed_frames", "points")]
+    pairs = [(getattr(one, name), getattr(other, name)) for name in ("observed_frames", "point_counts")]
     assert [layer.quantity for layer in one.layers.values()] == [layer.quantity for layer in other.layers.values()]
     pairs += [(layer.values, other.layers[key].values) for key, layer in one.layers.items()]
-    assert (one.blocks is None) == (other.blocks is None)
-    if one.blocks is not None:
+    assert (one.block_sums is None) == (other.block_sums is None)
+    if one.block_sums is not None:
         pairs += [
-            (getattr(one.blocks, name), getattr(other.blocks, name)) for name in ("steps", "at", "base", "listed")
+            (getattr(one.block_sums, name), getattr(other.block_sums, name))
+            for name in ("frame_counts", "cell_indices", "denominators", "sums")
         ]
     for a, b in pairs:
         torch.testing.assert_close(a, b, rtol=0, atol=0, equal_nan=True)
@@ -231,7 +232,7 @@ def test_a_file_can_be_read_by_numpy_alone(tmp_path):
             layer = np.full(header["shape"], np.nan)
             layer.flat[file["cell"]] = file[key]
             np.testing.assert_array_equal(layer, expected)
-        assert header["grid"]["cell"] == 0.5
+        assert header["grid"]["cell_m"] == 0.5
 
 
 def test_a_result_survives_pickling():
@@ -292,11 +293,11 @@ def rewrite(path, header=None, **arrays):
     [
         {"header": None, "radius_m": None},
         {"header": None, "radius_m": np.zeros((2, 2))},
-        {"header": None, "points": np.zeros((2, 2))},
+        {"header": None, "point_counts": np.zeros((2, 2))},
         {"header": lambda _: "[1]"},
         {"header": lambda _: "3"},
         {"header": lambda _: "no JSON"},
-        {"header": lambda _: '{"format": 10}'},
+        {"header": lambda _: '{"format": 11}'},
         {"header": lambda old: json.dumps({name: value for name, value in old.items() if name != "counts"})},
         {"header": lambda old: json.dumps({**old, "grid": {**old["grid"], "cell_m": 0.7}})},
     ],
@@ -321,16 +322,19 @@ def saved_in_blocks(tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"header": lambda old: json.dumps({**old, "num_blocks": 10**9})}, "the steps of 1000000000 blocks have shape"),
-        ({"header": lambda old: json.dumps({**old, "num_blocks": -8})}, "the steps of -8 blocks have shape"),
+        (
+            {"header": lambda old: json.dumps({**old, "num_blocks": 10**9})},
+            "the frame counts of 1000000000 blocks have shape",
+        ),
+        ({"header": lambda old: json.dumps({**old, "num_blocks": -8})}, "the frame counts of -8 blocks have shape"),
         ({"cell": lambda old: old[1:]}, "observed_frames has shape"),
-        ({"cell": lambda old: old[::-1]}, "cell: numbers of cells in ascending order, below 16, are needed"),
-        ({"block_cell": lambda old: old.astype(np.int64) - 1000}, "block_cell: numbers of cells in ascending order"),
-        ({"area_cell": lambda old: old + 8 * 16}, "area_cell: numbers of cells in ascending order, below 128"),
+        ({"cell": lambda old: old[::-1]}, "cell: cell indices in ascending order, below 16, are needed"),
+        ({"block_cell": lambda old: old.astype(np.int64) - 1000}, "block_cell: cell indices in ascending order"),
+        ({"area_cell": lambda old: old + 8 * 16}, "area_cell: cell indices in ascending order, below 128"),
         ({"area_cell": lambda old: old[1:]}, "cells do not fit into"),
         ({"block_sums": lambda old: old[:, :1]}, "cells do not fit into"),
-        ({"block_cell": lambda old: old[::-1]}, "block_cell: numbers of cells in ascending order"),
-        ({"area_cell": lambda old: np.repeat(old[::2], 2)[: len(old)]}, "area_cell: numbers of cells in ascending"),
+        ({"block_cell": lambda old: old[::-1]}, "block_cell: cell indices in ascending order"),
+        ({"area_cell": lambda old: np.repeat(old[::2], 2)[: len(old)]}, "area_cell: cell indices in ascending"),
     ],
 )
 def test_blocks_that_do_not_fit_are_refused(saved_in_blocks, change, message):
@@ -346,7 +350,10 @@ def test_blocks_in_which_nothing_is_listed_count_as_memory(saved_in_blocks, monk
     """A million blocks are some kB in a file, and errors are made of all known cells in all blocks."""
     many = np.zeros(1_000_000, np.int64)
     rewrite(
-        saved_in_blocks, lambda old: json.dumps({**old, "num_blocks": len(many)}), block_steps=many, area_steps=many
+        saved_in_blocks,
+        lambda old: json.dumps({**old, "num_blocks": len(many)}),
+        block_frame_counts=many,
+        area_frame_counts=many,
     )
     monkeypatch.setenv("TORCHCOVER_MAX_FILE_GB", "0.1")
     with pytest.raises(BadFileError, match=r"coverage\.npz: reading it takes 0\.\d+ GB .* more than the 0\.1 GB"):
@@ -360,12 +367,10 @@ def test_an_array_file_is_no_coverage_file(saved):
         Coverage.load(saved)
 
 
-@pytest.mark.parametrize(
-    ("number", "then"), [(9, "; height bands of older ones were over z of the vehicle"), (11, "$")]
-)
+@pytest.mark.parametrize(("number", "then"), [(10, "; evaluate the recording or scenario again"), (12, "$")])
 def test_another_format_is_refused_by_its_number(saved, number, then):
     rewrite(saved, header=lambda old: json.dumps({**old, "format": number, "unheard of": 1}))
-    said = rf"coverage\.npz: coverage format {number}; this torchcover reads format 10{then}"
+    said = rf"coverage\.npz: coverage format {number}; this torchcover reads format 11{then}"
     with pytest.raises(ValueError, match=said):
         Coverage.load(saved)
 

@@ -61,8 +61,8 @@ def test_a_table_whose_keys_are_none_is_refused(spoil):
     metric.update(*clouds(0))
     metric.persistent(True)
     state = metric.state_dict()
-    state["cells"][:, 0] = spoil(state["cells"][:, 0])
-    with pytest.raises(RuntimeError, match="state 'cells': keys in ascending order, whole numbers below 100"):
+    state["cell_sums"][:, 0] = spoil(state["cell_sums"][:, 0])
+    with pytest.raises(RuntimeError, match="state 'cell_sums': keys in ascending order, whole numbers below 100"):
         metric.load_state_dict(state)
 
 

@@ -147,8 +147,10 @@ def test_a_mixture_has_the_variance_of_its_strata_and_the_freedom_of_welch_and_s
 
 def test_differences_of_mixtures_are_paired_in_each_stratum():
     shared = [drawn(12, 2.0, 1.0, 1), drawn(16, 5.0, 1.0, 2)]
-    other = [replace(one, value=one.value - 0.3, left_out=one.jackknife_values - 0.3) for one in shared]
-    other[1] = replace(other[1], left_out=other[1].jackknife_values + 1e-4 * torch.randn(16, 1, dtype=torch.float64))
+    other = [replace(one, value=one.value - 0.3, jackknife_values=one.jackknife_values - 0.3) for one in shared]
+    other[1] = replace(
+        other[1], jackknife_values=other[1].jackknife_values + 1e-4 * torch.randn(16, 1, dtype=torch.float64)
+    )
     one, another = (Estimate.from_strata(list(zip((0.5, 0.5), each, strict=True))) for each in (shared, other))
     difference = another.compute_differences(one)["radius_m"]
     assert difference.value == pytest.approx(-0.3)

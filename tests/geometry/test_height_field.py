@@ -10,11 +10,13 @@ RANDOM = np.random.default_rng(5)
 
 def height_of(field, place_m):
     """At one place: the plane through the three corners of its triangle."""
-    rows, columns = field.corners_m.shape
-    x, y = np.clip((np.asarray(place_m) - field.lower_m) / field.cell_m, 0.0, [columns - 1, rows - 1])
+    rows, columns = field.corner_heights_m.shape
+    x, y = np.clip((np.asarray(place_m) - field.origin_m) / field.cell_m, 0.0, [columns - 1, rows - 1])
     column, row = min(int(x), columns - 2), min(int(y), rows - 2)
     x, y = x - column, y - row
-    first, right, left, across = (field.corners_m[row + up, column + on] for up, on in ((0, 0), (0, 1), (1, 0), (1, 1)))
+    first, right, left, across = (
+        field.corner_heights_m[row + up, column + on] for up, on in ((0, 0), (0, 1), (1, 0), (1, 1))
+    )
     if x >= y:
         return first + x * (right - first) + y * (across - right)
     return first + y * (left - first) + x * (across - left)

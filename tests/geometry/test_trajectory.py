@@ -125,7 +125,7 @@ def test_what_ever_changes_its_pose_moves():
     away = [moves([here, [0, 0, 1e-9]]), moves([here, [0, 1, 0], here])]
     turning = [moves([here] * 3, [here, aside[axis], here]) for axis in range(3)]
     turning += [moves([here] * 2, [here, aside[axis]]) for axis in range(3)]
-    coming = [moves([here], transient=True), moves([here] * 2, transient=True)]
+    coming = [moves([here], is_transient=True), moves([here] * 2, is_transient=True)]
     assert [*away, *turning, *coming] == [True] * 10
 
 

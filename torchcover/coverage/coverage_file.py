@@ -1,7 +1,8 @@
-"""Results as files: everything that a `Coverage` has, in one `.npz`.
+"""Reading and writing of a `Coverage` as one `.npz` file.
 
-All are lists over the cells that were probed. `cell` has their indices into the `shape` (H, Y, X) of the header; a map
-is `layer = np.full(shape, nan)` and `layer.flat[file["cell"]] = file["radius_m"]`, by the key of its quantity.
+Arrays have one entry per observed cell; `cell` holds the indices of these cells in the flattened grid of `shape`
+(H, Y, X), which the header contains. NumPy alone can rebuild a map: `layer = np.full(shape, nan)`, then
+`layer.flat[file["cell"]] = file["radius_m"]`, or another key of a quantity.
 """
 
 import json
@@ -39,192 +40,242 @@ from torchcover.metrics.blocks import FINER
 if TYPE_CHECKING:
     from torchcover.coverage.result import Coverage
 
-FORMAT_VERSION = 10
 Arrays = dict[str, NDArray[Any]]
-# Steps, cells, what is divided by, sums.
-IN_BLOCKS = ("block_frame_counts", "block_cell", "block_probed_steps", "block_sums")
-OVER_AREA = ("area_steps", "area_cell", "area_m2", "area_sums")
-OVER_PLACES = ("place_steps", "place_m2", "place_sums")
-# Numbers of regions, and what they are without each block.
-BODIES = ("body_steps", "body_sums", "body_cells")
-AGGREGATED = ("region_numbers", "region_numbers_left_out")
+
+# Raised whenever a header key, an array name or the meaning of an array changes.
+FORMAT_VERSION = 11
+# Names of the arrays of each part, in the order of the fields of the class that holds them.
+BLOCK_ARRAYS = ("block_frame_counts", "block_cell", "block_observed_frames", "block_sums")
+AREA_ARRAYS = ("area_frame_counts", "area_cell", "area_m2", "area_sums")
+REGION_ARRAYS = ("region_frame_counts", "region_areas_m2", "region_sums")
+TARGET_ARRAYS = ("target_frame_counts", "target_sums", "target_position_counts")
+AGGREGATED_ARRAYS = ("region_numbers", "region_numbers_jackknife")
 
 
 def write_coverage(coverage: "Coverage", path: Path) -> None:
-    """Write a coverage to one compressed file, with standard errors by key, for NumPy users."""
-    grid, known, blocks, area = coverage.grid, coverage.observed_cells, coverage.block_sums, coverage.area_sums
-    places, aggregated = coverage.region_sums, coverage.aggregated_numbers
-    redundancy, bodies, layers = coverage.redundancy, coverage.target_sums, coverage.sparse_layers.values()
-    header = {
+    """Write a coverage to one compressed file, with the standard errors of its maps for readers without torchcover.
+
+    Args:
+        coverage: Result to be saved.
+        path: File to be written.
+    """
+    arrays: dict[str, Any] = {name: tensor.cpu().numpy() for name, tensor in _collect_tensors(coverage).items()}
+    arrays["cell"] = _shrink_indices(arrays["cell"], coverage.grid.num_cells)
+    if coverage.block_sums is not None:
+        arrays |= _convert_block_sums(coverage.block_sums, BLOCK_ARRAYS)
+    if coverage.area_sums is not None:
+        arrays |= _convert_block_sums(coverage.area_sums, AREA_ARRAYS)
+    write_npz(path, {"header": np.array(json.dumps(_build_header(coverage))), **arrays})
+
+
+def _build_header(coverage: "Coverage") -> dict[str, Any]:
+    """Collect all parts of a coverage that are no arrays, as JSON values."""
+    aggregated, redundancy = coverage.aggregated_numbers, coverage.redundancy
+    aggregated_quantities = () if aggregated is None else aggregated.quantities
+    redundancy_layers = () if redundancy is None else redundancy.sparse_layers.values()
+    return {
         "format": FORMAT_VERSION,
-        "grid": asdict(grid),
-        "shape": grid.shape,
-        "thresholds": coverage.thresholds_m,
-        "max_radius": coverage.max_radius_m,
-        "layers": [layer.quantity._asdict() for layer in layers],
+        "grid": asdict(coverage.grid),
+        "shape": coverage.grid.shape,
+        "thresholds_m": coverage.thresholds_m,
+        "max_radius_m": coverage.max_radius_m,
+        "layers": [layer.quantity._asdict() for layer in coverage.sparse_layers.values()],
         "counts": coverage.counts,
-        "blocks": 1 if blocks is None else len(blocks.frame_counts),
-        "square_metres": area is not None,
+        "num_blocks": 1 if coverage.block_sums is None else len(coverage.block_sums.frame_counts),
+        "has_area_weights": coverage.area_sums is not None,
         "regions": [asdict(region) for region in coverage.regions],
-        "by_area": places is not None,
-        "aggregated": [] if aggregated is None else [quantity._asdict() for quantity in aggregated.quantities],
-        "sensors": None if redundancy is None else redundancy.sensor_names,
-        "bodies": None if bodies is None else bodies.to_record(),
-        "redundancy": []
-        if redundancy is None
-        else [layer.quantity._asdict() for layer in redundancy.sparse_layers.values()],
+        "has_region_sums": coverage.region_sums is not None,
+        "aggregated_quantities": [quantity._asdict() for quantity in aggregated_quantities],
+        "sensor_names": None if redundancy is None else redundancy.sensor_names,
+        "redundancy_layers": [layer.quantity._asdict() for layer in redundancy_layers],
+        "targets": None if coverage.target_sums is None else coverage.target_sums.to_record(),
     }
-    tensors = {"cell": known.cell_indices, "observed_frames": known.observed_frames, "points": known.point_counts}
-    tensors |= {layer.quantity.key: layer.values for layer in layers}
+
+
+def _collect_tensors(coverage: "Coverage") -> dict[str, Tensor]:
+    """Collect the tensors of a coverage by the name of their array, except for sums in blocks."""
+    observed, targets = coverage.observed_cells, coverage.target_sums
+    tensors = {
+        "cell": observed.cell_indices,
+        "observed_frames": observed.observed_frames,
+        "point_counts": observed.point_counts,
+    }
+    tensors |= {layer.quantity.key: layer.values for layer in coverage.sparse_layers.values()}
     tensors |= {f"{key}_error": error for key, error in coverage.sparse_errors.items()}
-    if aggregated is not None:
-        tensors |= dict(zip(AGGREGATED, aggregated[1:], strict=True))
-    if redundancy is not None:
-        tensors |= {key: layer.values for key, layer in redundancy.sparse_layers.items()}
-    if places is not None:
-        tensors |= dict(zip(OVER_PLACES, places, strict=True))
-    if bodies is not None:
-        tensors |= dict(zip(BODIES, (bodies.frame_counts, bodies.sums, bodies.position_counts), strict=True))
-    arrays: dict[str, Any] = {name: tensor.cpu().numpy() for name, tensor in tensors.items()}
-    arrays["cell"] = _short(arrays["cell"], grid.num_cells)
-    arrays |= {} if blocks is None else _listed(blocks, IN_BLOCKS)
-    arrays |= {} if area is None else _listed(area, OVER_AREA)
-    write_npz(path, {"header": np.array(json.dumps(header)), **arrays})
+    if coverage.aggregated_numbers is not None:
+        tensors |= dict(zip(AGGREGATED_ARRAYS, coverage.aggregated_numbers[1:], strict=True))
+    if coverage.redundancy is not None:
+        tensors |= {key: layer.values for key, layer in coverage.redundancy.sparse_layers.items()}
+    if coverage.region_sums is not None:
+        tensors |= dict(zip(REGION_ARRAYS, coverage.region_sums, strict=True))
+    if targets is not None:
+        target_tensors = (targets.frame_counts, targets.sums, targets.position_counts)
+        tensors |= dict(zip(TARGET_ARRAYS, target_tensors, strict=True))
+    return tensors
 
 
 @guard_reader("a saved coverage")
 def read_coverage(path: Path) -> dict[str, Any]:
-    """Read what `write_coverage` wrote: the arguments of `Coverage`."""
+    """Read a file that `write_coverage` wrote.
+
+    Args:
+        path: File to be read; it may come from an untrusted source.
+
+    Returns:
+        Keyword arguments of `Coverage`.
+
+    Raises:
+        ValueError: The file is no coverage file, is damaged, or has another format version.
+        TooLargeError: The content takes more memory than allowed.
+    """
     try:
-        arrays = read_npz(path, partial(check_dtype_kind, "fiuU"))  # numbers, and one text: the header
+        arrays = read_npz(path, partial(check_dtype_kind, "fiuU"))  # numbers, and the header as text
         header: dict[str, Any] = parse_json(str(arrays.pop("header")))
         version = header.pop("format")
-        parts = _parts(header, arrays) if version == FORMAT_VERSION else None
+        arguments = _parse_arguments(header, arrays) if version == FORMAT_VERSION else None
     except (TooLargeError, MemoryError):
         raise
     except Exception as error:  # damage shows anywhere: in the zip, zlib, NumPy, JSON, or as a missing part
         reason = str(error) or type(error).__name__
         raise ValueError(f"not a coverage file as Coverage.save writes it ({reason})") from error
-    if parts is None:
-        older = version in range(FORMAT_VERSION)
-        bands = "; height bands of older ones were over z of the vehicle: measure again" if older else ""
-        raise ValueError(f"coverage format {version}; this torchcover reads format {FORMAT_VERSION}{bands}")
-    return parts
+    if arguments is None:
+        advice = "; evaluate the recording or scenario again" if version in range(FORMAT_VERSION) else ""
+        raise ValueError(f"coverage format {version}; this torchcover reads format {FORMAT_VERSION}{advice}")
+    return arguments
 
 
-def _parts(header: dict[str, Any], arrays: Arrays) -> dict[str, Any]:
+def _parse_arguments(header: dict[str, Any], arrays: Arrays) -> dict[str, Any]:
     grid = BevGrid(**header["grid"])
-    known = _known(grid, arrays)
-    layers = _layers(header["layers"], arrays)
-    blocks = max((len(arrays[names[0]]) for names in (IN_BLOCKS, OVER_AREA) if names[0] in arrays), default=0)
-    # Of all cells maps are made one at a time, and of the known ones in all blocks errors.
-    check_memory(
-        8 * (grid.num_cells + 3 * blocks * len(known.cell_indices)) + sum(array.nbytes for array in arrays.values())
-    )
+    observed_cells = _parse_observed_cells(grid, arrays)
+    _check_memory_of_maps(grid, observed_cells, arrays)
+    has_blocks, has_redundancy = header["num_blocks"] != 1, header["sensor_names"] is not None
     return {
         "grid": grid,
-        "thresholds_m": tuple(header["thresholds"]),
-        "max_radius_m": header["max_radius"],
-        "observed_cells": known,
-        "layers": layers,
+        "thresholds_m": tuple(header["thresholds_m"]),
+        "max_radius_m": header["max_radius_m"],
+        "observed_cells": observed_cells,
+        "layers": _parse_layers(header["layers"], arrays),
         "counts": header["counts"],
-        "block_sums": None if header["blocks"] == 1 else _read_listed(IN_BLOCKS, header, grid, arrays),
-        "area_sums": _read_listed(OVER_AREA, header, grid, arrays) if header["square_metres"] else None,
-        "regions": [_region(stored) for stored in header["regions"]],
-        "region_sums": _places(header, grid, arrays) if header["by_area"] else None,
-        "aggregated_numbers": _aggregated(header, grid, arrays) if header["aggregated"] else None,
-        "redundancy": None if header["sensors"] is None else _redundancy(header, known, arrays),
-        "target_sums": None if header["bodies"] is None else _bodies(header["bodies"], arrays),
+        "block_sums": _parse_block_sums(BLOCK_ARRAYS, header, grid, arrays) if has_blocks else None,
+        "area_sums": _parse_block_sums(AREA_ARRAYS, header, grid, arrays) if header["has_area_weights"] else None,
+        "regions": [_parse_region(record) for record in header["regions"]],
+        "region_sums": _parse_region_sums(header, grid, arrays) if header["has_region_sums"] else None,
+        "aggregated_numbers": _parse_aggregated(header, grid, arrays) if header["aggregated_quantities"] else None,
+        "redundancy": _parse_redundancy(header, observed_cells, arrays) if has_redundancy else None,
+        "target_sums": None if header["targets"] is None else _parse_target_sums(header["targets"], arrays),
     }
 
 
-def _bodies(stored: dict[str, Any], arrays: Arrays) -> TargetSums:
-    grid = BevGrid(**stored.pop("grid"))
-    bodies, regions = tuple(stored.pop("target_names")), tuple(map(_region, stored.pop("regions")))
-    steps, sums, cells = (torch.from_numpy(arrays[name]) for name in BODIES)
-    shapes = (len(steps), len(bodies), len(regions), len(COLUMNS)), (len(bodies), *grid.shape[1:], 2)
-    if (tuple(sums.shape), tuple(cells.shape)) != shapes:
-        raise ValueError(f"sums of {len(bodies)} bodies of shape {tuple(sums.shape)} and {tuple(cells.shape)}")
+def _check_memory_of_maps(grid: BevGrid, observed_cells: ObservedCells, arrays: Arrays) -> None:
+    """Refuse a small file whose header or blocks would take too much memory once maps and errors are computed."""
+    block_counts = [len(arrays[names[0]]) for names in (BLOCK_ARRAYS, AREA_ARRAYS) if names[0] in arrays]
+    # One map of all cells exists at a time; errors need three arrays over blocks and observed cells.
+    float64_count = grid.num_cells + 3 * max(block_counts, default=0) * len(observed_cells.cell_indices)
+    check_memory(8 * float64_count + sum(array.nbytes for array in arrays.values()))
+
+
+def _parse_target_sums(record: dict[str, Any], arrays: Arrays) -> TargetSums:
+    grid = BevGrid(**record.pop("grid"))
+    names = tuple(record.pop("target_names"))
+    regions = tuple(_parse_region(region) for region in record.pop("regions"))
+    frame_counts, sums, position_counts = (torch.from_numpy(arrays[name]) for name in TARGET_ARRAYS)
+    expected_shapes = (len(frame_counts), len(names), len(regions), len(COLUMNS)), (len(names), *grid.shape[1:], 2)
+    shapes = tuple(sums.shape), tuple(position_counts.shape)
+    if shapes != expected_shapes:
+        raise ValueError(f"the sums of {len(names)} test targets have shapes {shapes}, not {expected_shapes}")
     return TargetSums(
-        target_names=bodies, regions=regions, grid=grid, frame_counts=steps, sums=sums, position_counts=cells, **stored
+        target_names=names,
+        regions=regions,
+        grid=grid,
+        frame_counts=frame_counts,
+        sums=sums,
+        position_counts=position_counts,
+        **record,
     )
 
 
-def _aggregated(header: dict[str, Any], grid: BevGrid, arrays: Arrays) -> AggregatedNumbers:
-    quantities = tuple(Quantity(**quantity) for quantity in header["aggregated"])
-    value, left_out = (torch.from_numpy(arrays[name]) for name in AGGREGATED)
-    places = len(header["regions"]) * len(grid.heights)
-    blocks = 0 if header["blocks"] == 1 else header["blocks"]
-    shape = (places, len(quantities))
-    if (tuple(value.shape), tuple(left_out.shape)) != (shape, (blocks, *shape)):
-        raise ValueError(f"{AGGREGATED[0]} of shape {tuple(value.shape)} in {blocks} blocks; needed is {shape}")
-    return AggregatedNumbers(quantities, value, left_out)
+def _parse_aggregated(header: dict[str, Any], grid: BevGrid, arrays: Arrays) -> AggregatedNumbers:
+    quantities = tuple(Quantity(**record) for record in header["aggregated_quantities"])
+    values, jackknife_values = (torch.from_numpy(arrays[name]) for name in AGGREGATED_ARRAYS)
+    num_blocks = 0 if header["num_blocks"] == 1 else header["num_blocks"]
+    shape = (len(header["regions"]) * len(grid.heights), len(quantities))
+    if (tuple(values.shape), tuple(jackknife_values.shape)) != (shape, (num_blocks, *shape)):
+        raise ValueError(f"{AGGREGATED_ARRAYS[0]} has shape {tuple(values.shape)} in {num_blocks} blocks, not {shape}")
+    return AggregatedNumbers(quantities, values, jackknife_values)
 
 
-def _redundancy(header: dict[str, Any], known: ObservedCells, arrays: Arrays) -> Redundancy:
-    layers = _layers(header["redundancy"], arrays)
-    sensors = tuple(header["sensors"])
-    if [layer.quantity for layer in layers] != list(list_redundancy_quantities(sensors, header["thresholds"])):
-        raise ValueError(f"other layers of redundancy than those of the sensors {', '.join(sensors)}")
-    return Redundancy(sensors, known, {layer.quantity.key: layer for layer in layers})
+def _parse_redundancy(header: dict[str, Any], observed_cells: ObservedCells, arrays: Arrays) -> Redundancy:
+    layers = _parse_layers(header["redundancy_layers"], arrays)
+    sensor_names = tuple(header["sensor_names"])
+    expected_quantities = list_redundancy_quantities(sensor_names, header["thresholds_m"])
+    if tuple(layer.quantity for layer in layers) != expected_quantities:
+        raise ValueError(f"the redundancy layers are not those of the sensors {', '.join(sensor_names)}")
+    return Redundancy(sensor_names, observed_cells, {layer.quantity.key: layer for layer in layers})
 
 
-def _places(header: dict[str, Any], grid: BevGrid, arrays: Arrays) -> RegionSums:
-    places = RegionSums(*(torch.from_numpy(arrays[name]) for name in OVER_PLACES))
-    blocks, count = header["blocks"], len(header["regions"]) * len(grid.heights)
-    blocks *= FINER if blocks > 1 else 1
-    values = 1 + len(header["thresholds"]) + len(header["redundancy"])
-    if [tuple(one.shape) for one in places] != [(blocks,), (blocks, count), (blocks, values, count)]:
-        raise ValueError(f"sums over {count} regions and bands of shape {tuple(places.sums.shape)}")
-    return places
+def _parse_region_sums(header: dict[str, Any], grid: BevGrid, arrays: Arrays) -> RegionSums:
+    region_sums = RegionSums(*(torch.from_numpy(arrays[name]) for name in REGION_ARRAYS))
+    num_blocks = header["num_blocks"] * (FINER if header["num_blocks"] > 1 else 1)
+    num_region_bands = len(header["regions"]) * len(grid.heights)
+    num_values = 1 + len(header["thresholds_m"]) + len(header["redundancy_layers"])
+    expected = [(num_blocks,), (num_blocks, num_region_bands), (num_blocks, num_values, num_region_bands)]
+    if [tuple(tensor.shape) for tensor in region_sums] != expected:
+        raise ValueError(f"sums over {num_region_bands} regions and bands have shape {tuple(region_sums.sums.shape)}")
+    return region_sums
 
 
-def _known(grid: BevGrid, arrays: Arrays) -> ObservedCells:
-    at = _ascending("cell", arrays, grid.num_cells)
-    return ObservedCells(grid.shape, at, *(_of_cells(name, arrays) for name in ("observed_frames", "points")))
+def _parse_observed_cells(grid: BevGrid, arrays: Arrays) -> ObservedCells:
+    cell_indices = _check_ascending_indices("cell", arrays, grid.num_cells)
+    observed_frames = _get_cell_array("observed_frames", arrays)
+    return ObservedCells(grid.shape, cell_indices, observed_frames, _get_cell_array("point_counts", arrays))
 
 
-def _layers(stored: Sequence[dict[str, Any]], arrays: Arrays) -> list[Layer]:
-    quantities = [Quantity(**quantity) for quantity in stored]
-    return [Layer(quantity, _of_cells(quantity.key, arrays)) for quantity in quantities]
+def _parse_layers(records: Sequence[dict[str, Any]], arrays: Arrays) -> list[Layer]:
+    quantities = [Quantity(**record) for record in records]
+    return [Layer(quantity, _get_cell_array(quantity.key, arrays)) for quantity in quantities]
 
 
-def _of_cells(name: str, arrays: Arrays) -> Tensor:
+def _parse_region(record: Mapping[str, Any]) -> Region:
+    corners_m = tuple((x_m, y_m) for x_m, y_m in record["corners_m"])
+    return Region(record["name"], tuple(record["x_m"]), tuple(record["y_m"]), corners_m, tuple(record["bands"]))
+
+
+def _parse_block_sums(names: Sequence[str], header: dict[str, Any], grid: BevGrid, arrays: Arrays) -> BlockSums:
+    frame_counts, _, denominators, sums = (arrays[name] for name in names)
+    if frame_counts.shape != (header["num_blocks"],):
+        raise ValueError(f"the frame counts of {header['num_blocks']} blocks have shape {frame_counts.shape}")
+    shape = (len(frame_counts), *grid.shape)
+    indices = _check_ascending_indices(names[1], arrays, math.prod(shape))
+    has_equal_lengths = denominators.shape == indices.shape == sums.shape[1:]
+    if not (has_equal_lengths and np.isin(indices % grid.num_cells, arrays["cell"]).all()):
+        raise ValueError(f"sums of shape {sums.shape} at {tuple(indices.shape)} cells do not fit into {shape}")
+    return BlockSums(
+        torch.from_numpy(frame_counts), shape, indices, torch.from_numpy(denominators), torch.from_numpy(sums)
+    )
+
+
+def _convert_block_sums(block_sums: BlockSums, names: Sequence[str]) -> Arrays:
+    tensors = (block_sums.frame_counts, block_sums.cell_indices, block_sums.denominators, block_sums.sums)
+    arrays = {name: tensor.cpu().numpy() for name, tensor in zip(names, tensors, strict=True)}
+    arrays[names[1]] = _shrink_indices(arrays[names[1]], math.prod(block_sums.shape))
+    return arrays
+
+
+def _get_cell_array(name: str, arrays: Arrays) -> Tensor:
     if arrays[name].shape != arrays["cell"].shape:
         raise ValueError(f"{name} has shape {arrays[name].shape}, the cells {arrays['cell'].shape}")
     return torch.from_numpy(arrays[name])
 
 
-def _ascending(name: str, arrays: Arrays, end: int) -> Tensor:
-    at = arrays[name].astype(np.int64)
-    if not (at.ndim == 1 and (np.diff(at) > 0).all() and 0 <= at.min(initial=0) <= at.max(initial=0) < max(end, 1)):
-        raise ValueError(f"{name}: numbers of cells in ascending order, below {end}, are needed")
-    return torch.from_numpy(at)
+def _check_ascending_indices(name: str, arrays: Arrays, end: int) -> Tensor:
+    """Return an array of indices as int64 if it ascends within [0, end), else raise ValueError."""
+    indices = arrays[name].astype(np.int64)
+    is_ascending = indices.ndim == 1 and bool((np.diff(indices) > 0).all())
+    if not (is_ascending and 0 <= indices.min(initial=0) <= indices.max(initial=0) < max(end, 1)):
+        raise ValueError(f"{name}: cell indices in ascending order, below {end}, are needed")
+    return torch.from_numpy(indices)
 
 
-def _short(at: NDArray[Any], end: int) -> NDArray[Any]:
-    return at.astype(np.uint32 if end < 2**32 else np.int64)
-
-
-def _region(stored: Mapping[str, Any]) -> Region:
-    corners = tuple((x, y) for x, y in stored["corners_m"])
-    return Region(stored["name"], tuple(stored["x_m"]), tuple(stored["y_m"]), corners, tuple(stored["bands"]))
-
-
-def _listed(blocks: BlockSums, names: Sequence[str]) -> Arrays:
-    arrays = [
-        each.cpu().numpy() for each in (blocks.frame_counts, blocks.cell_indices, blocks.denominators, blocks.sums)
-    ]
-    arrays[1] = _short(arrays[1], math.prod(blocks.shape))
-    return dict(zip(names, arrays, strict=True))
-
-
-def _read_listed(names: Sequence[str], header: dict[str, Any], grid: BevGrid, arrays: Arrays) -> BlockSums:
-    steps, _, base, sums = (arrays[name] for name in names)
-    if steps.shape != (header["blocks"],):
-        raise ValueError(f"the steps of {header['blocks']} blocks have shape {steps.shape}")
-    shape = (len(steps), *grid.shape)
-    at = _ascending(names[1], arrays, math.prod(shape))
-    if not (base.shape == at.shape == sums.shape[1:] and np.isin(at % grid.num_cells, arrays["cell"]).all()):
-        raise ValueError(f"sums of shape {sums.shape} at {tuple(at.shape)} cells do not fit into {shape}")
-    return BlockSums(torch.from_numpy(steps), shape, at, *map(torch.from_numpy, (base, sums)))
+def _shrink_indices(indices: NDArray[Any], end: int) -> NDArray[Any]:
+    """Store indices in 4 bytes where the largest one fits."""
+    return indices.astype(np.uint32 if end < 2**32 else np.int64)

@@ -77,8 +77,8 @@ class BevGrid:
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.cell_m) and self.cell_m > 0):
-            raise ValueError(f"cell: a positive length in metres is needed; got {self.cell_m}")
-        for axis, bounds in (("x", self.x_m), ("y", self.y_m)):
+            raise ValueError(f"cell_m: a positive length in metres is needed; got {self.cell_m}")
+        for axis, bounds in (("x_m", self.x_m), ("y_m", self.y_m)):
             _check_bounds(axis, bounds)
             _check_multiple(axis, bounds, self.cell_m)
         if not self.heights:
