@@ -164,7 +164,7 @@ def test_a_walk_looks_into_at_most_twice_the_boxes_that_any_search_has_to(backen
     warp = import_module("torchcover.neighbors.warp")
     points = generator(43).normal(0, 9, (600, 3)).astype(np.float32)
     query = points[:100] + np.float32(0.1)
-    tree = [part.numpy() for part in warp.box_tree(torch.from_numpy(points))]
+    tree = [part.numpy() for part in warp.build_box_tree(torch.from_numpy(points))]
     looked = []
 
     def noted(*given, gap=warp._gap.func):
