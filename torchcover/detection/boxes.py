@@ -69,7 +69,7 @@ class Boxes:
     __repr__ = format_short_repr
 
     def __post_init__(self) -> None:
-        for name in ("centre_m", "size_m", "yaw_rad"):
+        for name in ("center_m", "size_m", "yaw_rad"):
             tensor = getattr(self, name)
             check_tensor(tensor, name, is_floating=True)
             if not tensor.isfinite().all():
@@ -80,7 +80,7 @@ class Boxes:
             "velocity_mps": self.center_m.new_full((count, 2), math.nan),
             "ids": ("",) * count,
             "categories": ("",) * count,
-            "drawn_points": torch.zeros(count, dtype=torch.int64, device=self.yaw_rad.device),
+            "sampled_points": torch.zeros(count, dtype=torch.int64, device=self.yaw_rad.device),
             "bottom_heights_m": self.center_m.new_full((count,), math.nan),
             "visibility": self.center_m.new_full((count,), math.nan),
         }
@@ -102,8 +102,8 @@ class Boxes:
             )
 
     def _check_shapes(self, count: int) -> None:
-        expected = {"centre_m": (count, 3), "size_m": (count, 3), "yaw_rad": (count,), "velocity_mps": (count, 2)}
-        expected |= dict.fromkeys(("drawn_points", "bottom_heights_m", "visibility"), (count,))
+        expected = {"center_m": (count, 3), "size_m": (count, 3), "yaw_rad": (count,), "velocity_mps": (count, 2)}
+        expected |= dict.fromkeys(("sampled_points", "bottom_heights_m", "visibility"), (count,))
         for name, shape in expected.items():
             if tuple(getattr(self, name).shape) != shape:
                 raise ValueError(
@@ -201,7 +201,7 @@ class Boxes:
 
     def _each(self, change: Callable[[Tensor], Tensor], **names: tuple[str, ...]) -> "Boxes":
         """With all tensors changed, and other names where their number changes."""
-        tensors = ("centre_m", "size_m", "yaw_rad", "velocity_mps", "drawn_points", "bottom_heights_m", "visibility")
+        tensors = ("center_m", "size_m", "yaw_rad", "velocity_mps", "sampled_points", "bottom_heights_m", "visibility")
         changed: dict[str, Any] = {name: change(getattr(self, name)) for name in tensors} | names
         return replace(self, **changed, points_in_box={rig: change(count) for rig, count in self.points_in_box.items()})
 
