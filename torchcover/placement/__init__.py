@@ -1,6 +1,6 @@
-"""Where sensors should go: rigs scored on common instants, compared in pairs, and tested on fresh worlds.
+"""Sensor placement: score rigs on common frames, compare them in pairs, and validate the best on held-out scenes.
 
-The public names are imported when first used: who asks for help needs no ray caster.
+Public names are imported on first use, so that command help does not load the ray caster.
 """
 
 import lazy_loader

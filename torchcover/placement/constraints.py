@@ -1,4 +1,4 @@
-"""Constraints: what a rig must keep to, whatever its coverage, and what it costs."""
+"""Constraints and prices of a rig in a placement search, independent of its coverage."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from itertools import combinations
@@ -12,73 +12,97 @@ from torchcover.placement.free_sensor import FreeSensor
 from torchcover.simulation import Document, Rig, Sensor, list_builtin_names
 from torchcover.simulation.mount_regions import Skin
 
-# Sensors whose poses differ by less are each other's mirror images.
-MIRRORED_M = 1e-4
-MIRROR = np.diag([1.0, -1.0, 1.0, 1.0])
-# A housing has about this size; closer, two sensors are at one place.
-APART_M = 0.1
-# Among prices: that of the mount of each sensor.
-MOUNT = "mount"
+MOUNT = "mount"  # key of the price of the mount that each sensor needs
 
 
 class Constraints(Document):
-    """What a rig must keep to.
+    """Constraints that every candidate must satisfy.
 
     Args:
-        min_distance_m: Between a sensor that is free and any other.
-        max_self_hit_share: Share of a rig's rays that may end on the vehicle; known once it has been scanned.
-        symmetric: Whether every sensor must have its mirror image beyond the vehicle's middle, or lie on that.
-        max_cost_eur: What the rig may cost; see `cost` of the space.
+        min_distance_m: Minimum distance between a free sensor and any other; the default is the size of a housing.
+        max_self_hit_share: Maximum share of a rig's rays that hit the vehicle; it is known after the scan.
+        symmetric: Whether every sensor needs a mirror image on the other side of the plane y = 0, or must lie on it.
+        max_cost_eur: Maximum cost of the rig in EUR, from `prices_eur` of the space.
     """
 
-    min_distance_m: NonNegativeFloat = APART_M
+    min_distance_m: NonNegativeFloat = 0.1
     max_self_hit_share: Annotated[float, Field(ge=0.0, le=1.0)] | None = None
     symmetric: bool = False
     max_cost_eur: NonNegativeFloat | None = None
 
     def find_violations(self, rig: Rig, free_sensors: Collection[str], cost_eur: float | None) -> tuple[str, ...]:
-        """What of it a rig does not keep to, in words; not its self-hits, which only a scan knows.
+        """Describe the constraints that a rig violates, except for self hits, which need a scan.
 
-        `free_sensors` are the names of the sensors that a search may place.
+        Args:
+            rig: The rig.
+            free_sensors: Names of the sensors that the search places.
+            cost_eur: Cost of the rig; None without prices.
+
+        Returns:
+            One sentence for each violation.
         """
-        return (*self._too_close(rig, free_sensors), *self._lopsided(rig), *self._too_dear(cost_eur))
+        return (
+            *self._find_close_pairs(rig, free_sensors),
+            *self._find_asymmetric_sensors(rig),
+            *self._check_cost(cost_eur),
+        )
 
-    def _too_close(self, rig: Rig, free: Collection[str]) -> Iterator[str]:
-        for one, other in combinations(rig.sensors, 2):
-            if one.name not in free and other.name not in free:
+    def _find_close_pairs(self, rig: Rig, free_sensors: Collection[str]) -> Iterator[str]:
+        for first, second in combinations(rig.sensors, 2):
+            if first.name not in free_sensors and second.name not in free_sensors:
                 continue
-            apart_m = float(np.linalg.norm(one.mount.to_matrix()[:3, 3] - other.mount.to_matrix()[:3, 3]))
-            if apart_m < self.min_distance_m:
+            offset_m = first.mount.to_matrix()[:3, 3] - second.mount.to_matrix()[:3, 3]
+            distance_m = float(np.linalg.norm(offset_m))
+            if distance_m < self.min_distance_m:
                 yield (
-                    f"{one.name} and {other.name} are {apart_m:.3f} m apart; min_distance_m is {self.min_distance_m:g}"
+                    f"{first.name} and {second.name} are {distance_m:.3f} m apart; min_distance_m is "
+                    f"{self.min_distance_m:g}"
                 )
 
-    def _lopsided(self, rig: Rig) -> Iterator[str]:
+    def _find_asymmetric_sensors(self, rig: Rig) -> Iterator[str]:
         if not self.symmetric:
             return
+        mirror = np.diag([1.0, -1.0, 1.0, 1.0])
+        tolerance = 1e-4  # meters, and entries of rotation matrices
         poses = [sensor.mount.to_matrix() for sensor in rig.sensors]
         for sensor, pose in zip(rig.sensors, poses, strict=True):
-            mirrored = MIRROR @ pose @ MIRROR
-            if not any(np.allclose(mirrored, other, rtol=0.0, atol=MIRRORED_M) for other in poses):
+            mirrored = mirror @ pose @ mirror
+            if not any(np.allclose(mirrored, candidate, rtol=0.0, atol=tolerance) for candidate in poses):
                 yield f"{sensor.name} has no mirror image on the other side of the vehicle; symmetric is true"
 
-    def _too_dear(self, cost_eur: float | None) -> Iterator[str]:
+    def _check_cost(self, cost_eur: float | None) -> Iterator[str]:
         if self.max_cost_eur is not None and cost_eur is not None and cost_eur > self.max_cost_eur:
             yield f"it costs {cost_eur:g} EUR; max_cost_eur is {self.max_cost_eur:g}"
 
 
 def find_placement_error(sensor: Sensor, skin: Skin) -> str | None:
-    """Why a sensor cannot be where it is: below the ground, or inside the vehicle; None if it can."""
-    place_m: Matrix = sensor.mount.to_matrix()[:3, 3]
-    if place_m[2] <= 0.0:
-        return f"{sensor.name} at {place_m.round(3).tolist()} m is not above the ground"
-    if skin.is_inside(place_m):
-        return f"{sensor.name} at {place_m.round(3).tolist()} m is inside the vehicle's body"
+    """Describe why a sensor cannot be at its position: below the ground or inside the vehicle.
+
+    Args:
+        sensor: The sensor with its mount.
+        skin: Surface of the vehicle.
+
+    Returns:
+        A sentence; None if the position is possible.
+    """
+    position_m: Matrix = sensor.mount.to_matrix()[:3, 3]
+    if position_m[2] <= 0.0:
+        return f"{sensor.name} at {position_m.round(3).tolist()} m is not above the ground"
+    if skin.is_inside(position_m):
+        return f"{sensor.name} at {position_m.round(3).tolist()} m is inside the vehicle's body"
     return None
 
 
 def get_price_eur(prices_eur: Mapping[str, float], sensor_name: str, model: str | None) -> float:
-    """What a sensor costs, with its mount, by its model or by its name. ValueError: it has no price.
+    """Return the price of a sensor with its mount.
+
+    Args:
+        prices_eur: Prices by LiDAR model, by name of a sensor, and of "mount".
+        sensor_name: Name of the sensor.
+        model: LiDAR model of the sensor; its price is taken before that of the name.
+
+    Raises:
+        ValueError: The sensor has no price.
 
     Example:
         >>> get_price_eur({"velodyne_vlp16": 3000.0, "mount": 100.0}, "roof", "velodyne_vlp16")
@@ -86,7 +110,7 @@ def get_price_eur(prices_eur: Mapping[str, float], sensor_name: str, model: str 
     """
     key = sensor_name if model is None or model not in prices_eur else model
     if key not in prices_eur:
-        raise ValueError(f"cost: no price of {model or sensor_name!r}, for the sensor {sensor_name!r}; give it")
+        raise ValueError(f"prices_eur: {model or sensor_name!r} of the sensor {sensor_name!r} has no price; add it")
     return prices_eur[key] + prices_eur.get(MOUNT, 0.0)
 
 
@@ -96,31 +120,45 @@ def check_prices(
     sensors: Sequence[Sensor],
     free_sensors: Mapping[str, FreeSensor],
 ) -> None:
-    """ValueError: a price is missing, is one of nothing, or the limit, if there is one, is below the cheapest rig."""
+    """Check that all needed prices exist and that some rig is within the cost limit.
+
+    Args:
+        prices_eur: Prices by LiDAR model, by name of a sensor, and of "mount".
+        max_cost_eur: Maximum cost of a rig; None without a limit.
+        sensors: Sensors of the start.
+        free_sensors: Free variables of sensors, by name.
+
+    Raises:
+        ValueError: A price is missing or belongs to nothing, or the cheapest rig exceeds the limit.
+    """
     if not prices_eur:
         if max_cost_eur is not None:
-            raise ValueError("constraints.max_cost_eur: nothing has a price; give them as cost")
+            raise ValueError("constraints.max_cost_eur: there are no prices; add prices_eur")
         return
-    models = {model for one in free_sensors.values() for model in one.model or ()}
-    known = {MOUNT, *models, *list_builtin_names("lidars"), *(sensor.name for sensor in sensors)}
-    if unknown := [key for key in prices_eur if key not in known]:
-        raise ValueError(f"cost: {', '.join(unknown)}: no LiDAR model, no sensor of the rig, and not {MOUNT!r}")
-    cheapest = sum(min(_prices(prices_eur, sensor, sensors, free_sensors)) for sensor in sensors)
-    if max_cost_eur is not None and cheapest > max_cost_eur:
+    models = {model for free in free_sensors.values() for model in free.model or ()}
+    names = {MOUNT, *models, *list_builtin_names("lidars"), *(sensor.name for sensor in sensors)}
+    if unknown := [key for key in prices_eur if key not in names]:
+        raise ValueError(f"prices_eur: {', '.join(unknown)} is no LiDAR model, no sensor of the rig, and not {MOUNT!r}")
+    lowest_cost_eur = sum(min(_list_prices(prices_eur, sensor, sensors, free_sensors)) for sensor in sensors)
+    if max_cost_eur is not None and lowest_cost_eur > max_cost_eur:
         raise ValueError(
-            f"constraints.max_cost_eur: {max_cost_eur:g}, but the cheapest rig of the space costs {cheapest:g}"
+            f"constraints.max_cost_eur: got {max_cost_eur:g}, but the cheapest rig of the space costs "
+            f"{lowest_cost_eur:g}; raise it"
         )
 
 
-def _prices(
-    cost: Mapping[str, float], sensor: Sensor, sensors: Sequence[Sensor], free: Mapping[str, FreeSensor]
+def _list_prices(
+    prices_eur: Mapping[str, float],
+    sensor: Sensor,
+    sensors: Sequence[Sensor],
+    free_sensors: Mapping[str, FreeSensor],
 ) -> Iterator[float]:
-    """All that a sensor may cost."""
-    own, made = free.get(sensor.name), sensor
-    if own is not None and own.mirror_of is not None:
-        made = next(other for other in sensors if other.name == own.mirror_of)
-        own = free[own.mirror_of]
-    if own is not None and own.present is not None:
+    """Yield the price of a sensor for each of its models; 0 if it may be absent."""
+    free, source = free_sensors.get(sensor.name), sensor
+    if free is not None and free.mirror_of is not None:
+        source = next(candidate for candidate in sensors if candidate.name == free.mirror_of)
+        free = free_sensors[free.mirror_of]
+    if free is not None and free.present is not None:
         yield 0.0
-    for model in (own.model if own else None) or (getattr(made, "model", None),):
-        yield get_price_eur(cost, sensor.name, model)
+    for model in (free.model if free else None) or (getattr(source, "model", None),):
+        yield get_price_eur(prices_eur, sensor.name, model)

@@ -1,4 +1,4 @@
-"""The host vehicle of a search or a selection, and what both documents have in common."""
+"""Host vehicle of a placement search, and the settings that search spaces and selection spaces share."""
 
 from collections.abc import Sequence
 from functools import cached_property
@@ -14,30 +14,32 @@ from torchcover.geometry.arrays import Float64
 from torchcover.placement.objective import NonEmptyName, Objective
 from torchcover.simulation import Rig, Scenario, set_ego
 from torchcover.simulation.bodies import get_mount_regions
-from torchcover.simulation.documents import SEVERAL, FileDocument, NameOrFile, build_name_validator, is_file_name
+from torchcover.simulation.documents import SEVERAL, NameOrFile, FileDocument, build_name_validator, is_file_name
 from torchcover.simulation.mount_regions import MountRegion, Skin
 
-MAX_OBJECTIVES = 3  # a front of more cannot be plotted
 NOT_WORSE = "not worse: "  # prefix of the name of a number that must not become worse
 REQUIRED = "required: "  # prefix of the name of a number that a requirement bounds
 
 
-def _vehicle(given: str) -> str:
-    if Path(given).suffix and not is_file_name(given):
-        raise ValueError(f"the name of a vehicle, or the path of its YAML file, is needed; got {given!r}")
-    return given
+def _check_vehicle_name(name: str) -> str:
+    if Path(name).suffix and not is_file_name(name):
+        raise ValueError(f"got {name!r}; give the name of a vehicle or the path of its YAML file")
+    return name
 
 
-# A rig, or the name or the file of one.
 NamedRig = Annotated[Rig, build_name_validator(Rig)]
-# One name or file, or several.
 NamesOrFiles = Annotated[tuple[NameOrFile, ...], SEVERAL, Field(min_length=1)]
-# A vehicle's.
-VehicleNameOrFile = Annotated[NameOrFile, AfterValidator(_vehicle)]
+VehicleNameOrFile = Annotated[NameOrFile, AfterValidator(_check_vehicle_name)]
 
 
 class HostVehicle(NamedTuple):
-    """The vehicle that all candidates are mounted on: its name, its surface, and its mount regions by name."""
+    """Vehicle that all candidates are mounted on.
+
+    Args:
+        name: Its name.
+        skin: Its surface.
+        mount_regions: Its mount regions by name.
+    """
 
     name: str
     skin: Skin
@@ -45,92 +47,111 @@ class HostVehicle(NamedTuple):
 
     @property
     def outline_m(self) -> Float64:
-        """(4, 2) corners x, y of the vehicle."""
+        """(4, 2) corners x, y of the vehicle in meters."""
         return BoundingBox.from_points(self.skin.mesh.vertices_m).outline_m
 
     @classmethod
     def from_scenarios(cls, scenarios: Sequence[Scenario]) -> "HostVehicle":
-        """Return the ego vehicle of all scenarios.
+        """Return the common ego vehicle of scenarios.
 
-        ValueError: they have different ones. FileNotFoundError: a mesh or vehicle file is missing.
+        Args:
+            scenarios: At least one scenario.
+
+        Raises:
+            ValueError: The scenarios have different ego vehicles.
+            FileNotFoundError: A mesh or vehicle file is missing.
         """
-        first, *others = scenarios
-        shape = first.ego.shape if first.ego else None
-        if any((other.ego.shape if other.ego else None) != shape for other in others):
-            egos = ", ".join(f"{each.name} {each.ego_name}" for each in scenarios)
-            raise ValueError(f"scenario: their egos differ ({egos}), but a rig is mounted on one; say which by vehicle")
-        return cls(first.ego_name, Skin(first.build_ego_mesh()), get_mount_regions(shape))
+        shapes = [scenario.ego.shape if scenario.ego else None for scenario in scenarios]
+        if any(shape != shapes[0] for shape in shapes):
+            vehicles = ", ".join(f"{scenario.name} {scenario.ego_name}" for scenario in scenarios)
+            raise ValueError(f"scenario: the ego vehicles differ ({vehicles}), but a rig has one vehicle; set vehicle")
+        return cls(scenarios[0].ego_name, Skin(scenarios[0].build_ego_mesh()), get_mount_regions(shapes[0]))
 
     def get_mount_region(self, name: str) -> MountRegion:
-        """Return a mount region. ValueError: there is none of this name; the message lists the others."""
+        """Return a mount region.
+
+        Args:
+            name: Name of the region.
+
+        Raises:
+            ValueError: The vehicle has no such region; the message lists its regions.
+        """
         if name not in self.mount_regions:
-            told = ", ".join(self.mount_regions) or "none at all: add mount_regions to its document"
-            raise ValueError(f"region: {self.name} has no {name!r}; it has {told}")
+            names = ", ".join(self.mount_regions) or "none; add mount_regions to its document"
+            raise ValueError(f"region: {self.name} has no {name!r}; it has {names}")
         return self.mount_regions[name]
 
 
 class PlacementSpace(FileDocument):
-    """Base of a search space and a selection: the scenarios, the host vehicle, objectives and requirements."""
+    """Base of search spaces and selection spaces: scenarios, host vehicle, objectives and requirements."""
 
     kind: ClassVar[str] = "a search space"
     name: str
     description: str = ""
     scenario: NamesOrFiles
     vehicle: VehicleNameOrFile | None = None
-    objectives: dict[NonEmptyName, Objective] = Field(min_length=1, max_length=MAX_OBJECTIVES)
+    objectives: dict[NonEmptyName, Objective] = Field(min_length=1, max_length=3)  # larger fronts cannot be plotted
     not_worse: tuple[NonEmptyName | Objective, ...] = ()
     requirements: Annotated[Requirements, build_name_validator(Requirements)] | None = None
 
     @property
     def base_rig(self) -> Rig | None:
-        """The rig that is there in any case."""
+        """Rig that every candidate starts from; None if there is none."""
         raise NotImplementedError
 
     @cached_property
     def scored_objectives(self) -> dict[str, Objective]:
-        """Numbers that rigs are scored by: the objectives, those that must not be worse, and those of requirements."""
-        kept = [Objective(region=one) if isinstance(one, str) else one for one in self.not_worse]
-        named = {f"{NOT_WORSE}{one.description}": one for one in kept}
-        return self.objectives | named | {name: one for name, (one, _) in self._required.items()}
+        """Numbers that rigs are scored by: objectives, numbers that must not become worse, and bounded numbers."""
+        scored = dict(self.objectives)
+        for item in self.not_worse:
+            objective = Objective(region=item) if isinstance(item, str) else item
+            scored[f"{NOT_WORSE}{objective.description}"] = objective
+        return scored | {name: objective for name, (objective, _) in self._bounded_objectives.items()}
 
     @property
     def bounds(self) -> dict[str, float]:
-        """Bounds of the requirements, by the names of their numbers: the least, or of lower ones the largest value."""
-        return {name: bound for name, (_, bound) in self._required.items()}
+        """Bounds of the requirements by the names of their numbers: minima, or maxima where lower is better."""
+        return {name: bound for name, (_, bound) in self._bounded_objectives.items()}
 
     @cached_property
-    def _required(self) -> dict[str, tuple[Objective, float]]:
-        """Numbers of regions with their bounds; those of targets and encounters are measured apart."""
-        required, numbers = self.requirements, dict[str, tuple[Objective, float]]()
-        for one in required.requirements if required else ():
-            if required is None or not isinstance(one, RegionRequirement):
+    def _bounded_objectives(self) -> dict[str, tuple[Objective, float]]:
+        """Numbers of regions with their bounds; requirements of targets and encounters are checked separately."""
+        bounded: dict[str, tuple[Objective, float]] = {}
+        if self.requirements is None:
+            return bounded
+        heights, regions = self.requirements.heights, self.requirements.regions
+        for requirement in self.requirements.requirements:
+            if not isinstance(requirement, RegionRequirement):
                 continue
-            usual_m, own_m = PAPER_HEIGHTS.get(one.band), required.heights.get(one.band)
-            if usual_m is None or own_m not in (None, usual_m):
+            band = requirement.band
+            if PAPER_HEIGHTS.get(band) is None or heights.get(band) not in (None, PAPER_HEIGHTS[band]):
                 raise ValueError(
-                    f"requirements: a search has the bands {dict(PAPER_HEIGHTS)} alone, and {one.band!r} is {own_m} "
-                    "there; leave heights out, or check what was found"
+                    f"requirements: a search has only the bands {dict(PAPER_HEIGHTS)}, but {band!r} is "
+                    f"{heights.get(band)}; remove heights, or check the result of the search"
                 )
-            region = {one.region: required.regions[one.region]} if one.region in required.regions else one.region
-            for key in (one.number, *(f"{one.number}_without_{name}" for name in one.failing_sensors)):
-                each = Objective(number=key, region=region, band=one.band)
-                numbers |= {f"{REQUIRED}{each.description}, {bound.text}": (each, bound.value) for bound in one.bounds}
-        return numbers
+            region = {requirement.region: regions[requirement.region]} if requirement.region in regions else None
+            failures = [f"{requirement.number}_without_{sensor}" for sensor in requirement.failing_sensors]
+            for key in (requirement.number, *failures):
+                objective = Objective(number=key, region=region or requirement.region, band=band)
+                for bound in requirement.bounds:
+                    bounded[f"{REQUIRED}{objective.description}, {bound.text}"] = objective, bound.value
+        return bounded
 
     @cached_property
     def non_region_requirements(self) -> Requirements | None:
-        """The requirements of targets and encounters; None if there are none."""
-        required = self.requirements
-        others = [one for one in required.requirements if not isinstance(one, RegionRequirement)] if required else []
-        return required.model_copy(update={"requirements": tuple(others)}) if required and others else None
+        """Requirements of targets and encounters; None if there are none."""
+        if self.requirements is None:
+            return None
+        selected = [item for item in self.requirements.requirements if not isinstance(item, RegionRequirement)]
+        return self.requirements.model_copy(update={"requirements": tuple(selected)}) if selected else None
 
     @cached_property
     def scenarios(self) -> tuple[Scenario, ...]:
-        """The scenarios, each with the host vehicle as its ego."""
+        """Scenarios, each with the host vehicle as its ego vehicle."""
         rigs = {self.base_rig.name: self.base_rig} if self.base_rig else {}
-        return tuple(set_ego(Scenario.load(each), rigs, self.vehicle) for each in self.scenario)
+        return tuple(set_ego(Scenario.load(name), rigs, self.vehicle) for name in self.scenario)
 
     @cached_property
     def host(self) -> HostVehicle:
-        """The host vehicle."""
+        """Host vehicle."""
         return HostVehicle.from_scenarios(self.scenarios)

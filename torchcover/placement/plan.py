@@ -11,7 +11,7 @@ import numpy as np
 
 from torchcover import __version__
 from torchcover.coverage import Average
-from torchcover.placement.common_frames import EVERY_S, FRAMES_PER_WORLD, MEASURES, RAYS, WORLDS, CommonFrames
+from torchcover.placement.common_frames import CommonFrames
 from torchcover.placement.free_sensor import FreeChoice, VariableValue
 from torchcover.placement.host_vehicle import PlacementSpace
 from torchcover.placement.space import SearchSpace
@@ -26,8 +26,8 @@ class OptimizerParams:
 
     Args:
         num_startup_candidates: Number of random candidates before the first model.
-        random_interval: Every so many candidates one more is random: a control of the optimizer, which learns from it.
-        max_combinations: A space of choices alone with at most so many rigs is searched without repetition.
+        random_interval: Every n-th candidate is random: a control of the optimizer, which learns from it too.
+        max_combinations: Maximum number of combinations of a space of choices that is searched without repetition.
     """
 
     num_startup_candidates: int = 5
@@ -36,33 +36,49 @@ class OptimizerParams:
 
 
 def make_common_frames(space: PlacementSpace, plan: "SearchPlan", seed: int, num_scenes: int) -> CommonFrames:
-    """Return frames of the scenarios of a space, for a seed and a number of worlds."""
-    names = ("per_world", "frame_interval_s", "rays", "estimate", "sensor_model", "workers")
-    settings: dict[str, Any] = {name: getattr(plan, name) for name in names}
-    return CommonFrames(space.scenarios, space.scored_objectives, num_scenes=num_scenes, seed=seed, **settings)
+    """Build the frames on which candidates of a space are scored.
+
+    Args:
+        space: Its scenarios and objectives.
+        plan: Settings of the frames.
+        seed: Seed of the scenes.
+        num_scenes: Number of scenes of each scenario.
+    """
+    return CommonFrames(
+        space.scenarios,
+        space.scored_objectives,
+        num_scenes=num_scenes,
+        frames_per_scene=plan.frames_per_scene,
+        frame_interval_s=plan.frame_interval_s,
+        seed=seed,
+        num_rays=plan.num_rays,
+        average=plan.average,
+        sensor_model=plan.sensor_model,
+        num_workers=plan.num_workers,
+    )
 
 
 @dataclass(frozen=True)
 class SearchPlan:
-    """Budget, worlds and seeds of a placement search.
+    """Budget, scenes and seeds of a placement search.
 
     Args:
-        num_evaluations: Number of candidates after the start; or
-        budget_s: seconds for the whole search with its frames and the test on held-out worlds. One of both is needed.
-        seed: Seed of the worlds that candidates are scored in and of the candidates; held-out worlds have the next.
-        average: Average of a score: "area", the visible surface, or "cells", the mean of the observed cells.
-        sensor_model: "ideal" or "real"; if not given, real where the rig's range limits are known.
-        num_scenes: Worlds of each scenario to search in.
-        num_held_out_scenes: Held-out worlds of each scenario to test in.
-        frames_per_scene: Frames of each world.
-        frame_interval_s: Time between them in seconds.
-        rays: Approximate number of reference rays of each frame.
-        workers: Processes that score; 0 scores in this one. Results do not depend on it.
+        num_evaluations: Number of candidates after the start; either this or `budget_s` is needed.
+        budget_s: Time in seconds for the whole search, including its frames and the validation.
+        seed: Seed of the scenes of the search and of the candidates; held-out scenes have the next seed.
+        average: Average of a score: "area" over visible surface, "cells" over observed cells.
+        sensor_model: "ideal" or "real"; None takes "real" where the range limits of the rig are known.
+        num_scenes: Number of scenes of each scenario in the search.
+        num_held_out_scenes: Number of held-out scenes of each scenario in the validation.
+        frames_per_scene: Number of frames of each scene.
+        frame_interval_s: Time between two frames in seconds.
+        num_rays: Approximate number of reference rays of each frame.
+        num_workers: Number of processes that score; 0 scores in this one. Results do not depend on it.
         optimizer_params: Parameters of the optimizer.
         make_frames: Factory of the frames.
 
     Raises:
-        ValueError: Values out of range.
+        ValueError: A value is out of range.
     """
 
     num_evaluations: int | None = None
@@ -70,56 +86,60 @@ class SearchPlan:
     seed: int = 0
     average: Average = "area"
     sensor_model: Literal["ideal", "real"] | None = None
-    num_scenes: int = WORLDS
+    num_scenes: int = 6
     num_held_out_scenes: int = 16
-    frames_per_scene: int = FRAMES_PER_WORLD
-    frame_interval_s: float = EVERY_S
-    rays: int = RAYS
-    workers: int = 0
+    frames_per_scene: int = 3
+    frame_interval_s: float = 20.0
+    num_rays: int = 16_384
+    num_workers: int = 0
     optimizer_params: OptimizerParams = OptimizerParams()
     make_frames: FrameFactory = make_common_frames
 
     def __post_init__(self) -> None:
         if (self.num_evaluations is None) == (self.budget_s is None):
-            given = "neither" if self.num_evaluations is None else "both"
-            raise ValueError(f"budget: seconds or a number of evaluations is needed; got {given}")
+            arrived = "neither" if self.num_evaluations is None else "both"
+            raise ValueError(f"budget, num_evaluations: got {arrived}; give one of the two")
         if self.num_evaluations is not None and self.num_evaluations < 1:
-            raise ValueError(f"evaluations: 1 or more is needed; got {self.num_evaluations}")
+            raise ValueError(f"num_evaluations: got {self.num_evaluations}; give 1 or more")
         if self.budget_s is not None and not self.budget_s > 0:
-            raise ValueError(f"budget: more than 0 s is needed; got {self.budget_s:g}")
-        if self.average not in MEASURES:
-            raise ValueError(f"estimate: one of {', '.join(MEASURES)} is needed; got {self.average!r}")
+            raise ValueError(f"budget: got {self.budget_s:g} s; give more than 0 s")
+        if self.average not in ("area", "cells"):
+            raise ValueError(f"average: got {self.average!r}; give area or cells")
 
     @property
     def test_seed(self) -> int:
-        """Seed of the held-out worlds, which differs from that of the search."""
+        """Seed of the held-out scenes, which differs from that of the search."""
         return self.seed + 1
 
     def collect_settings(self, space: SearchSpace) -> dict[str, Any]:
-        """Return everything that decides which candidates are proposed, for JSON.
+        """Collect everything that determines the proposed candidates, for JSON.
+
+        Args:
+            space: The search space.
 
         Raises:
             ValueError: The sensor model is "real", and no sensor of the start has known range limits.
         """
-        content = {
-            "space": space.collect_content(),
-            "scenarios": [scenario.collect_content() for scenario in space.scenarios],
-        }
+        content = {"space": space.collect_content(), "scenarios": [scenario.collect_content() for scenario in space.scenarios]}
         text = json.dumps(content, sort_keys=True, default=str)
         return {
             "torchcover": __version__,
             "space": space.name,
             "space_sha256": sha256(text.encode()).hexdigest(),
             "optimizer": str(self.optimizer_params),
-            "estimate": self.average,
+            "average": self.average,
             "sensor_model": space.start.apply_sensor_model(self.sensor_model).sensor_model,
             "band_frame": DEFAULT_BAND_FRAME,
-            **{name: getattr(self, name) for name in ("seed", "worlds", "per_world", "frame_interval_s", "rays")},
+            "seed": self.seed,
+            "num_scenes": self.num_scenes,
+            "frames_per_scene": self.frames_per_scene,
+            "frame_interval_s": self.frame_interval_s,
+            "num_rays": self.num_rays,
         }
 
 
 def import_optuna() -> ModuleType:
-    """Return the package Optuna. ImportError: it is not installed."""
+    """Import the package Optuna. ImportError: it is not installed."""
     try:
         import optuna
     except ImportError as error:
@@ -131,42 +151,64 @@ def import_optuna() -> ModuleType:
 def propose_by_model(
     space: SearchSpace, observations: list[tuple[dict[str, VariableValue], list[float], dict[str, float]]], seed: int
 ) -> dict[str, VariableValue]:
-    """Return the values with the largest expected improvement, by a Gaussian process of all candidates so far.
+    """Propose the values with the largest expected improvement, by a Gaussian process of all candidates.
 
     Args:
         space: Its variables and objectives.
-        observations: Values, gains, and constraints, of which each is met if it is not above 0.
+        observations: Values, improvements and constraints of each candidate; a constraint is met if it is at most 0.
         seed: Seed of the optimization.
+
+    Returns:
+        Values by variable.
     """
     optuna = import_optuna()
-    spans = build_distributions(space)
+    distributions = build_distributions(space)
     sampler = optuna.samplers.GPSampler(seed=seed, n_startup_trials=1, warn_independent_sampling=False)
     directions = ["maximize"] * len(observations[0][1])
-    study = run_quietly(optuna, lambda: optuna.create_study(directions=directions, sampler=sampler))
-    study.add_trials(
-        optuna.create_trial(params=values, distributions=spans, values=gains, constraints=constraints or None)
-        for values, gains, constraints in observations
-    )
-    return dict(run_quietly(optuna, lambda: study.ask(spans)).params)
+    study = run_quietly(optuna, optuna.create_study, directions=directions, sampler=sampler)
+    for values, improvements, constraints in observations:
+        trial = optuna.create_trial(
+            params=values, distributions=distributions, values=improvements, constraints=constraints or None
+        )
+        study.add_trial(trial)
+    return dict(run_quietly(optuna, study.ask, distributions).params)
 
 
 def build_distributions(space: SearchSpace) -> dict[str, Any]:
-    """Return the distribution of Optuna of each variable, by name."""
-    kinds = import_optuna().distributions
-    return {
-        variable.name: kinds.CategoricalDistribution(variable.options)
-        if isinstance(variable, FreeChoice)
-        else kinds.FloatDistribution(variable.low, variable.high)
-        for variable in space.variables
-    }
+    """Build the Optuna distribution of each variable.
+
+    Args:
+        space: Its variables.
+
+    Returns:
+        Distributions by the name of the variable.
+    """
+    optuna = import_optuna()
+    distributions: dict[str, Any] = {}
+    for variable in space.variables:
+        if isinstance(variable, FreeChoice):
+            distributions[variable.name] = optuna.distributions.CategoricalDistribution(variable.options)
+        else:
+            distributions[variable.name] = optuna.distributions.FloatDistribution(variable.low, variable.high)
+    return distributions
 
 
-def run_quietly(optuna: ModuleType, action: Callable[[], Any]) -> Any:  # noqa: ANN401  (objects of Optuna)
-    """Do something without Optuna's messages: new studies, and its missing optional package greenlet."""
+def run_quietly(optuna: ModuleType, action: Callable[..., Any], *args: Any, **options: Any) -> Any:  # noqa: ANN401
+    """Call a function of Optuna without its log messages, such as those on new studies.
+
+    Args:
+        optuna: The package.
+        action: The function.
+        *args: Its positional arguments.
+        **options: Its keyword arguments.
+
+    Returns:
+        Result of the function.
+    """
     level = optuna.logging.get_verbosity()
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     try:
-        with np.errstate(all="ignore"):  # of acquisition values that are 0 nearly everywhere
-            return action()
+        with np.errstate(all="ignore"):  # acquisition values are 0 nearly everywhere
+            return action(*args, **options)
     finally:
         optuna.logging.set_verbosity(level)

@@ -11,33 +11,32 @@ from typing import Any, NamedTuple, Self
 import torch
 from torch import Tensor
 
-from torchcover.coverage import AGGREGATIONS, Aggregation, Average, BevGrid, CoverageSums, MeanOfMeans, Region
+from torchcover.coverage import AGGREGATIONS, Aggregation, BevGrid, CoverageSums, MeanOfMeans, Average, Region
 from torchcover.coverage.grid import PAPER_HEIGHTS
 from torchcover.coverage.quantity import RADIUS, make_detection_quantity, make_failure_quantity
 from torchcover.estimation import Estimate
 from torchcover.evaluation import CoverageObserver
 from torchcover.evaluation.measuring import BLOCKS
 from torchcover.geometry.arrays import Float64
-from torchcover.placement.objective import THRESHOLD_M, Objective
+from torchcover.placement.objective import DEFAULT_THRESHOLD_M, Objective
 from torchcover.simulation import Areas, RegionsOfInterest, Rig, SurfaceReference
 from torchcover.simulation.regions_of_interest import RegionOfInterest
 
-# Of the cells of a search.
-CELL_M = 0.5
-# What stands in a key for the sensor without which the number is worst.
-ANY = "any"
-SEEN_WITHIN = re.compile(r"(?:detection|sensors|make_redundancy_quantity)_(\d+(?:\.\d+)?)m")
-# What is asked where nothing else is, for the steps.
-FOR_STEPS = {"": Objective(region="20m", band="ground")}
-FAILURE = re.compile(r"(.+)_without_(.+)")
+ANY = "any"  # stands in a key for the sensor whose failure is worst
+DETECTION_KEY = re.compile(r"(?:detection|sensors|seen_by_two)_(\d+(?:\.\d+)?)m")
+FAILURE_KEY = re.compile(r"(.+)_without_(.+)")
 
 
 class Queries(NamedTuple):
-    """Objectives by name, and the regions, bands and thresholds that they query around one vehicle.
+    """Regions, bands and thresholds that objectives query around one vehicle.
 
-    Requirements of targets and encounters are not among them; `objective_names` are those of all, in order.
-    The `grid` has cells of 0.5 m around these. Radii
-    saturate at `max_radius_m`: as in `evaluate`, or at the largest threshold if no radius is asked for.
+    Args:
+        objectives: Objectives of regions by name; requirements of targets and encounters are excluded.
+        regions: Regions by name.
+        grid: Cells of 0.5 m around the regions.
+        max_radius_m: Radius at which radii saturate: as in `evaluate`, or the largest threshold if no radius is queried.
+        thresholds_m: Thresholds in meters.
+        objective_names: Names of all objectives, in order.
     """
 
     objectives: Mapping[str, Objective]
@@ -48,90 +47,127 @@ class Queries(NamedTuple):
     objective_names: tuple[str, ...]
 
     @classmethod
-    def from_objectives(cls, ego_outline_m: Float64, objectives: Mapping[str, Objective]) -> Self:
-        """Return the queries for a vehicle with (K, 2) corners x, y.
+    def from_objectives(cls, objectives: Mapping[str, Objective], ego_outline_m: Float64) -> Self:
+        """Collect the queries of objectives.
 
-        ValueError: a region or a band that is none; two regions of one name; one that holds no cell centre.
+        Args:
+            objectives: Objectives by name.
+            ego_outline_m: (K, 2) corners x, y of the vehicle in meters.
+
+        Raises:
+            ValueError: A region or band is unknown, two regions have one name, or a region contains no cell center.
         """
-        usual = {region.name: region for region in RegionsOfInterest().build_query_plan(ego_outline_m).regions}
-        regions, names = dict[str, Region](), tuple(objectives)
-        objectives = {name: one for name, one in objectives.items() if not one.requirement} or FOR_STEPS
+        named_regions = {region.name: region for region in RegionsOfInterest().build_query_plan(ego_outline_m).regions}
+        names = tuple(objectives)
+        objectives = {name: objective for name, objective in objectives.items() if not objective.requirement}
+        # Requirements alone still need frames, whose number is that of some region.
+        objectives = objectives or {"": Objective(region="20m", band="ground")}
+        regions: dict[str, Region] = {}
         for name, objective in objectives.items():
             try:
-                for region in objective.resolve_regions(usual):
+                for region in objective.resolve_regions(named_regions):
                     if regions.setdefault(region.name, region) != region:
-                        raise ValueError(f"region {region.name!r}: another objective calls another region so")
+                        raise ValueError(f"region {region.name!r}: two objectives define it differently; rename one")
             except ValueError as error:
                 raise ValueError(f"objective {name!r}: {error}") from error
         bands = [band for objective in objectives.values() for _, band in objective.region_bands]
-        written = {name: _written(region) for name, region in regions.items()}
+        documents = {name: _to_document(region) for name, region in regions.items()}
         heights = {band: PAPER_HEIGHTS[band] for band in bands}
-        grid = RegionsOfInterest(regions=written, heights=heights).build_query_plan(ego_outline_m, CELL_M).grid
+        grid = RegionsOfInterest(regions=documents, heights=heights).build_query_plan(ego_outline_m, 0.5).grid
         keys = [objective.key for objective in objectives.values()]
-        thresholds = sorted({float(each) for key in keys for each in SEEN_WITHIN.findall(key)})
-        within = all(SEEN_WITHIN.match(key) for key in keys) and max(thresholds) > 0
-        max_radius_m = max(thresholds) if within else grid.diagonal_m
-        grid = _around(grid, regions.values())
-        return cls(objectives, regions, grid, max_radius_m, tuple(thresholds), names)
+        thresholds_m = sorted({float(threshold) for key in keys for threshold in DETECTION_KEY.findall(key)})
+        has_no_radius = all(DETECTION_KEY.match(key) for key in keys) and max(thresholds_m) > 0
+        max_radius_m = max(thresholds_m) if has_no_radius else grid.diagonal_m
+        grid = _crop_grid(grid, regions.values())
+        return cls(objectives, regions, grid, max_radius_m, tuple(thresholds_m), names)
 
     @property
     def search_radius_m(self) -> float | None:
-        """How near to a point of the reference all lies that can change a number; None if anything can."""
+        """Distance from a reference point beyond which sensor points change no number; None if all matter."""
         return self.max_radius_m if self.max_radius_m in self.thresholds_m else None
 
     @property
     def areas(self) -> Areas:
-        """Rectangles of whole cells around the regions: over known cells a cell counts as a whole."""
-        each = (_around(self.grid, [region]) for region in self.regions.values())
-        return tuple((own.x_m, own.y_m) for own in each)
+        """Rectangles of whole cells around the regions, since an average over cells needs whole cells."""
+        grids = [_crop_grid(self.grid, [region]) for region in self.regions.values()]
+        return tuple((grid.x_m, grid.y_m) for grid in grids)
 
-    def build_reference_sensor(self, rays: int) -> SurfaceReference:
-        """One that is aimed at what is asked about."""
-        return SurfaceReference(
-            self.areas, rays, bands_m=tuple(self.grid.heights.values()), band_frame=self.grid.band_frame
-        )
+    def build_reference_sensor(self, num_rays: int) -> SurfaceReference:
+        """Build a reference sensor that samples the queried regions and bands.
+
+        Args:
+            num_rays: Approximate number of rays.
+        """
+        bands_m = tuple(self.grid.heights.values())
+        return SurfaceReference(self.areas, num_rays, bands_m=bands_m, band_frame=self.grid.band_frame)
 
     def mask_points(self, points: Tensor, heights_m: Tensor | None = None) -> Tensor:
-        """Return (M,) bool: which of (M, 3) points lie in a queried region and band."""
-        inside, of, cell = self.grid.assign_cells(points, heights_m)
-        kept = torch.zeros(len(points), dtype=torch.bool, device="cpu")
-        x, y, bands = *points[inside[of], :2].T, list(self.grid.heights)
-        band, column = cell // (self.grid.num_cells // len(bands)), cell % (self.grid.num_cells // len(bands))
-        for place in dict.fromkeys(place for objective in self.objectives.values() for place in objective.region_bands):
-            region = self.regions[place[0]]
-            own = (
-                region.mask_points(x, y) | region.mask_cells(self.grid).view(-1)[column]
-            )  # by area, or of a cell of it
-            kept[inside[of[own & (band == bands.index(place[1]))]]] = True
-        return kept
+        """Mask the points in a queried region and band.
+
+        Args:
+            points: (M, 3) points in the vehicle frame in meters.
+            heights_m: (M,) heights above ground; None takes z.
+
+        Returns:
+            (M,) bool.
+        """
+        is_inside, band_points, cell = self.grid.assign_cells(points, heights_m)
+        point_indices = is_inside[band_points]
+        mask = torch.zeros(len(points), dtype=torch.bool, device="cpu")
+        x, y = points[point_indices, :2].T
+        bands = list(self.grid.heights)
+        cells_per_band = self.grid.num_cells // len(bands)
+        band_index, column = cell // cells_per_band, cell % cells_per_band
+        for region_name, band in self._list_region_bands():
+            region = self.regions[region_name]
+            # An average by area needs points in the region, an average over cells all points of its cells.
+            in_region = region.mask_points(x, y) | region.mask_cells(self.grid).view(-1)[column]
+            mask[point_indices[in_region & (band_index == bands.index(band))]] = True
+        return mask
 
     def check(self, rig: Rig) -> None:
-        """Refuse objectives that are numbers of no result of such a rig on its ego.
+        """Check that results of a rig contain the numbers of all objectives.
 
-        ValueError: such a one; the message has the nearest name.
+        Args:
+            rig: The rig.
+
+        Raises:
+            ValueError: A number is unknown; the message has the most similar one.
         """
-        queries = self._replace(thresholds_m=self.thresholds_m or (THRESHOLD_M,))
-        with warnings.catch_warnings(action="ignore"):  # that they were fed with nothing
-            of_coverage = [one.key for one in queries.build_observer(rig, "area").compute().all_quantities]
-        single = (RADIUS, *map(make_detection_quantity, queries.thresholds_m))
-        others = [one.key for kind in AGGREGATIONS for one in kind.parse(kind.example).quantities]
-        of_coverage += [one.key for one in (*single, *(make_failure_quantity(ANY, each) for each in single))] + others
+        queries = self._replace(thresholds_m=self.thresholds_m or (DEFAULT_THRESHOLD_M,))
+        with warnings.catch_warnings(action="ignore"):  # the observer has no frames
+            coverage = queries.build_observer(rig, "area").compute()
+        keys = [quantity.key for quantity in coverage.all_quantities]
+        quantities = (RADIUS, *map(make_detection_quantity, queries.thresholds_m))
+        keys += [quantity.key for quantity in quantities]
+        keys += [make_failure_quantity(ANY, quantity).key for quantity in quantities]
+        for kind in AGGREGATIONS:
+            keys += [quantity.key for quantity in kind.parse(kind.example).quantities]
         for name, objective in self.objectives.items():
-            if objective.key not in of_coverage:
-                near = get_close_matches(objective.key, of_coverage, n=1, cutoff=0.0)
-                raise ValueError(f"objective {name!r}: no result has a number {objective.key!r}; near is {near[0]!r}")
+            if objective.key not in keys:
+                similar = get_close_matches(objective.key, keys, n=1, cutoff=0.0)
+                raise ValueError(
+                    f"objective {name!r}: results have no number {objective.key!r}; did you mean {similar[0]!r}?"
+                )
 
     @property
     def aggregations(self) -> tuple[Aggregation, ...]:
-        """Those whose numbers are asked for."""
-        return tuple(one for kind in AGGREGATIONS if (one := kind.from_keys(set(self._keys))))
-
-    @property
-    def _keys(self) -> list[str]:
-        return [objective.key for objective in self.objectives.values()]
+        """Aggregations that the objectives need."""
+        keys = {objective.key for objective in self.objectives.values()}
+        aggregations = [kind.from_keys(keys) for kind in AGGREGATIONS]
+        return tuple(aggregation for aggregation in aggregations if aggregation)
 
     def build_observer(self, rig: Rig, average: Average) -> CoverageObserver:
-        """Return an observer of the coverage of a rig, fed with nothing yet, for means by area or over known cells."""
+        """Build an observer of the coverage of a rig.
+
+        Args:
+            rig: The rig.
+            average: Average of the numbers, "area" or "cells".
+
+        Returns:
+            An observer without frames.
+        """
+        needs_sensors = any(_needs_sensors(objective.key) for objective in self.objectives.values())
         coverage = CoverageSums(
             self.grid,
             self.thresholds_m,
@@ -139,90 +175,102 @@ class Queries(NamedTuple):
             num_blocks=BLOCKS,
             regions=tuple(self.regions.values()),
             aggregations=self.aggregations,
-            sensor_names=tuple(sensor.name for sensor in rig.sensors) if any(map(_of_failures, self._keys)) else (),
+            sensor_names=tuple(sensor.name for sensor in rig.sensors) if needs_sensors else (),
             has_area_weights=average == "area",
         )
         return CoverageObserver(coverage, rig.name)
 
     def estimate(self, metric: CoverageSums, met_shares: Mapping[str, Estimate]) -> Estimate:
-        """Return the objectives, each a quantity under its own name.
+        """Estimate the objectives, each a quantity under its own name.
 
         Args:
-            metric: That of `build_observer`, with the sums of all frames.
-            met_shares: Name of an objective that is required of bodies -> share of the requirements that are met, the same in
-                every block.
+            metric: Metric of `build_observer` with the sums of all frames.
+            met_shares: Name of an objective with a requirement -> share of positions or encounters that meet it, the
+                same in every block.
         """
-        answers = self._answers(metric)
-        steps = max((one.frame_counts for each in answers.values() for one in each), key=len)
-        quantities, values, left_out = [], [], []
+        parts = self._estimate_parts(metric)
+        steps = max((part.frame_counts for estimates in parts.values() for part in estimates), key=len)
+        missing = torch.full((len(steps),), math.nan, dtype=torch.float64, device="cpu")
+        quantities, values, values_without_block = [], [], []
         for name in self.objective_names:
-            each = answers.get(name) or [met_shares[name]]
-            quantities.append(each[0].quantities[0]._replace(key=name))
-            values.append(torch.cat([one.value for one in each]).mean())
-            whole = all(len(one.jackknife_values) == len(steps) for one in each)
-            unknown = torch.full((len(steps),), math.nan, dtype=torch.float64, device="cpu")
-            known = torch.cat([one.jackknife_values for one in each], dim=1).mean(dim=1) if whole else unknown
-            left_out.append(values[-1].expand(len(steps)) if name in met_shares else known)
-        return Estimate(tuple(quantities), torch.stack(values), torch.stack(left_out, dim=1), steps)
+            estimates = parts.get(name) or [met_shares[name]]
+            quantities.append(estimates[0].quantities[0]._replace(key=name))
+            values.append(torch.cat([estimate.value for estimate in estimates]).mean())
+            if name in met_shares:
+                values_without_block.append(values[-1].expand(len(steps)))
+            elif all(len(estimate.jackknife_values) == len(steps) for estimate in estimates):
+                values_without_block.append(torch.cat([estimate.jackknife_values for estimate in estimates], dim=1).mean(dim=1))
+            else:
+                values_without_block.append(missing)
+        return Estimate(tuple(quantities), torch.stack(values), torch.stack(values_without_block, dim=1), steps)
 
-    def _answers(self, metric: CoverageSums) -> dict[str, list[Estimate]]:
+    def _estimate_parts(self, metric: CoverageSums) -> dict[str, list[Estimate]]:
         """Return for each objective its number in each of its regions and bands."""
-        plain = [quantity.key for quantity in MeanOfMeans(metric.thresholds_m).quantities]
-        places = list(dict.fromkeys(place for one in self.objectives.values() for place in one.region_bands))
-        if metric.has_area_weights and all(key in plain for key in self._keys):
-            by_area = metric.estimate_regions([(self.regions[region], band) for region, band in places], "area")
-            found = dict(zip(places, by_area, strict=True))
+        mean_keys = [quantity.key for quantity in MeanOfMeans(metric.thresholds_m).quantities]
+        if metric.has_area_weights and all(objective.key in mean_keys for objective in self.objectives.values()):
+            region_bands = self._list_region_bands()
+            pairs = [(self.regions[region], band) for region, band in region_bands]
+            area_estimates = dict(zip(region_bands, metric.estimate_regions(pairs, "area"), strict=True))
 
-            def number(key: str, place: tuple[str, str]) -> Estimate:
-                at = [quantity.key for quantity in found[place].quantities].index(key)
-                return found[place][at : at + 1]
+            def estimate_number(key: str, region: str, band: str) -> Estimate:
+                estimates = area_estimates[region, band]
+                index = [quantity.key for quantity in estimates.quantities].index(key)
+                return estimates[index : index + 1]
         else:
             coverage = metric.compute()
 
-            def number(key: str, place: tuple[str, str]) -> Estimate:
-                key = key if metric.has_area_weights else key.removeprefix("known_")
-                return coverage.estimate_number(key, self.regions[place[0]], place[1])
+            def estimate_number(key: str, region: str, band: str) -> Estimate:
+                key = key if metric.has_area_weights else key.removeprefix("cells_")
+                return coverage.estimate_number(key, self.regions[region], band)
 
-        def answer(key: str, place: tuple[str, str]) -> Estimate:
-            alone, sensor = failed.groups() if (failed := FAILURE.match(key)) else (key, "")
+        def estimate_part(key: str, region: str, band: str) -> Estimate:
+            failure = FAILURE_KEY.match(key)
+            number, sensor = failure.groups() if failure else (key, "")
             if sensor == ANY:
-                worst = _worst([number(f"{alone}_without_{one}", place) for one in metric.sensor_names])
+                failures = [estimate_number(f"{number}_without_{name}", region, band) for name in metric.sensor_names]
+                worst = _select_worst(failures)
                 title = worst.quantities[0].title.removesuffix(metric.sensor_names[0]) + "any one sensor"
                 return replace(worst, quantities=(worst.quantities[0]._replace(title=title),))
-            return number(
-                key if sensor in ("", *metric.sensor_names) else alone, place
-            )  # what is not there cannot fail
+            # A sensor that the rig does not have cannot fail.
+            return estimate_number(key if sensor in ("", *metric.sensor_names) else number, region, band)
 
-        return {name: [answer(one.key, place) for place in one.region_bands] for name, one in self.objectives.items()}
+        parts = {}
+        for name, objective in self.objectives.items():
+            parts[name] = [estimate_part(objective.key, region, band) for region, band in objective.region_bands]
+        return parts
 
-
-def _of_failures(key: str) -> bool:
-    """Whether only a metric that is told of the sensors gives the number."""
-    return FAILURE.match(key) is not None or not key.startswith(("radius", "detection", "known_"))
-
-
-def _worst(each: Sequence[Estimate]) -> Estimate:
-    """The worst of one number of several rigs, and so without each block."""
-    quantity = each[0].quantities[0]
-    value, left_out = (
-        torch.stack(parts) for parts in zip(*((one.value, one.jackknife_values) for one in each), strict=True)
-    )
-    worst: Any = torch.amax if quantity.lower_is_better else torch.amin
-    return Estimate(each[0].quantities, worst(value, dim=0), worst(left_out, dim=0), each[0].frame_counts)
+    def _list_region_bands(self) -> list[tuple[str, str]]:
+        """List the queried pairs of region and band, each once."""
+        return list(dict.fromkeys(pair for objective in self.objectives.values() for pair in objective.region_bands))
 
 
-def _written(region: Region) -> RegionOfInterest:
+def _needs_sensors(key: str) -> bool:
+    """Return whether only a metric that distinguishes the sensors has the number."""
+    return FAILURE_KEY.match(key) is not None or not key.startswith(("radius", "detection", "cells_"))
+
+
+def _select_worst(estimates: Sequence[Estimate]) -> Estimate:
+    """Select the worst value of one number of several rigs, also without each block."""
+    quantity = estimates[0].quantities[0]
+    reduce: Any = torch.amax if quantity.lower_is_better else torch.amin
+    value = reduce(torch.stack([estimate.value for estimate in estimates]), dim=0)
+    left_out = reduce(torch.stack([estimate.jackknife_values for estimate in estimates]), dim=0)
+    return Estimate(estimates[0].quantities, value, left_out, estimates[0].frame_counts)
+
+
+def _to_document(region: Region) -> RegionOfInterest:
     if region.corners_m:
         return RegionOfInterest(polygon_m=region.corners_m)
     return RegionOfInterest(x_m=region.x_m, y_m=region.y_m)
 
 
-def _around(grid: BevGrid, regions: Collection[Region]) -> BevGrid:
-    """The part of a grid that holds some regions: the same cells, but fewer."""
+def _crop_grid(grid: BevGrid, regions: Collection[Region]) -> BevGrid:
+    """Crop a grid to the smallest range of its cells that contains the regions."""
 
-    def outside(edges: Tensor, bounds: Sequence[tuple[float, float]]) -> tuple[float, float]:
+    def find_range(edges: Tensor, bounds: Sequence[tuple[float, float]]) -> tuple[float, float]:
         low, high = min(low for low, _ in bounds), max(high for _, high in bounds)
         return float(edges[edges <= low].max()), float(edges[edges >= high].min())
 
-    x, y = outside(grid.x_edges_m, [one.x_m for one in regions]), outside(grid.y_edges_m, [one.y_m for one in regions])
+    x = find_range(grid.x_edges_m, [region.x_m for region in regions])
+    y = find_range(grid.y_edges_m, [region.y_m for region in regions])
     return BevGrid(x, y, grid.cell_m, grid.heights, grid.band_frame)

@@ -1,4 +1,4 @@
-"""What a search, and a choice, write: the same kinds of files and one page."""
+"""Files and page of a placement search or a sensor selection."""
 
 import json
 import re
@@ -26,16 +26,24 @@ from torchcover.simulation import Rig
 if TYPE_CHECKING:
     import pandas
 
-OF_THE_RUN = ("seconds", "torchcover", "space_sha256")
+RUN_KEYS = ("duration_s", "torchcover", "space_sha256")  # keys of the record that are no settings
 
 
 @dataclass(frozen=True, eq=False)
 class PlacementReport:
-    """What was found, for its files, its page, and the terminal.
+    """Content of the files, the page and the terminal output of a placement result.
 
-    `record` stands in `search.json`, where what is unknown may be NaN; the page shows those `setting_names` of it, and the
-    rigs that are `page_rigs`, by what they are. `rigs` and `csv_tables`, tables with their headings, are by the names of their
-    files. The first table is printed, too. `render_plots` makes the stem of a file, what it shows, and a figure of its own.
+    Args:
+        title: Title of the page.
+        summary: Summary in sentences.
+        record: Content of `search.json`; unknown numbers are NaN.
+        setting_names: Keys of `record` that the page shows as settings.
+        rigs: File name -> rig.
+        page_rigs: Role -> rig, as shown on the page.
+        tables: Tables of the page; the first is also printed.
+        csv_tables: File name -> rows, the first of them headings.
+        render_plots: Function that yields file stem, description and figure of each plot.
+        ego_outline_m: (K, 2) corners x, y of the vehicle in meters.
     """
 
     title: str
@@ -50,62 +58,70 @@ class PlacementReport:
     ego_outline_m: Float64
 
     def save(self, folder: str | Path, *, files: str | Iterable[str] = FILES) -> list[Path]:
-        """Write the files of the command line: first what was found, then the pictures and the page.
+        """Write the files of the command line: first numbers and rigs, then plots and page.
 
-        A folder is made if it does not exist; files of an earlier run that its `summary.json` lists are deleted.
-        `files` is as in `Result.save`; "maps" are the pictures.
+        Files of an earlier run that its `summary.json` lists are deleted.
+
+        Args:
+            folder: Folder of the files; it is created if it does not exist.
+            files: Kinds of files, as in `Result.save`; "maps" are the plots.
+
+        Returns:
+            Paths of the written files.
         """
-        wanted = parse_file_kinds(files)
-        summary = {"torchcover": __version__, "complete": True, "sentence": self.summary}
-        with AtomicOutput(Path(folder)) as written:
-            with defer_signals():  # what was found is safe before anything ends this
-                if "numbers" in wanted:
-                    self._add_numbers(written)
-                written.publish(summary)
+        kinds = parse_file_kinds(files)
+        summary = {"torchcover": __version__, "complete": True, "summary": self.summary}
+        with AtomicOutput(Path(folder)) as output:
+            with defer_signals():  # an interrupted program must not lose the numbers
+                if "numbers" in kinds:
+                    self._add_numbers(output)
+                output.publish(summary)
             pictures = []
-            for stem, words, figure in self.render_plots() if wanted & {"maps", "page"} else ():
+            for stem, description, figure in self.render_plots() if kinds & {"maps", "page"} else ():
                 png = BytesIO()
                 figure.savefig(png, dpi=figure.dpi)
-                pictures.append(PagePicture(words, png.getvalue()))
-                if "maps" in wanted:
-                    written.add(f"{stem}.png", partial(Path.write_bytes, data=png.getvalue()))
-            if "page" in wanted:
-                written.add_text("report.html", render_page(self._page(pictures)))
-            written.publish(summary)
-        return written.paths
+                pictures.append(PagePicture(description, png.getvalue()))
+                if "maps" in kinds:
+                    output.add(f"{stem}.png", partial(Path.write_bytes, data=png.getvalue()))
+            if "page" in kinds:
+                output.add_text("report.html", render_page(self._build_page(pictures)))
+            output.publish(summary)
+        return output.paths
 
-    def _add_numbers(self, files: AtomicOutput) -> None:
+    def _add_numbers(self, output: AtomicOutput) -> None:
         for name, rig in self.rigs.items():
-            files.add(name, rig.save)
+            output.add(name, rig.save)
         for name, rows in self.csv_tables.items():
-            files.add_text(name, format_csv([*map(_digits, row)] for row in rows))
-        record = json.dumps(replace_nan({**self.record, "sentence": self.summary}), indent=2, allow_nan=False)
-        files.add_text("search.json", f"{record}\n")
+            output.add_text(name, format_csv([_round_digits(value) for value in row] for row in rows))
+        record = json.dumps(replace_nan({**self.record, "summary": self.summary}), indent=2, allow_nan=False)
+        output.add_text("search.json", f"{record}\n")
 
-    def _page(self, pictures: Sequence[PagePicture]) -> Page:
+    def _build_page(self, pictures: Sequence[PagePicture]) -> Page:
         record = replace_nan(self.record)
-        facts = {"Settings": self.setting_names, "Run": [name for name in OF_THE_RUN if name in record]}
+        rigs = []
+        for role, rig in self.page_rigs.items():
+            yaml_text = format_rig_yaml(rig.name, rig.sensors)
+            rigs.append(PageRig(f"{role}: {rig.name}", build_sensor_views(rig.sensors), yaml_text))
+        settings = {name: record[name] for name in self.setting_names}
+        run = {name: record[name] for name in RUN_KEYS if name in record}
         return Page(
             title=self.title,
             lead="Measured by torchcover.",
             findings=re.split(r"(?<=[.]) (?=[A-Z])", self.summary),
             tables=self.tables,
             pictures=pictures,
-            rigs=[
-                PageRig(f"{what}: {rig.name}", build_sensor_views(rig.sensors), format_rig_yaml(rig.name, rig.sensors))
-                for what, rig in self.page_rigs.items()
-            ],
+            rigs=rigs,
             ego_outline_m=self.ego_outline_m,
-            facts={title: format_facts({name: record[name] for name in names}) for title, names in facts.items()},
+            facts={"Settings": format_facts(settings), "Run": format_facts(run)},
         )
 
 
 class ReportMixin:
-    """What has a report: files, a page, and what a notebook shows of it."""
+    """Methods of results that have a `PlacementReport`: files, a plot, and a notebook view."""
 
     @property
     def report(self) -> PlacementReport:
-        """For its files, its page, and the terminal."""
+        """Content of the files, the page and the terminal output."""
         raise NotImplementedError
 
     def _repr_html_(self) -> str:
@@ -113,28 +129,36 @@ class ReportMixin:
         return build_result_html([report.title, report.summary], self.plot())
 
     def plot(self) -> Figure:
-        """The first of its pictures: a figure of its own, outside pyplot."""
+        """Return the first plot, a new figure outside pyplot."""
         return next(self.report.render_plots())[2]
 
     def to_dataframe(self) -> "pandas.DataFrame":
-        """The rows of its first table: `candidates.csv` of a choice, `evaluations.csv` of a search.
+        """Return `evaluations.csv` of a search or `candidates.csv` of a selection as a data frame.
 
         Raises:
-            ModuleNotFoundError: pandas is not there.
+            ModuleNotFoundError: pandas is not installed.
         """
         headings, *rows = next(iter(self.report.csv_tables.values()))
-        return build_dataframe(dict(zip(map(str, headings), row, strict=True)) for row in rows)
+        names = [str(heading) for heading in headings]
+        return build_dataframe(dict(zip(names, row, strict=True)) for row in rows)
 
     def save(self, folder: str | Path, *, files: str | Iterable[str] = FILES) -> list[Path]:
-        """Write the files of the command line; see `PlacementReport.save`.
+        """Write the files of the command line, see `PlacementReport.save`.
 
-        They are `best.yaml` (of several objectives also `best_OBJECTIVE.yaml`), `search.json`, `report.html`, the
-        pictures and `summary.json`; of a choice `candidates.csv` and `sizes.csv`, of a search `evaluations.csv` and
-        `pareto.csv`.
+        They are `best.yaml` (of several objectives also `best_OBJECTIVE.yaml`), `search.json`, `report.html`, plots and
+        `summary.json`; of a search also `evaluations.csv` and `pareto.csv`, of a selection `candidates.csv` and
+        `sizes.csv`.
+
+        Args:
+            folder: Folder of the files.
+            files: Kinds of files, as in `Result.save`.
+
+        Returns:
+            Paths of the written files.
         """
         return self.report.save(folder, files=files)
 
 
-def _digits(value: object) -> object:
-    """As many as anybody can use."""
+def _round_digits(value: object) -> object:
+    """Round numbers of a CSV file to nine digits."""
     return f"{value:.9g}" if isinstance(value, float) and value == value else value

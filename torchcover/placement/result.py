@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from torchcover.evaluation.result import describe_sensor_models
 from torchcover.placement.free_sensor import FreeNumber
-from torchcover.placement.report_files import OF_THE_RUN, PlacementReport, ReportMixin
+from torchcover.placement.report_files import RUN_KEYS, PlacementReport, ReportMixin
 from torchcover.placement.search import OPTIMIZER, RANDOM, START, Evaluation, PlacementSearch
 from torchcover.placement.validation import (
     HeldOutImprovement,
@@ -23,21 +23,28 @@ from torchcover.report import PageTable, TextCell, build_file_stems, plot_fronts
 from torchcover.report.wording import UNKNOWN, get_display_unit
 from torchcover.simulation import Rig
 
-BOUND_SHARE = 0.005  # a number closer to an end of its range, as a share of that, lies on the end
-HEADINGS = ("rig", "objective", "estimate", "gain in\nthe search", "gain on\nheld-out worlds", "t",
-            "better in\n(worlds)", "optimism")  # fmt: skip
+HEADINGS = (
+    "rig",
+    "objective",
+    "average",
+    "improvement in\nthe search",
+    "improvement on\nheld-out scenes",
+    "t statistic",
+    "better in\n(blocks)",
+    "optimism",
+)
 
 
 @dataclass(frozen=True, eq=False)
 class Finalist:
-    """A rig of a search that is tested on held-out worlds.
+    """Rig of a search that is tested on held-out scenes.
 
     Args:
         role: "best"; "random", the best random candidate; of several objectives "compromise" or the name of the
-            objective that the rig is best in.
-        evaluation: Its scores in the search.
+            objective in which the rig is best.
+        evaluation: Scores in the search.
         rig: The rig.
-        improvements: Gains on held-out worlds; empty if it was not tested.
+        improvements: Improvements on held-out scenes; empty without a test.
     """
 
     role: str
@@ -47,20 +54,20 @@ class Finalist:
 
     @property
     def is_start(self) -> bool:
-        """Whether nothing better than the start was found."""
+        """Whether the rig is the start, since no candidate is better."""
         return self.evaluation.strategy == START
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class SearchResult(ReportMixin):
-    """Result of `run_search`. Its first picture shows the progress of the search.
+    """Result of `run_search`. Its first plot shows the progress of the search.
 
     Args:
-        search: The search with all its evaluations.
-        finalists: The best first; of several objectives the compromise.
-        test: Side effects of the first finalist on held-out worlds.
+        search: The search with all evaluations.
+        finalists: Finalists, the best or the compromise first.
+        test: Validation on held-out scenes; None without a test.
         no_test_reason: Reason why there is no test; empty if there is one.
-        duration_s: Duration, with the time before it was resumed.
+        duration_s: Duration in seconds, including the time before the search was resumed.
     """
 
     search: PlacementSearch
@@ -80,7 +87,7 @@ class SearchResult(ReportMixin):
         return self.search.space.start if self.best is None else self.best.rig
 
     @cached_property
-    def improvements(self) -> Any:  # noqa: ANN401  (an array; see `PlacementSearch.gains`)
+    def improvements(self) -> Any:  # noqa: ANN401  (an array, see `PlacementSearch.improvements`)
         """(evaluations, objectives) improvements over the start in the search."""
         return self.search.improvements
 
@@ -94,231 +101,247 @@ class SearchResult(ReportMixin):
     def units(self) -> list[str]:
         """Units of the objectives."""
         start = self.search.evaluations[0].estimate
-        assert start is not None  # it always is scored
+        assert start is not None  # the start always has a score
         return [quantity.unit for quantity in start.quantities[: len(self.search.space.objectives)]]
 
     @property
     def summary(self) -> str:
-        """The summary: the gain on held-out worlds, side effects, and what random candidates reached."""
-        return " ".join(self._sentences())
+        """Summary: improvement on held-out scenes, side effects, and the result of random candidates."""
+        return " ".join(self._build_sentences())
 
-    def _sentences(self) -> Iterator[str]:
+    def _build_sentences(self) -> Iterator[str]:
         search, best = self.search, self.best
-        others = search.evaluations[1:]
-        reasons = [evaluation.infeasible_reason for evaluation in others if evaluation.infeasible_reason]
-        if others and len(reasons) == len(others):
-            yield f"None of {len(others)} candidates is possible, the last for this reason: {reasons[-1]}."
+        candidates = search.evaluations[1:]
+        reasons = [candidate.infeasible_reason for candidate in candidates if candidate.infeasible_reason]
+        if candidates and len(reasons) == len(candidates):
+            yield f"All {len(candidates)} candidates are infeasible; reason of the last: {reasons[-1]}."
             return
         if best is None:
-            yield f"None of {len(others)} candidates is possible."
+            yield f"All {len(candidates)} candidates are infeasible."
             return
         if best.is_start:
-            yield f"Nothing better than {search.space.start.name} was found in {len(others)} candidates."
+            yield f"None of {len(candidates)} candidates is better than {search.space.start.name}."
         elif not best.improvements:
-            yield f"Found in {len(others)} candidates, but not tested, so that no gain is shown: {self.no_test_reason}."
+            yield f"Best of {len(candidates)} candidates, without validation: {self.no_test_reason}."
         else:
-            yield f"{self._describe(best, optimism=True)}."
-        if missing := self._describe_shortfalls(best.evaluation):
-            yield f"No candidate keeps all that must be kept; this one misses the least: {missing}."
+            yield f"{self._describe_improvements(best, optimism=True)}."
+        if shortfalls := self._describe_shortfalls(best.evaluation):
+            yield f"No candidate meets all bounds; this one has the smallest shortfall: {shortfalls}."
         if self.test is not None:
             yield f"{self.test.summary}."
-        if bounds := self._find_bounds(best.evaluation):
-            yield f"On the bounds of their ranges ended {', '.join(bounds)}: more room may be worth more."
-        yield self._compare_random()
+        if variables := self._find_variables_on_bounds(best.evaluation):
+            yield f"Variables at the end of their range: {', '.join(variables)}; a wider range may be better."
+        yield self._describe_random_candidates()
         rigs = {"start": search.space.start, **{finalist.role: finalist.rig for finalist in self.finalists}}
         is_ideal = search.plan.sensor_model == "ideal"
         yield from describe_sensor_models(
             {name: "ideal" if is_ideal else rig.sensor_model for name, rig in rigs.items()}
         )
 
-    def _find_bounds(self, evaluation: Evaluation) -> list[str]:
-        """Return the numbers of a candidate that lie at an end of their range."""
-        bounds = []
+    def _find_variables_on_bounds(self, evaluation: Evaluation) -> list[str]:
+        """Return the variables of a candidate that are within 0.5 % of an end of their range."""
+        variables = []
         for variable in self.search.space.variables:
             if evaluation.number == 0 or not isinstance(variable, FreeNumber):
                 continue
             value = float(evaluation.values[variable.name])
-            if min(value - variable.low, variable.high - value) < BOUND_SHARE * (variable.high - variable.low):
-                bounds.append(f"{variable.name} ({value:g})")
-        return bounds
+            if min(value - variable.low, variable.high - value) < 0.005 * (variable.high - variable.low):
+                variables.append(f"{variable.name} ({value:g})")
+        return variables
 
-    def _compare_random(self) -> str:
-        """Return what random candidates reached: the control of the optimizer."""
-        count = f"{self.strategy_counts[RANDOM]} random candidates"
+    def _describe_random_candidates(self) -> str:
+        """Describe the result of random candidates, the control of the optimizer."""
+        count = self.strategy_counts[RANDOM]
         if len(self.search.space.objectives) > 1:
-            front = [self.search.evaluations[at].strategy for at in self.search.find_best()]
-            return f"Of the front's {len(front)} rigs, {front.count(RANDOM)} are among the {count}."
+            front = [self.search.evaluations[number].strategy for number in self.search.find_best()]
+            return f"Control: {front.count(RANDOM)} of {len(front)} rigs of the front are random candidates ({count})."
         finalist = self.finalists[-1]
         if finalist.is_start:
-            return f"The {count} are not better than the start."
+            return f"Control: none of {count} random candidates is better than the start."
         if self.best is not None and finalist.evaluation is self.best.evaluation:
-            return f"It is one of the {count}: the optimizer found nothing better."
-        gain = f": {self._describe(finalist, optimism=False)}" if finalist.improvements else " was not tested"
-        return f"The best of {count}{gain}."
+            return f"Control: it is one of {count} random candidates; the optimizer found nothing better."
+        if not finalist.improvements:
+            return f"Control: the best of {count} random candidates was not validated."
+        return f"Control, the best of {count} random candidates: {self._describe_improvements(finalist)}."
 
-    def _describe(self, finalist: Finalist, *, optimism: bool) -> str:
-        gains = finalist.improvements[: len(self.search.space.objectives)]
-        return "; ".join(f"{gain.objective}: {describe_improvement(gain, optimism=optimism)}" for gain in gains)
+    def _describe_improvements(self, finalist: Finalist, *, optimism: bool = False) -> str:
+        texts = []
+        for improvement in finalist.improvements[: len(self.search.space.objectives)]:
+            texts.append(f"{improvement.objective}: {describe_improvement(improvement, optimism=optimism)}")
+        return "; ".join(texts)
 
     def _describe_shortfalls(self, evaluation: Evaluation) -> str:
-        """Return what a candidate misses of what must be kept, the largest first; empty if it keeps all."""
-        missing = self.search.find_shortfalls(evaluation)
-        names = sorted(missing, key=lambda name: -missing[name])
-        return "; ".join(f"{missing[name]:.2%} of {name}" for name in names)
+        """Describe the shortfalls of a candidate, the largest first; empty if it has none."""
+        shortfalls = self.search.find_shortfalls(evaluation)
+        names = sorted(shortfalls, key=lambda name: -shortfalls[name])
+        return "; ".join(f"{shortfalls[name]:.2%} of {name}" for name in names)
 
     @property
     def report(self) -> PlacementReport:
-        """Tables, files and pictures of the result."""
-        search, settings = self.search, self.search.plan.collect_settings(self.search.space)
-        ends = [finalist for finalist in self.finalists[1:] if finalist.role != RANDOM]
-        best_of = zip(build_file_stems([finalist.role for finalist in ends]), ends, strict=True)
-        of_plan = {name: getattr(search.plan, name) for name in ("evaluations", "budget_s", "num_held_out_scenes")}
-        rigs = {finalist.role: finalist.rig for finalist in self.finalists}
+        """Tables, files and plots of the result."""
+        search, space, plan = self.search, self.search.space, self.search.plan
+        settings = plan.collect_settings(space)
+        budget = {
+            "num_evaluations": plan.num_evaluations,
+            "budget_s": plan.budget_s,
+            "num_held_out_scenes": plan.num_held_out_scenes,
+            "test_seed": plan.test_seed,
+        }
+        front_ends = [finalist for finalist in self.finalists[1:] if finalist.role != RANDOM]
+        stems = build_file_stems([finalist.role for finalist in front_ends])
+        files = {f"best_{stem}.yaml": end.rig for stem, end in zip(stems, front_ends, strict=True)}
+        improvements = PageTable(f"{space.name}: against {space.start.name}", HEADINGS, self._build_rows(), 3)
         return PlacementReport(
-            title=f"{search.space.name}: where should the sensors go?",
+            title=f"{space.name}: sensor placement",
             summary=self.summary,
             record={
                 **settings,
-                **of_plan,
-                "test_seed": search.plan.test_seed,
-                "seconds": round(self.duration_s, 3),
-                "candidates": self.strategy_counts,
-                "infeasible": sum(bool(evaluation.infeasible_reason) for evaluation in search.evaluations[1:]),
-                "changes": self.test and self.test.record,
-                "found": [self._record_finalist(finalist) for finalist in self.finalists],
-                "untested": self.no_test_reason or None,
+                **budget,
+                "duration_s": round(self.duration_s, 3),
+                "strategy_counts": self.strategy_counts,
+                "infeasible_count": sum(bool(evaluation.infeasible_reason) for evaluation in search.evaluations[1:]),
+                "side_effects": self.test and self.test.record,
+                "finalists": [self._record_finalist(finalist) for finalist in self.finalists],
+                "no_test_reason": self.no_test_reason or None,
             },
-            setting_names=[name for name in (*settings, *of_plan, "test_seed") if name not in OF_THE_RUN],
-            rigs={"best.yaml": self.rig} | {f"best_{stem}.yaml": end.rig for stem, end in best_of},
-            page_rigs={"start": search.space.start} | rigs,
-            tables=[
-                PageTable(f"{search.space.name}: against {search.space.start.name}", HEADINGS, self._gain_rows(), 3),
-                *([self.test.table] if self.test else ()),
-                self._values_table(),
-            ],
-            csv_tables={"evaluations.csv": self._evaluation_rows(), "pareto.csv": self._pareto_rows()},
-            render_plots=self._pictures,
-            ego_outline_m=search.space.host.outline_m,
+            setting_names=[name for name in (*settings, *budget) if name not in RUN_KEYS],
+            rigs={"best.yaml": self.rig} | files,
+            page_rigs={"start": space.start} | {finalist.role: finalist.rig for finalist in self.finalists},
+            tables=[improvements, *([self.test.table] if self.test else ()), self._build_values_table()],
+            csv_tables={"evaluations.csv": self._yield_evaluations(), "pareto.csv": self._yield_front()},
+            render_plots=self._render_plots,
+            ego_outline_m=space.host.outline_m,
         )
 
     def __repr__(self) -> str:
         return f"SearchResult in {self.search.space.name}: {self.summary}"
 
     def _record_finalist(self, finalist: Finalist) -> dict[str, Any]:
-        gains: dict[str, dict[str, Any]] = {}
-        for gain in finalist.improvements:
-            gains.setdefault(gain.objective, {})[gain.average] = gain.record
+        improvements: dict[str, dict[str, Any]] = {}
+        for improvement in finalist.improvements:
+            improvements.setdefault(improvement.objective, {})[improvement.average] = improvement.record
         return {
             "role": finalist.role,
             "strategy": finalist.evaluation.strategy,
             "evaluation": finalist.evaluation.number,
             "values": finalist.evaluation.values,
-            "cost_eur": self._cost(finalist.evaluation),
-            "gains": gains or None,
+            "cost_eur": self._compute_cost_eur(finalist.evaluation),
+            "improvements": improvements or None,
         }
 
-    def _gain_rows(self) -> list[tuple[TextCell, ...]]:
-        """Return cells below `HEADINGS`; those of the test are "-" for a finalist that was not tested."""
-        rows, objectives = [], self.search.space.objectives
+    def _build_rows(self) -> list[tuple[TextCell, ...]]:
+        """Build the rows below `HEADINGS`; cells of the test are "-" for a finalist that was not tested."""
+        rows: list[tuple[TextCell, ...]] = []
         for finalist in self.finalists:
-            for gain in finalist.improvements:
-                test, unit = gain.difference, gain.difference.quantity.unit
-                cells = (
-                    finalist.role,
-                    f"{gain.objective} ({format_unit(unit)})",
-                    gain.average,
-                    format_improvement(gain.search_improvement, unit),
-                    gain.description,
-                    f"{gain.t_statistic:.1f}",
-                    f"{test.better_count} of {test.block_count}",
-                    format_improvement(gain.optimism, unit),
-                )
-                known = ["-" if cell in ("nan", "+nan", UNKNOWN) else cell.replace("nan", "?") for cell in cells]
-                styles = ["significant" if at == 4 and test.is_significant else "" for at in range(len(cells))]
-                rows.append(tuple(map(TextCell, known, styles)))
+            rows += [self._build_tested_row(finalist.role, improvement) for improvement in finalist.improvements]
             if finalist.improvements:
                 continue
-            name = finalist.role + " (the start)" * finalist.is_start
-            gains = self.improvements[finalist.evaluation.number].tolist()
-            for (objective, asked), unit, gained in zip(objectives.items(), self.units, gains, strict=True):
-                estimate = asked.fixed_average or self.search.plan.average
-                row = (name, f"{objective} ({format_unit(unit)})", estimate, format_improvement(gained, unit), *"----")
-                rows.append(tuple(map(TextCell, row)))
+            role = finalist.role + " (the start)" * finalist.is_start
+            values = self.improvements[finalist.evaluation.number].tolist()
+            for (name, objective), unit, value in zip(
+                self.search.space.objectives.items(), self.units, values, strict=True
+            ):
+                average = objective.fixed_average or self.search.plan.average
+                cells = (role, f"{name} ({format_unit(unit)})", average, format_improvement(value, unit), *"----")
+                rows.append(tuple(TextCell(cell) for cell in cells))
         return rows
 
-    def _values_table(self) -> PageTable:
+    def _build_tested_row(self, role: str, improvement: HeldOutImprovement) -> tuple[TextCell, ...]:
+        difference, unit = improvement.difference, improvement.difference.quantity.unit
+        cells = (
+            role,
+            f"{improvement.objective} ({format_unit(unit)})",
+            improvement.average,
+            format_improvement(improvement.search_improvement, unit),
+            improvement.description,
+            f"{improvement.t_statistic:.1f}",
+            f"{difference.better_count} of {difference.block_count}",
+            format_improvement(improvement.optimism, unit),
+        )
+        texts = ["-" if cell in ("nan", "+nan", UNKNOWN) else cell.replace("nan", "?") for cell in cells]
+        row = [TextCell(text) for text in texts]
+        if difference.is_significant:
+            row[4] = TextCell(texts[4], "significant")
+        return tuple(row)
+
+    def _build_values_table(self) -> PageTable:
         columns: dict[str, Mapping[str, object]] = {"start": self.search.space.get_start_values()}
         columns |= {finalist.role: finalist.evaluation.values for finalist in self.finalists}
-        names = [variable.name for variable in self.search.space.variables]
-        rows = [
-            (TextCell(name), *(TextCell(_format_value(column.get(name))) for column in columns.values()))
-            for name in names
-        ]
+        rows = []
+        for variable in self.search.space.variables:
+            values = [_format_value(column.get(variable.name)) for column in columns.values()]
+            rows.append(tuple(TextCell(text) for text in (variable.name, *values)))
         return PageTable("Values", ("variable", *columns), rows)
 
-    def _evaluation_rows(self) -> Iterator[Sequence[object]]:
-        """Yield the heading, and a row for each candidate: gains are in the units of the objectives."""
+    def _yield_evaluations(self) -> Iterator[Sequence[object]]:
+        """Yield the headings, and a row for each candidate: improvements are in the units of the objectives."""
         search = self.search
-        names, variables = list(search.space.objectives), [variable.name for variable in search.space.variables]
-        of_objectives = [f"{name}_{what}" for name in names for what in ("value", "gain", "gain_error")]
-        yield [
-            "number",
-            "strategy",
-            "state",
-            *variables,
-            *of_objectives,
-            "self_hit_share",
-            "cost_eur",
-            "seconds",
-            "why",
-        ]
-        for one in search.evaluations:
-            numbers: list[object] = [None] * len(of_objectives)
-            if one.estimate is not None:
-                gains, errors = search.compare_with_start(one)
-                triples = zip(one.estimate.value.tolist(), gains.tolist(), errors.tolist(), strict=True)
-                numbers = [number for triple in list(triples)[: len(names)] for number in triple]
-            missing = "" if one.infeasible_reason else self._describe_shortfalls(one)
-            state = "infeasible" if one.infeasible_reason else "misses bounds" if missing else "complete"
-            values = [one.values.get(name) for name in variables]
-            last = (one.self_hit_share, self._cost(one), round(one.duration_s, 3), one.infeasible_reason or missing)
-            yield [one.number, one.strategy, state, *values, *numbers, *last]
+        variables = [variable.name for variable in search.space.variables]
+        columns: list[str] = []
+        for name in search.space.objectives:
+            columns += [f"{name}_value", f"{name}_improvement", f"{name}_improvement_error"]
+        first, last = ("number", "strategy", "state"), ("self_hit_share", "cost_eur", "duration_s", "reason")
+        yield [*first, *variables, *columns, *last]
+        for evaluation in search.evaluations:
+            numbers: list[object] = [None] * len(columns)
+            if evaluation.estimate is not None:
+                numbers = []
+                improvements, errors = search.compare_with_start(evaluation)
+                for index in range(len(search.space.objectives)):
+                    numbers += [float(evaluation.estimate.value[index]), float(improvements[index]), float(errors[index])]
+            shortfalls = "" if evaluation.infeasible_reason else self._describe_shortfalls(evaluation)
+            state = "infeasible" if evaluation.infeasible_reason else "violates bounds" if shortfalls else "complete"
+            yield [
+                evaluation.number,
+                evaluation.strategy,
+                state,
+                *(evaluation.values.get(name) for name in variables),
+                *numbers,
+                evaluation.self_hit_share,
+                self._compute_cost_eur(evaluation),
+                round(evaluation.duration_s, 3),
+                evaluation.infeasible_reason or shortfalls,
+            ]
 
-    def _pareto_rows(self) -> Iterator[Sequence[object]]:
-        """Yield the heading, and the candidates that no other dominates."""
+    def _yield_front(self) -> Iterator[Sequence[object]]:
+        """Yield the headings, and the candidates that no other dominates."""
         variables = [variable.name for variable in self.search.space.variables]
-        gains = [f"{name}_gain" for name in self.search.space.objectives]
-        yield ["number", "strategy", *gains, "cost_eur", *variables]
-        for at in self.search.find_best():
-            one = self.search.evaluations[at]
-            values = [one.values.get(variable) for variable in variables]
-            yield [one.number, one.strategy, *self.improvements[at].tolist(), self._cost(one), *values]
+        columns = [f"{name}_improvement" for name in self.search.space.objectives]
+        yield ["number", "strategy", *columns, "cost_eur", *variables]
+        for number in self.search.find_best():
+            evaluation = self.search.evaluations[number]
+            values = [evaluation.values.get(variable) for variable in variables]
+            cost_eur = self._compute_cost_eur(evaluation)
+            yield [number, evaluation.strategy, *self.improvements[number].tolist(), cost_eur, *values]
 
-    def _cost(self, one: Evaluation) -> float | None:
+    def _compute_cost_eur(self, evaluation: Evaluation) -> float | None:
         space = self.search.space
-        if not space.prices_eur or one.infeasible_reason:
+        if not space.prices_eur or evaluation.infeasible_reason:
             return None
-        return space.compute_cost_eur(space.start if one.number == 0 else space.build_rig(one.values, str(one.number)))
+        if evaluation.number == 0:
+            return space.compute_cost_eur(space.start)
+        return space.compute_cost_eur(space.build_rig(evaluation.values, str(evaluation.number)))
 
-    def _pictures(self) -> Iterator[tuple[str, str, Figure]]:
+    def _render_plots(self) -> Iterator[tuple[str, str, Figure]]:
         """Yield stem, description and figure: progress, and of several objectives the front."""
         search, names = self.search, list(self.search.space.objectives)
         factors = np.array([get_display_unit(unit).factor for unit in self.units])
-        labels = [f"gain in {name} ({format_unit(unit)})" for name, unit in zip(names, self.units, strict=True)]
-        gains = factors * self.improvements
-        best_so_far = np.maximum.accumulate(np.nan_to_num(gains, nan=-np.inf), axis=0)
-        lines = {
-            label: np.column_stack([np.arange(len(line)), line])
-            for label, line in zip(labels, best_so_far.T, strict=True)
-        }
-        yield "progress", "The best so far over the candidates", plot_progress(lines, title=search.space.name)
+        labels = [f"improvement in {name} ({format_unit(unit)})" for name, unit in zip(names, self.units, strict=True)]
+        improvements = factors * self.improvements
+        best_so_far = np.maximum.accumulate(np.nan_to_num(improvements, nan=-np.inf), axis=0)
+        lines = {}
+        for label, line in zip(labels, best_so_far.T, strict=True):
+            lines[label] = np.column_stack([np.arange(len(line)), line])
+        yield "progress", "Best improvement so far", plot_progress(lines, title=search.space.name)
         if len(names) > 1:
             strategies = np.array([evaluation.strategy for evaluation in search.evaluations])
-            groups = {name: strategies == name for name in (OPTIMIZER, RANDOM)}
-            is_on_front = np.isin(np.arange(len(gains)), search.find_best())
-            every = {name: gains[group] for name, group in groups.items()}
-            fronts = {name: gains[group & is_on_front] for name, group in groups.items()}
-            yield "pareto", "Trade-off of the objectives", plot_fronts(labels, every, fronts, title=search.space.name)
+            is_on_front = np.isin(np.arange(len(improvements)), search.find_best())
+            candidates, fronts = {}, {}
+            for name in (OPTIMIZER, RANDOM):
+                candidates[name] = improvements[strategies == name]
+                fronts[name] = improvements[(strategies == name) & is_on_front]
+            figure = plot_fronts(labels, candidates, fronts, title=search.space.name)
+            yield "pareto", "Trade-off between the objectives", figure
 
 
 def _format_value(value: object) -> str:

@@ -1,4 +1,4 @@
-"""A placement search from its start to the test on held-out worlds, within its budget, with its journal."""
+"""Run of a placement search: budget, journal, and validation of the finalists on held-out scenes."""
 
 import math
 import time
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 
 JOURNAL = "search.journal"
 STUDY = "placement"
-JOURNAL_BYTES_PER_BYTE = 30  # memory of JSON objects that are as small as possible
 
 Clock = Callable[[], float]
 
@@ -37,22 +36,23 @@ def run_search(
     progress: bool = False,
     clock: Clock = time.monotonic,
 ) -> SearchResult:
-    """Spend the budget of a search, then test its finalists on held-out worlds.
+    """Run a search until its budget is spent, then validate its finalists on held-out scenes.
 
     Args:
-        search: A search that has proposed nothing yet.
-        out_dir: Folder of its journal: every evaluation is on the disk before the next one begins.
-        resume: Whether to continue the journal that is there. With a number of evaluations, the result is that of a
-            search without interruption.
+        search: A search without evaluations.
+        out_dir: Folder of the journal, which stores every evaluation before the next one begins; None writes none.
+        resume: Whether to continue an existing journal. With `num_evaluations`, the result equals that of a search
+            without interruption.
         progress: Whether to show a progress bar.
-        clock: Returns seconds.
+        clock: Function that returns seconds.
 
     Raises:
-        ValueError: A budget below two evaluations; a start that cannot be scored; a journal of another search.
-        BadFileError: A damaged journal.
+        ValueError: The budget is below two evaluations, the start cannot be scored, or the journal belongs to another
+            search.
+        BadFileError: The journal is damaged.
     """
     if search.evaluations:
-        raise ValueError("search: one that has proposed nothing yet is needed; make another one")
+        raise ValueError(f"search: got one with {len(search.evaluations)} evaluations; create a new one")
     with nullcontext() if out_dir is None else lock_folder(out_dir):
         try:
             return _run(search, out_dir, resume, progress, clock)
@@ -61,87 +61,86 @@ def run_search(
                 search.frames.close()
 
 
-def _run(search: PlacementSearch, out: Path | None, resume: bool, progress: bool, clock: Clock) -> SearchResult:
-    began_s = clock()
-    frame_s = (len(search.frames), clock() - began_s)
-    journal = None if out is None else SearchJournal(out / JOURNAL, search)
+def _run(search: PlacementSearch, out_dir: Path | None, resume: bool, progress: bool, clock: Clock) -> SearchResult:
+    start_s = clock()
+    num_frames = len(search.frames)  # builds the frames
+    frame_duration_s = (clock() - start_s) / num_frames
+    journal = None if out_dir is None else SearchJournal(out_dir / JOURNAL, search)
     if journal is not None and resume:
         journal.resume()
     earlier_s = sum(evaluation.duration_s for evaluation in search.evaluations[1:])
     if not search.evaluations:
         start = search.ask()
-        assert start is not None  # the first one always is
+        assert start is not None  # the start is always proposed
         search.evaluate(start)
-    budget = _Budget(search, clock, began_s - earlier_s, frame_s[1] / frame_s[0])
+    budget = _Budget(search, clock, start_s - earlier_s, frame_duration_s)
     budget.check()
-    with Progress(budget.expected, search.space.name, num_done=len(search.evaluations), is_shown=progress) as bar:
-        _spend(search, budget, journal, bar.advance)
-    finalists, test, untested = _validate(search, _pick_finalists(search))
-    return SearchResult(search, finalists, test, untested, clock() - began_s + earlier_s)
+    num_done = len(search.evaluations)
+    with Progress(budget.expected_evaluations, search.space.name, num_done=num_done, is_shown=progress) as bar:
+        _evaluate_candidates(search, budget, journal, bar.advance)
+    finalists, test, no_test_reason = _validate_finalists(search, _select_finalists(search))
+    return SearchResult(search, finalists, test, no_test_reason, clock() - start_s + earlier_s)
 
 
 class _Budget:
-    """Time that a search with a scored start may still spend; as much is reserved as the test will take.
+    """Time budget of a search with a scored start, from which the duration of the validation is reserved.
 
     Args:
         search: The search.
-        clock: Returns seconds.
-        began_s: Start of the search by the clock, earlier by the time spent before it was resumed.
-        frame_s: Time that it took to make one frame.
+        clock: Function that returns seconds.
+        start_s: Start of the search by the clock, earlier by the time spent before it was resumed.
+        frame_duration_s: Time to build one frame.
     """
 
-    def __init__(self, search: PlacementSearch, clock: Clock, began_s: float, frame_s: float) -> None:
-        self._search, self._clock, self._began_s = search, clock, began_s
-        plan, objectives = search.plan, len(search.space.objectives)
-        rigs = 3 if objectives == 1 else objectives + 2
-        held_out = (
-            plan.num_held_out_scenes
-            * plan.frames_per_scene
-            * sum(not each.is_repeating for each in search.space.scenarios)
-        )
+    def __init__(self, search: PlacementSearch, clock: Clock, start_s: float, frame_duration_s: float) -> None:
+        self._search, self._clock, self._start_s = search, clock, start_s
+        plan, num_objectives = search.plan, len(search.space.objectives)
+        num_rigs = 3 if num_objectives == 1 else num_objectives + 2
+        num_scenarios = sum(not scenario.is_repeating for scenario in search.space.scenarios)
+        num_frames = plan.num_held_out_scenes * plan.frames_per_scene * num_scenarios
         self.evaluation_s = search.evaluations[0].duration_s
-        rigs_s = rigs * self.evaluation_s
-        self.test_s = held_out * (frame_s + rigs_s / len(search.frames)) + rigs_s
-        self.until_s = math.inf if plan.budget_s is None else began_s + plan.budget_s - self.test_s
+        rigs_s = num_rigs * self.evaluation_s
+        self.validation_s = num_frames * (frame_duration_s + rigs_s / len(search.frames)) + rigs_s
+        self.deadline_s = math.inf if plan.budget_s is None else start_s + plan.budget_s - self.validation_s
 
     @property
-    def expected(self) -> int:
-        """Expected number of evaluations in all."""
+    def expected_evaluations(self) -> int:
+        """Expected total number of evaluations."""
         plan = self._search.plan
         if plan.num_evaluations is not None:
             return plan.num_evaluations + 1
-        left_s = max(self.until_s - self._clock(), 0.0)
+        left_s = max(self.deadline_s - self._clock(), 0.0)
         return len(self._search.evaluations) + int(left_s / max(self.evaluation_s, 1e-9))
 
     def check(self) -> None:
-        """ValueError: there is no time for two candidates, and there was none before."""
-        if len(self._search.evaluations) > 1 or self._clock() + 2 * self.evaluation_s <= self.until_s:
+        """Raise ValueError if there is no time for two candidates in a search without candidates."""
+        if len(self._search.evaluations) > 1 or self._clock() + 2 * self.evaluation_s <= self.deadline_s:
             return
-        spent_s = self._clock() - self._began_s
-        needed_s = spent_s + 2 * self.evaluation_s + self.test_s
+        spent_s = self._clock() - self._start_s
+        needed_s = spent_s + 2 * self.evaluation_s + self.validation_s
         raise ValueError(
-            f"budget: {self._search.plan.budget_s:g} s are less than two evaluations: frames and start took "
-            f"{spent_s:.1f} s, a candidate takes up to {self.evaluation_s:.1f} s, and the test on held-out worlds "
-            f"about {self.test_s:.1f} s; give {math.ceil(needed_s)} s at the very least"
+            f"budget: {self._search.plan.budget_s:g} s is too short for two evaluations: frames and start took "
+            f"{spent_s:.1f} s, a candidate takes up to {self.evaluation_s:.1f} s, and the validation on held-out scenes "
+            f"about {self.validation_s:.1f} s; give at least {math.ceil(needed_s)} s"
         )
 
     def is_left(self) -> bool:
         """Return whether there is time for another candidate."""
-        return self._clock() + self.evaluation_s <= self.until_s
+        return self._clock() + self.evaluation_s <= self.deadline_s
 
 
-def _spend(
+def _evaluate_candidates(
     search: PlacementSearch, budget: _Budget, journal: "SearchJournal | None", advance: Callable[[int, str], Any]
 ) -> None:
-    search.deadline_s = budget.until_s
+    search.deadline_s = budget.deadline_s
     if journal is not None:
         journal.write()
     while budget.is_left() and (candidate := search.ask()) is not None:
         search.evaluate(candidate)
         if journal is not None:
             journal.write()
-        advance(budget.expected, _describe_best(search))
-    if journal is not None:  # the infeasible candidates of the last `ask`
+        advance(budget.expected_evaluations, _describe_best(search))
+    if journal is not None:  # the last `ask` may have recorded infeasible candidates
         journal.write()
 
 
@@ -150,43 +149,45 @@ def _describe_best(search: PlacementSearch) -> str:
     start = search.evaluations[0].estimate
     if best is None or start is None:
         return "no possible rig yet"
-    pairs = zip(start.quantities, search.improvements[best].tolist(), strict=False)  # the objectives come first
-    return "  ".join(f"{quantity.key} {format_improvement(gain, quantity.unit)}" for quantity, gain in pairs)
+    improvements = search.improvements[best].tolist()  # of the objectives, which are the first quantities
+    pairs = zip(start.quantities, improvements, strict=False)
+    return "  ".join(f"{quantity.key} {format_improvement(value, quantity.unit)}" for quantity, value in pairs)
 
 
-def _pick_finalists(search: PlacementSearch) -> list[Finalist]:
-    """Return the rigs to test: the best, of several objectives the ends of the front, and the best random one."""
-    front, several = search.find_best(), len(search.space.objectives) > 1
+def _select_finalists(search: PlacementSearch) -> list[Finalist]:
+    """Select the rigs to validate: of one objective the best and the best random one, of several the front's ends."""
+    front = search.find_best()
+    has_several_objectives = len(search.space.objectives) > 1
     best = search.select_compromise(front)
     if best is None:
         return []
-    roles = {"compromise" if several else "best": best}
-    if several:
+    roles = {"compromise" if has_several_objectives else "best": best}
+    if has_several_objectives:
         columns = zip(search.space.objectives, search.improvements[front].T, strict=True)
         roles |= {name: front[int(np.argmax(column))] for name, column in columns}
     else:
         random = search.select_compromise(search.find_best((START, RANDOM)))
         roles |= {RANDOM: best if random is None else random}
     finalists = []
-    for role, at in roles.items():
-        evaluation, rig = search.evaluations[at], search.space.start
-        if at:
+    for role, number in roles.items():
+        evaluation, rig = search.evaluations[number], search.space.start
+        if number:
             rig = search.space.build_rig(evaluation.values, f"{search.space.name}_{role}")
         finalists.append(Finalist(role, evaluation, rig))
     return finalists
 
 
-def _validate(
+def _validate_finalists(
     search: PlacementSearch, finalists: list[Finalist]
 ) -> tuple[list[Finalist], ValidationResult | None, str]:
-    """Return the finalists with their gains on held-out worlds, the test, and the reason why there is none."""
-    moved = {finalist.role: finalist.rig for finalist in finalists if not finalist.is_start}
-    if not moved:
+    """Return the finalists with their improvements on held-out scenes, the test, and the reason if there is none."""
+    rigs = {finalist.role: finalist.rig for finalist in finalists if not finalist.is_start}
+    if not rigs:
         return finalists, None, ""
     plan = search.plan
     try:
         test = validate(
-            moved, search.space.start, search.frames, test_seed=plan.test_seed, num_scenes=plan.num_held_out_scenes
+            rigs, search.space.start, search.frames, test_seed=plan.test_seed, num_scenes=plan.num_held_out_scenes
         )
     except ValueError as error:
         return finalists, None, str(error)
@@ -195,17 +196,17 @@ def _validate(
 
 
 class SearchJournal:
-    """The evaluations of a search in a file: an Optuna study in a journal of JSON lines, one for each evaluation.
+    """Journal of a search: a file with an Optuna study as JSON lines, one for each evaluation.
 
     Args:
         path: The file, in a folder that no other search writes to.
-        search: The search that it belongs to.
+        search: The search.
     """
 
     def __init__(self, path: Path, search: PlacementSearch) -> None:
         self.path = path
         self._search = search
-        self._written = 0
+        self._num_written = 0
         self._study: Any = None
         settings = search.plan.collect_settings(search.space)
         self._settings = {name: str(value) for name, value in settings.items()}
@@ -214,64 +215,65 @@ class SearchJournal:
         """Load the evaluations of the file, if there is one.
 
         Raises:
-            ValueError: It belongs to another search.
-            BadFileError: It is damaged, or the start has another score today.
+            ValueError: The file belongs to another search.
+            BadFileError: The file is damaged, or the start has a different score now.
         """
         if not self.path.exists():
             return
         search = self._search
         self._study, evaluations, settings = load_study(self.path)
-        if other := describe_differences(self._settings, settings):
+        if differences := describe_differences(self._settings, settings):
             raise ValueError(
-                f"{self.path}: the journal of another search: {other}; resume with the settings of that search, or "
-                "choose another folder"
+                f"{self.path}: the journal belongs to another search: {differences}; resume with the settings of that "
+                "search, or choose another folder"
             )
-        earlier = evaluations[0].estimate
-        today = search.frames.score(search.space.start).estimate
-        if earlier is None or not torch.equal(today.value, earlier.value):
+        stored = evaluations[0].estimate
+        current = search.frames.score(search.space.start).estimate
+        if stored is None or not torch.equal(current.value, stored.value):
             raise BadFileError(
-                f"{self.path}: the start has another score today: the version of a package, or a file that the space "
-                "names, has changed; begin anew, without --resume"
+                f"{self.path}: the start has a different score now, because a package or a file of the space has "
+                "changed; start again without --resume"
             )
         drop_torn_line(self.path)
         search.evaluations[:] = evaluations
-        self._written = len(evaluations)
+        self._num_written = len(evaluations)
 
     def write(self) -> None:
         """Append all evaluations that are not in the file yet."""
         with defer_signals():
             if self._study is None:
                 self.path.unlink(missing_ok=True)
-                self._study = self._create()
-            for evaluation in self._search.evaluations[self._written :]:
-                self._study.add_trial(self._trial(evaluation))
-                self._written += 1
+                self._study = self._create_study()
+            for evaluation in self._search.evaluations[self._num_written :]:
+                self._study.add_trial(self._create_trial(evaluation))
+                self._num_written += 1
 
-    def _create(self) -> Any:  # noqa: ANN401  (a study of Optuna)
+    def _create_study(self) -> Any:  # noqa: ANN401  (a study of Optuna)
         optuna = import_optuna()
         directions = ["maximize"] * len(self._search.space.objectives)
-        make = optuna.create_study
-        study = run_quietly(optuna, lambda: make(storage=_storage(self.path), study_name=STUDY, directions=directions))
+        storage = _open_storage(self.path)
+        study = run_quietly(optuna, optuna.create_study, storage=storage, study_name=STUDY, directions=directions)
         study.set_user_attr("settings", self._settings)
         return study
 
-    def _trial(self, evaluation: Evaluation) -> "FrozenTrial":
-        optuna, spans = import_optuna(), build_distributions(self._search.space)
-        values = dict(evaluation.values)
-        gains = self._search.improvements[evaluation.number].tolist()
+    def _create_trial(self, evaluation: Evaluation) -> "FrozenTrial":
+        optuna, distributions = import_optuna(), build_distributions(self._search.space)
+        improvements = self._search.improvements[evaluation.number].tolist()
         state = optuna.trial.TrialState.COMPLETE
-        if math.isnan(gains[0]):
-            state, gains = optuna.trial.TrialState.FAIL, None
-        known = {name: spans[name] for name in values}
-        attributes = {"evaluation": evaluation.to_record()}
+        if math.isnan(improvements[0]):
+            state, improvements = optuna.trial.TrialState.FAIL, None
         trial: FrozenTrial = optuna.create_trial(
-            params=values, distributions=known, values=gains, state=state, user_attrs=attributes
+            params=dict(evaluation.values),
+            distributions={name: distributions[name] for name in evaluation.values},
+            values=improvements,
+            state=state,
+            user_attrs={"evaluation": evaluation.to_record()},
         )
         return trial
 
 
 class _FolderLock:
-    """A lock that does nothing, since the folder is locked; that of Optuna waits for processes that were killed."""
+    """Lock without effect, since the folder is locked already; that of Optuna waits for processes that were killed."""
 
     def acquire(self) -> bool:
         return True
@@ -280,32 +282,39 @@ class _FolderLock:
         pass
 
 
-def _storage(path: Path) -> Any:  # noqa: ANN401  (a storage of Optuna)
-    journal = import_optuna().storages.journal
-    return import_optuna().storages.JournalStorage(journal.JournalFileBackend(str(path), lock_obj=_FolderLock()))
+def _open_storage(path: Path) -> Any:  # noqa: ANN401  (a storage of Optuna)
+    storages = import_optuna().storages
+    return storages.JournalStorage(storages.journal.JournalFileBackend(str(path), lock_obj=_FolderLock()))
 
 
 def drop_torn_line(path: Path) -> None:
-    """Replace a journal by one without a last line that has no line break, whose process was killed.
+    """Remove an incomplete last line, which a process was writing when it was killed.
+
+    Args:
+        path: The journal.
 
     Raises:
         ValueError: The path is a symbolic link.
     """
     data = path.read_bytes()
-    write_atomically(path, lambda new: new.write_bytes(data[: data.rfind(b"\n") + 1]))
+    write_atomically(path, lambda file: file.write_bytes(data[: data.rfind(b"\n") + 1]))
 
 
 @guard_reader("the journal of a placement search")
 def load_study(path: Path) -> tuple[Any, list[Evaluation], dict[str, str]]:
-    """Return the study in a journal, its evaluations and its settings. Only JSON is read; no code is executed."""
-    check_memory(JOURNAL_BYTES_PER_BYTE * path.stat().st_size)
+    """Load the study of a journal, its evaluations and its settings. Only JSON is read; no code is executed.
+
+    Args:
+        path: The journal.
+    """
+    check_memory(30 * path.stat().st_size)  # the smallest JSON objects take 30 bytes of memory per byte
     optuna = import_optuna()
-    study = run_quietly(optuna, lambda: optuna.load_study(storage=_storage(path), study_name=STUDY))
+    study = run_quietly(optuna, optuna.load_study, storage=_open_storage(path), study_name=STUDY)
     settings = study.user_attrs["settings"]
     records = [trial.user_attrs["evaluation"] for trial in study.trials]
     evaluations = [Evaluation.from_record(record) for record in records]
     if not evaluations or [evaluation.number for evaluation in evaluations] != list(range(len(evaluations))):
-        raise ValueError("its evaluations are not numbered from 0 on")
+        raise ValueError("the evaluations are not numbered from 0")
     if not all(isinstance(value, str) for value in settings.values()):
-        raise ValueError("its settings are not texts")
+        raise ValueError("a setting is not a string")
     return study, evaluations, settings

@@ -1,4 +1,4 @@
-"""Placement search with Optuna: candidates are proposed, scored on common frames, and compared with the start."""
+"""Placement search with Optuna that proposes candidates, scores them on common frames, and compares them with the start."""
 
 import math
 import time
@@ -28,18 +28,18 @@ ROUNDING = 1e-9  # relative; smaller shortfalls are rounding errors
 
 @dataclass(frozen=True, eq=False)
 class Evaluation:
-    """A candidate and its scores.
+    """Candidate with its scores.
 
     Args:
-        number: Its position in the search; 0 is the start.
+        number: Position in the search; 0 is the start.
         strategy: "start", "optimizer" or "random".
         values: Values of the variables.
-        rig: The rig, until it is scored.
-        estimate: The numbers of the space on all frames; None if it was not scored.
-        self_hit_share: Share of its rays that end on the vehicle.
+        rig: The rig; None once it is scored.
+        estimate: Numbers of the space over all frames; None without a score.
+        self_hit_share: Share of rays that hit the vehicle.
         infeasible_reason: Reason why the rig is impossible; empty if it is possible.
-        shortfalls: Requirement of targets or encounters -> relative shortfall, of those that are not met.
-        duration_s: Time that the evaluation took.
+        shortfalls: Requirement of targets or encounters that is not met -> relative shortfall.
+        duration_s: Duration of the evaluation in seconds.
     """
 
     number: int
@@ -59,39 +59,53 @@ class Evaluation:
 
     def to_record(self) -> dict[str, Any]:
         """Return everything but the rig, for JSON."""
-        names = ("number", "strategy", "values", "self_hit_share", "infeasible", "shortfalls", "seconds")
-        record: dict[str, Any] = {name: getattr(self, name) for name in names}
+        record: dict[str, Any] = {
+            "number": self.number,
+            "strategy": self.strategy,
+            "values": self.values,
+            "self_hit_share": self.self_hit_share,
+            "infeasible_reason": self.infeasible_reason,
+            "shortfalls": self.shortfalls,
+            "duration_s": self.duration_s,
+        }
         if self.estimate is not None:
             tensors = self.estimate.value, self.estimate.jackknife_values, self.estimate.frame_counts
-            record["estimate"] = [[*map(list, self.estimate.quantities)], *(tensor.tolist() for tensor in tensors)]
+            quantities = [list(quantity) for quantity in self.estimate.quantities]
+            record["estimate"] = [quantities, *(tensor.tolist() for tensor in tensors)]
         return record
 
     @classmethod
     def from_record(cls, record: Mapping[str, Any]) -> Self:
-        """Return the evaluation that `record` described."""
-        given = dict(record)
-        if (parts := given.pop("estimate", None)) is not None:
+        """Build an evaluation from its record.
+
+        Args:
+            record: Result of `to_record`.
+        """
+        fields = dict(record)
+        parts = fields.pop("estimate", None)
+        if parts is not None:
             quantities, value, left_out, steps = parts
-            tensors = [torch.tensor(numbers, dtype=torch.float64, device="cpu") for numbers in (value, left_out)]
-            left_out = tensors[1].view(-1, len(value))
-            estimate = Estimate(
-                tuple(Quantity(*each) for each in quantities), tensors[0], left_out, torch.tensor(steps, device="cpu")
+            fields["estimate"] = Estimate(
+                tuple(Quantity(*quantity) for quantity in quantities),
+                torch.tensor(value, dtype=torch.float64, device="cpu"),
+                torch.tensor(left_out, dtype=torch.float64, device="cpu").view(-1, len(value)),
+                torch.tensor(steps, device="cpu"),
             )
-            given["estimate"] = estimate
-        return cls(**given)
+        return cls(**fields)
 
 
 class PlacementSearch:
-    """Looks for a better rig in a space by Bayesian optimization.
+    """Bayesian optimization of a rig in a search space.
 
-    Evaluation 0 is the start. Proposals depend on the space, the seed and the scores so far, and on nothing else.
+    Evaluation 0 is the start. Proposals depend only on the space, the seed and the previous scores.
 
     Args:
         space: Free variables, constraints and objectives.
-        plan: Budget, worlds and seeds; or, instead of it, its arguments by name.
+        plan: Budget, scenes and seeds; None takes the arguments of `SearchPlan` from `settings`.
+        **settings: Arguments of `SearchPlan`.
 
     Raises:
-        ValueError: Values of the plan that are out of range.
+        ValueError: A value of the plan is out of range.
         ImportError: Optuna is not installed.
 
     Example:
@@ -102,7 +116,7 @@ class PlacementSearch:
         ...     free={"roof": {"pitch_deg": (-10.0, 15.0)}},
         ...     objectives={"near": {"band": "ground", "region": "20m"}},
         ... )
-        >>> search = PlacementSearch(space, evaluations=2, per_world=1, rays=1024)
+        >>> search = PlacementSearch(space, num_evaluations=2, frames_per_scene=1, num_rays=1024)
         >>> while (candidate := search.ask()) is not None:
         ...     search.tell(candidate, search.frames.score(candidate.rig))
         >>> [evaluation.strategy for evaluation in search.evaluations]
@@ -123,10 +137,10 @@ class PlacementSearch:
         return self.plan.make_frames(self.space, self.plan, self.plan.seed, self.plan.num_scenes)
 
     def ask(self) -> Evaluation | None:
-        """Return the next possible rig; impossible ones before it are recorded as infeasible.
+        """Propose the next possible rig; impossible ones before it are recorded as infeasible.
 
         Returns:
-            A candidate; None when the budget is spent, or no combination of choices is left.
+            A candidate; None when the budget is spent or no combination of choices is left.
         """
         if not self.evaluations:
             if self.plan.budget_s is not None:
@@ -149,22 +163,22 @@ class PlacementSearch:
         return None
 
     def tell(self, candidate: Evaluation, score: Score, *, duration_s: float = 0.0) -> None:
-        """Record the score of a candidate; with too many rays on the vehicle, it is infeasible.
+        """Record the score of a candidate; too many self hits make it infeasible.
 
         Args:
-            candidate: The last that `ask` returned, with its shortfalls.
-            score: From `frames.score`.
-            duration_s: Time that it took.
+            candidate: The last result of `ask`, with its shortfalls.
+            score: Result of `frames.score`.
+            duration_s: Duration of the evaluation in seconds.
 
         Raises:
-            ValueError: Another candidate; of the start, an unknown objective.
+            ValueError: It is another candidate, or an objective of the start is unknown.
         """
         self._check_turn(candidate)
         estimate, limit = score.estimate, self.space.constraints.max_self_hit_share
         reasons = [] if candidate.number else list(self.space.find_violations(self.space.start))
         if limit is not None and score.self_hit_share > limit:
             reasons.append(
-                f"{score.self_hit_share:.1%} of its rays end on the vehicle; max_self_hit_share is {limit:.1%}"
+                f"{score.self_hit_share:.1%} of its rays hit the vehicle; max_self_hit_share is {limit:.1%}"
             )
         if candidate.number == 0:
             self._check_start(estimate)
@@ -176,8 +190,13 @@ class PlacementSearch:
     def reject(self, candidate: Evaluation, reason: str, *, duration_s: float = 0.0) -> None:
         """Record that a candidate is impossible.
 
+        Args:
+            candidate: The last result of `ask`.
+            reason: Reason in words.
+            duration_s: Duration of the evaluation in seconds.
+
         Raises:
-            ValueError: Another than the last that `ask` returned, or it is the start.
+            ValueError: It is another candidate, or the start.
         """
         self._check_turn(candidate)
         if candidate.number == 0:
@@ -185,90 +204,124 @@ class PlacementSearch:
         self.evaluations.append(replace(candidate, rig=None, infeasible_reason=reason, duration_s=duration_s))
 
     def evaluate(self, candidate: Evaluation) -> None:
-        """Score a candidate on all frames, check the requirements of targets and encounters, and record both."""
-        assert candidate.rig is not None  # until it is scored
-        began_s = time.perf_counter()
+        """Score a candidate on all frames, check the requirements of targets and encounters, and record both.
+
+        Args:
+            candidate: The last result of `ask`.
+        """
+        assert candidate.rig is not None  # a candidate without a score has its rig
+        start_s = time.perf_counter()
         try:
             score = self.frames.score(candidate.rig)
         except ValueError as error:
-            self.reject(candidate, str(error), duration_s=time.perf_counter() - began_s)
+            self.reject(candidate, str(error), duration_s=time.perf_counter() - start_s)
             return
         checked = replace(candidate, shortfalls=self._check_requirements(candidate.rig))
-        self.tell(checked, score, duration_s=time.perf_counter() - began_s)
+        self.tell(checked, score, duration_s=time.perf_counter() - start_s)
 
     @property
     def improvements(self) -> Float64:
         """(evaluations, objectives) improvement over the start, in units of the objectives.
 
-        All of a row are NaN if the rig is infeasible or one of its objectives is unknown.
+        A row is NaN if the rig is infeasible or one of its objectives is unknown.
         """
-        count = len(self.space.objectives)
-        rows = [
-            self.compare_with_start(each)[0][:count] if each.is_valid else np.full(count, np.nan)
-            for each in self.evaluations
-        ]
-        gains = np.array(rows).reshape(-1, count)
-        return np.where(np.isnan(gains).any(axis=1, keepdims=True), np.nan, gains)
+        improvements = np.full((len(self.evaluations), len(self.space.objectives)), np.nan)
+        for row, evaluation in zip(improvements, self.evaluations, strict=True):
+            if evaluation.is_valid:
+                row[:] = self.compare_with_start(evaluation)[0][: len(row)]
+        return np.where(np.isnan(improvements).any(axis=1, keepdims=True), np.nan, improvements)
 
     def compare_with_start(self, evaluation: Evaluation) -> tuple[Float64, Float64]:
-        """Return (numbers,) improvements of a scored candidate over the start, and their standard errors."""
+        """Compute the improvements of a scored candidate over the start.
+
+        Args:
+            evaluation: The candidate.
+
+        Returns:
+            (numbers,) improvements and (numbers,) standard errors.
+        """
         start = self.evaluations[0].estimate
         assert evaluation.estimate is not None
         assert start is not None
         return compute_improvements(evaluation.estimate, start)
 
     def find_shortfalls(self, evaluation: Evaluation) -> dict[str, float]:
-        """Return what a candidate misses of what must be kept, by name, relative to it."""
-        margins = self._margins(evaluation)
-        return {name: margin for name, margin in margins.items() if margin > ROUNDING} | dict(evaluation.shortfalls)
+        """Compute the relative shortfalls of a candidate below its bounds.
+
+        Args:
+            evaluation: The candidate.
+
+        Returns:
+            Name of a bounded number or requirement -> shortfall, only where there is one.
+        """
+        shortfalls = self._compute_shortfalls(evaluation)
+        return {name: value for name, value in shortfalls.items() if value > ROUNDING} | dict(evaluation.shortfalls)
 
     def find_best(self, strategies: tuple[str, ...] = (START, OPTIMIZER, RANDOM)) -> list[int]:
-        """Return numbers of the candidates that no other dominates, among those with the least total shortfall.
+        """Find the candidates that no other dominates, among those with the smallest total shortfall.
 
-        With one objective they are the best and its equals; with several the Pareto front.
+        Args:
+            strategies: Strategies whose candidates are compared.
+
+        Returns:
+            Numbers of the candidates: with one objective the best and its equals, with several the Pareto front.
         """
         is_known = ~np.isnan(self.improvements[:, 0])
-        valid = [at for at, each in enumerate(self.evaluations) if is_known[at] and each.strategy in strategies]
-        missing = [sum(self.find_shortfalls(self.evaluations[at]).values()) for at in valid]
-        valid = [at for at, miss in zip(valid, missing, strict=True) if miss <= min(missing) + ROUNDING]
-        front = find_non_dominated(self.improvements[valid]).tolist()
-        return [at for at, is_on_front in zip(valid, front, strict=True) if is_on_front]
+        valid = []
+        for number, evaluation in enumerate(self.evaluations):
+            if is_known[number] and evaluation.strategy in strategies:
+                valid.append(number)
+        totals = [sum(self.find_shortfalls(self.evaluations[number]).values()) for number in valid]
+        valid = [number for number, total in zip(valid, totals, strict=True) if total <= min(totals) + ROUNDING]
+        is_on_front = find_non_dominated(self.improvements[valid])
+        return [valid[index] for index in np.flatnonzero(is_on_front)]
 
     def select_compromise(self, front: list[int]) -> int | None:
-        """Return the candidate of a front whose worst objective is best, each relative to the front's span."""
-        moved = [at for at in front if at] or front if len(self.space.objectives) > 1 else front
-        if not moved:
+        """Select the candidate of a front whose worst objective is best, each relative to the range of the front.
+
+        Args:
+            front: Numbers of candidates.
+
+        Returns:
+            Number of the candidate; None if the front is empty.
+        """
+        candidates = front
+        if len(self.space.objectives) > 1:  # the start is no compromise if there is another candidate
+            candidates = [number for number in front if number] or front
+        if not candidates:
             return None
-        gains = self.improvements[front]
-        low, span = gains.min(axis=0), np.ptp(gains, axis=0)
-        scaled = (self.improvements[moved] - low) / np.where(span > 0, span, 1.0)
-        return moved[int(np.argmax(scaled.min(axis=1) + 0.05 * scaled.mean(axis=1)))]
+        improvements = self.improvements[front]
+        low, span = improvements.min(axis=0), np.ptp(improvements, axis=0)
+        scaled = (self.improvements[candidates] - low) / np.where(span > 0, span, 1.0)
+        # The mean decides between candidates with the same worst objective.
+        return candidates[int(np.argmax(scaled.min(axis=1) + 0.05 * scaled.mean(axis=1)))]
 
-    def _margins(self, evaluation: Evaluation) -> dict[str, float]:
-        """Return for each number with a bound how far the candidate is on its wrong side, relative to the bound.
+    def _compute_shortfalls(self, evaluation: Evaluation) -> dict[str, float]:
+        """Compute for each bounded number the shortfall relative to its bound; negative if the bound is met.
 
-        Bounds are those of the requirements, and values of the start that must not become worse. Unknown counts as 1.
+        Bounds are those of the requirements, and values of the start that must not become worse. An unknown number
+        has the shortfall 1.
         """
         start = self.evaluations[0].estimate
         if evaluation.estimate is None or start is None:
             return {}
-        margins: dict[str, float] = {}
-        for at, quantity in enumerate(start.quantities):
+        shortfalls: dict[str, float] = {}
+        for index, quantity in enumerate(start.quantities):
             if quantity.key in self.space.objectives:
                 continue
-            bound = self.space.bounds.get(quantity.key, float(start.value[at]))
-            margin = -quantity.compute_improvement(float(evaluation.estimate.value[at]) - bound) / max(
-                abs(bound), ROUNDING
-            )
-            margins[quantity.key] = 1.0 if math.isnan(margin) else margin
-        return margins
+            bound = self.space.bounds.get(quantity.key, float(start.value[index]))
+            margin = quantity.compute_improvement(float(evaluation.estimate.value[index]) - bound)
+            shortfall = -margin / max(abs(bound), ROUNDING)
+            shortfalls[quantity.key] = 1.0 if math.isnan(shortfall) else shortfall
+        return shortfalls
 
     def _check_requirements(self, rig: Rig) -> dict[str, float]:
         """Return shortfalls of targets and encounters: mean of the failed share and of the worst relative margin."""
-        shortfalls, required = dict[str, float](), self.space.non_region_requirements
-        if required is None:
+        shortfalls: dict[str, float] = {}
+        requirements = self.space.non_region_requirements
+        if requirements is None:
             return shortfalls
-        for verdict in check_requirements(rig, required, self.space.scenarios[0], self.plan.sensor_model):
+        for verdict in check_requirements(rig, requirements, self.space.scenarios[0], self.plan.sensor_model):
             if verdict.state == "kept":
                 continue
             margin = -verdict.margin / (abs(verdict.bound.value) or 1.0)
@@ -278,76 +331,72 @@ class PlacementSearch:
         return shortfalls
 
     def _propose(self, number: int) -> tuple[str, dict[str, VariableValue] | None]:
-        """Return the strategy and the values of a candidate, which was not proposed before; None if none is left."""
+        """Propose the strategy and new values of a candidate; the values are None if none are left."""
         seed = int(np.random.SeedSequence([self.plan.seed, number]).generate_state(1)[0])
-        trials, params = self._trials(), self.plan.optimizer_params
-        if number <= params.num_startup_candidates or number % params.random_interval == 0 or not trials:
-            strategy, values = RANDOM, self._random_values(seed, number)
+        observations, params = self._collect_observations(), self.plan.optimizer_params
+        if number <= params.num_startup_candidates or number % params.random_interval == 0 or not observations:
+            strategy, values = RANDOM, self._sample_values(seed, number)
         else:
-            strategy, values = OPTIMIZER, self._round(propose_by_model(self.space, trials, seed))
-        known = [evaluation.values for evaluation in self.evaluations]
-        if values not in known:
+            proposed = propose_by_model(self.space, observations, seed)
+            values = {variable.name: variable.round_value(proposed[variable.name]) for variable in self.space.variables}
+            strategy = OPTIMIZER
+        evaluated = [evaluation.values for evaluation in self.evaluations]
+        if values not in evaluated:
             return strategy, values
         options = [variable.options for variable in self.space.variables if isinstance(variable, FreeChoice)]
-        count = math.prod(map(len, options))
-        if len(options) < len(self.space.variables) or count > params.max_combinations:
-            return RANDOM, self._random_values(seed + 1, number)
+        combination_count = math.prod(map(len, options))
+        if len(options) < len(self.space.variables) or combination_count > params.max_combinations:
+            return RANDOM, self._sample_values(seed + 1, number)
         names = [variable.name for variable in self.space.variables]
-        unknown = [
-            each for each in (dict(zip(names, one, strict=True)) for one in product(*options)) if each not in known
-        ]
-        return strategy, unknown[seed % len(unknown)] if unknown else None
+        combinations = [dict(zip(names, combination, strict=True)) for combination in product(*options)]
+        remaining = [combination for combination in combinations if combination not in evaluated]
+        return strategy, remaining[seed % len(remaining)] if remaining else None
 
-    def _random_values(self, seed: int, number: int) -> dict[str, VariableValue]:
-        """Return uniformly distributed values; those of the startup are a Latin hypercube, which covers all options."""
-        variables, startup = self.space.variables, self.plan.optimizer_params.num_startup_candidates
-        shares = np.random.default_rng(seed).random(len(variables))
-        if number <= startup:
-            order = np.random.default_rng(self.plan.seed)
-            strata = np.array([order.permutation(startup)[number - 1] for _ in variables])
-            shares = (strata + shares) / startup
-        return {
-            variable.name: variable.get_value(share) for variable, share in zip(variables, shares.tolist(), strict=True)
-        }
+    def _sample_values(self, seed: int, number: int) -> dict[str, VariableValue]:
+        """Sample uniform values; those of the startup form a Latin hypercube, which contains all options."""
+        variables, startup_count = self.space.variables, self.plan.optimizer_params.num_startup_candidates
+        fractions = np.random.default_rng(seed).random(len(variables))
+        if number <= startup_count:
+            generator = np.random.default_rng(self.plan.seed)
+            strata = np.array([generator.permutation(startup_count)[number - 1] for _ in variables])
+            fractions = (strata + fractions) / startup_count
+        pairs = zip(variables, fractions.tolist(), strict=True)
+        return {variable.name: variable.get_value(fraction) for variable, fraction in pairs}
 
-    def _round(self, values: Mapping[str, VariableValue]) -> dict[str, VariableValue]:
-        return {variable.name: variable.round_value(values[variable.name]) for variable in self.space.variables}
+    def _collect_observations(self) -> list[tuple[dict[str, VariableValue], list[float], dict[str, float]]]:
+        """Return values, improvements and constraints of all candidates, for the model.
 
-    def _trials(self) -> list[tuple[dict[str, VariableValue], list[float], dict[str, float]]]:
-        """Return values, gains and constraints of all candidates, for the model.
-
-        An infeasible rig counts as the worst that was scored. A constraint is met if it is not above 0; before any
-        rig meets all, the model learns the total shortfall alone.
+        An infeasible rig gets the worst improvement of all rigs. A constraint is met if it is at most 0. As long as no
+        rig meets all constraints, the model learns only the total shortfall.
         """
-        gains = self.improvements
-        if np.isnan(gains).all():
+        improvements = self.improvements
+        if np.isnan(improvements).all():
             return []
-        worst = np.nanmin(gains, axis=0)
-        constraints = [self._constraints(evaluation) for evaluation in self.evaluations]
-        largest = {name: max(each.get(name, 0.0) for each in constraints) for each in constraints for name in each}
-        complete = [
-            evaluation for evaluation in self.evaluations if len(evaluation.values) == len(self.space.variables)
-        ]
-        trials = [
-            (
-                each.values,
-                np.where(np.isnan(gains[each.number]), worst, gains[each.number]).tolist(),
-                constraints[each.number] or {name: max(value, 1.0) for name, value in largest.items()},
-            )
-            for each in complete
-        ]
-        missing = [sum(max(value, 0.0) for value in limits.values()) for _, _, limits in trials]
-        if min(missing, default=0.0) > 0:
-            return [(values, [-miss], {}) for (values, _, _), miss in zip(trials, missing, strict=True)]
-        return trials
+        worst = np.nanmin(improvements, axis=0)
+        constraints = [self._get_constraints(evaluation) for evaluation in self.evaluations]
+        infeasible: dict[str, float] = {}  # largest constraint of any rig, at least 1
+        for values_by_name in constraints:
+            for name, value in values_by_name.items():
+                infeasible[name] = max(infeasible.get(name, 1.0), value)
+        observations = []
+        for evaluation in self.evaluations:
+            if len(evaluation.values) < len(self.space.variables):
+                continue  # the start may lie outside the space
+            row = improvements[evaluation.number]
+            targets = np.where(np.isnan(row), worst, row).tolist()
+            observations.append((evaluation.values, targets, constraints[evaluation.number] or dict(infeasible)))
+        totals = [sum(max(value, 0.0) for value in limits.values()) for _, _, limits in observations]
+        if min(totals, default=0.0) > 0:
+            return [(values, [-total], {}) for (values, _, _), total in zip(observations, totals, strict=True)]
+        return observations
 
-    def _constraints(self, evaluation: Evaluation) -> dict[str, float]:
+    def _get_constraints(self, evaluation: Evaluation) -> dict[str, float]:
         if not evaluation.is_valid:
             return {}
-        of_bodies = (
-            {} if self.space.non_region_requirements is None else {"requirements": sum(evaluation.shortfalls.values())}
-        )
-        return self._margins(evaluation) | of_bodies
+        constraints = self._compute_shortfalls(evaluation)
+        if self.space.non_region_requirements is not None:
+            constraints["requirements"] = sum(evaluation.shortfalls.values())
+        return constraints
 
     def _is_budget_left(self) -> bool:
         if self._is_exhausted or time.monotonic() > self.deadline_s:
@@ -356,31 +405,43 @@ class PlacementSearch:
 
     def _check_turn(self, candidate: Evaluation) -> None:
         if candidate.number != len(self.evaluations):
-            raise ValueError(f"candidate {len(self.evaluations)} is to be told next; got candidate {candidate.number}")
+            raise ValueError(f"candidate: got number {candidate.number}; give the last of `ask`, {len(self.evaluations)}")
 
     def _check_start(self, estimate: Estimate) -> None:
         for name, value in zip(self.space.scored_objectives, estimate.value.tolist(), strict=True):
             if not math.isnan(value):
                 continue
             objective = self.space.scored_objectives[name]
-            why = "one of its regions and bands is never visible; take larger ones, more worlds or more rays"
+            reason = "a region and band is never visible; use larger regions, more scenes or more rays"
             if objective.requirement:
-                why = "there is no room for the target anywhere; take another place"
-            raise ValueError(f"objectives.{name}: unknown in all {len(self.frames)} frames: {why}")
+                reason = "no position is free for the target; use other positions"
+            raise ValueError(f"objectives.{name}: unknown in all {len(self.frames)} frames: {reason}")
 
 
 def compute_improvements(estimate: Estimate, baseline: Estimate) -> tuple[Float64, Float64]:
-    """Return (numbers,) paired improvements of one rig over another on the same frames, and their standard errors.
+    """Compute the paired improvements of one rig over another on the same frames.
 
-    In units of the numbers; more is better. NaN where one is unknown; errors need three worlds.
+    Args:
+        estimate: Numbers of the rig.
+        baseline: Numbers of the other rig.
+
+    Returns:
+        (numbers,) improvements, positive if better, in units of the numbers, NaN where one is unknown; and (numbers,)
+        standard errors, NaN with fewer than three scenes.
     """
-    between = estimate.subtract(baseline)
-    sign = [quantity.compute_improvement(1.0) for quantity in between.quantities]
-    return between.value.numpy() * sign, between.compute_errors(3).numpy()
+    difference = estimate.subtract(baseline)
+    signs = [quantity.compute_improvement(1.0) for quantity in difference.quantities]
+    return difference.value.numpy() * signs, difference.compute_errors(3).numpy()
 
 
 def find_non_dominated(values: Float64) -> Bools:
-    """Return which of (candidates, objectives) no other equals everywhere and exceeds somewhere. Higher is better.
+    """Find the candidates that no other equals or exceeds everywhere and exceeds somewhere.
+
+    Args:
+        values: (candidates, objectives); higher is better.
+
+    Returns:
+        (candidates,) bool.
 
     Example:
         >>> find_non_dominated(np.array([[1.0, 2.0], [2.0, 1.0], [1.0, 1.0]])).tolist()

@@ -1,8 +1,9 @@
-"""Validation of the finalists of a search: paired with the start on held-out worlds, in numbers and words."""
+"""Validation of the finalists of a search: paired with the start on held-out scenes, in numbers and sentences."""
 
 import math
 from collections.abc import Mapping, Sequence
 from contextlib import closing
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,29 +16,34 @@ from torchcover.estimation.errors import ROUND_OFF
 from torchcover.evaluation.target_survey import build_flat_ground
 from torchcover.placement.common_frames import CommonFrames
 from torchcover.placement.host_vehicle import NOT_WORSE
-from torchcover.placement.objective import THRESHOLD_M, Objective
+from torchcover.placement.objective import DEFAULT_THRESHOLD_M, Objective
 from torchcover.report import PageTable, TextCell
 from torchcover.report.wording import format_difference, get_display_unit
 from torchcover.simulation import RegionsOfInterest, Rig, set_ego
 from torchcover.targets import TARGETS, Raster, Target, survey
 
-# Changes that a sentence names.
-MOST_TOLD = 4
-# Of targets around the vehicle, and how far apart they are put: some hundred places tell two rigs apart.
-WITHIN_M, STEP_M = 3.0, 0.4
-# Usual regions have the same names around any vehicle.
-ANY_OUTLINE_M = np.array([[-2.0, -1.0], [2.0, -1.0], [2.0, 1.0], [-2.0, 1.0]])
-CHANGE_HEADINGS = ("what", "gain on\nheld-out worlds", "unit", "p (Holm)", "share of\nthe gain")
+
+@dataclass(frozen=True)
+class TargetRasterParams:
+    """Positions of test targets around the vehicle at which two rigs are compared.
+
+    Args:
+        max_distance_m: Maximum distance of a position from the vehicle in meters.
+        spacing_m: Distance between two positions; a few hundred positions distinguish two rigs.
+    """
+
+    max_distance_m: float = 3.0
+    spacing_m: float = 0.4
 
 
 class HeldOutImprovement(NamedTuple):
     """Improvement of a finalist over the start in one objective.
 
     Args:
-        objective: Its name.
-        average: Average of the number, "area" or "cells"; "-" where the number has no such choice.
-        difference: Paired difference on held-out worlds.
-        search_improvement: The same difference on the frames of the search.
+        objective: Name of the objective.
+        average: Average of the number, "area" or "cells"; "-" if the number has only one.
+        difference: Paired difference on held-out scenes.
+        search_improvement: The improvement on the frames of the search.
     """
 
     objective: str
@@ -47,46 +53,44 @@ class HeldOutImprovement(NamedTuple):
 
     @property
     def description(self) -> str:
-        """The improvement on held-out worlds with its interval, without its unit: shares in percentage points."""
+        """The improvement on held-out scenes with its interval, without its unit: shares in percentage points."""
         return format_signed_difference(self.difference)
 
     @property
     def optimism(self) -> float:
-        """How much larger the improvement was in the search."""
+        """Improvement in the search minus improvement on held-out scenes."""
         return self.search_improvement - self.difference.improvement
 
     @property
     def t_statistic(self) -> float:
-        """Gain over error; NaN if the error is unknown, or 0."""
+        """Improvement over its standard error; NaN if the error is unknown or 0."""
         return self.difference.improvement / self.difference.error if self.difference.error > 0 else math.nan
 
     @property
     def record(self) -> dict[str, Any]:
-        """All of it, for JSON."""
-        test = self.difference
+        """All numbers, for JSON."""
+        difference, quantity = self.difference, self.difference.quantity
         return {
-            "unit": test.quantity.unit,
-            "gain": test.improvement,
-            "error": test.error,
-            "interval": sorted(
-                [test.quantity.compute_improvement(test.low), test.quantity.compute_improvement(test.high)]
-            ),
-            "t": self.t_statistic,
-            "p": test.p_value,
-            "worlds": test.block_count,
-            "better": test.better_count,
+            "unit": quantity.unit,
+            "improvement": difference.improvement,
+            "error": difference.error,
+            "confidence_interval": sorted([quantity.compute_improvement(difference.low), quantity.compute_improvement(difference.high)]),
+            "t_statistic": self.t_statistic,
+            "p_value": difference.p_value,
+            "block_count": difference.block_count,
+            "better_count": difference.better_count,
             "search_improvement": self.search_improvement,
             "optimism": self.optimism,
         }
 
 
 class SideEffect(NamedTuple):
-    """A change of another number on held-out worlds.
+    """Change of a number that was not the objective, on held-out scenes.
 
     Args:
-        name: The number in words.
+        name: Description of the number.
         difference: Paired difference to the start.
-        p_value: Its p value, adjusted for all changes (Holm 1979).
+        p_value: Its p value, adjusted for all side effects (Holm 1979).
         objective_shares: Objective -> share of its improvement, if the number is a part of it.
     """
 
@@ -96,13 +100,18 @@ class SideEffect(NamedTuple):
     objective_shares: Mapping[str, float]
 
     @property
+    def is_significant(self) -> bool:
+        """Whether the change is significant at 5 %."""
+        return self.p_value <= 0.05
+
+    @property
     def is_worse(self) -> bool:
-        """Whether it got worse beyond chance."""
-        return self.p_value <= 0.05 and self.difference.improvement < 0
+        """Whether the number became significantly worse."""
+        return self.is_significant and self.difference.improvement < 0
 
     @property
     def description(self) -> str:
-        """It with its interval and unit."""
+        """Description of the number, its change with the interval, and the unit."""
         unit = self.difference.quantity.unit
         return f"{self.name} {format_signed_difference(self.difference)} {format_unit(unit)}"
 
@@ -120,167 +129,238 @@ class ValidationResult(NamedTuple):
 
     @property
     def summary(self) -> str:
-        """The side effects in words."""
+        """Sentence about significant deteriorations; at most four are listed."""
         worse = [change.description for change in self.side_effects if change.is_worse]
-        told = [*worse[:MOST_TOLD], *([f"{len(worse) - MOST_TOLD} more"] if len(worse) > MOST_TOLD else [])]
-        number = f"of {len(self.side_effects)} numbers around the vehicle"
+        total = f"{len(self.side_effects)} numbers around the vehicle"
         if not worse:
-            return f"None {number} got worse beyond chance"
-        return f"Worse beyond chance, {number}: {'; '.join(told)}"
+            return f"None of {total} became significantly worse"
+        max_listed = 4
+        remaining = [f"{len(worse) - max_listed} more"] if len(worse) > max_listed else []
+        return f"Significantly worse, of {total}: {'; '.join([*worse[:max_listed], *remaining])}"
 
     @property
     def table(self) -> PageTable:
-        """All changes."""
-        rows = [
-            (
+        """Table of all side effects."""
+        headings = ("number", "improvement on\nheld-out scenes", "unit", "p (Holm)", "share of the\nimprovement")
+        rows = []
+        for change in self.side_effects:
+            shares = [f"{name} {share:.0%}" for name, share in change.objective_shares.items()]
+            improvement = format_signed_difference(change.difference)
+            cells = (
                 TextCell(change.name),
-                TextCell(format_signed_difference(change.difference), "significant" if change.p_value <= 0.05 else ""),
+                TextCell(improvement, "significant" if change.is_significant else ""),
                 TextCell(format_unit(change.difference.quantity.unit)),
                 TextCell("-" if math.isnan(change.p_value) else f"{change.p_value:.2g}"),
-                TextCell(", ".join(f"{name} {share:.0%}" for name, share in change.objective_shares.items())),
+                TextCell(", ".join(shares)),
             )
-            for change in self.side_effects
-        ]
-        return PageTable("What else changed", CHANGE_HEADINGS, rows, 1)
+            rows.append(cells)
+        return PageTable("Side effects", headings, rows, 1)
 
     @property
     def record(self) -> list[dict[str, Any]]:
-        """The changes, for JSON."""
+        """The side effects, for JSON."""
         return [
             {
-                "what": one.name,
-                "gain": one.difference.improvement,
-                "error": one.difference.error,
-                "p_holm": one.p_value,
-                "shares": one.objective_shares,
+                "name": change.name,
+                "improvement": change.difference.improvement,
+                "error": change.difference.error,
+                "p_value_holm": change.p_value,
+                "objective_shares": change.objective_shares,
             }
-            for one in self.side_effects
+            for change in self.side_effects
         ]
 
 
 def validate(
-    finalists: Mapping[str, Rig], start: Rig, search_frames: CommonFrames, *, test_seed: int, num_scenes: int
+    finalists: Mapping[str, Rig],
+    start: Rig,
+    search_frames: CommonFrames,
+    *,
+    test_seed: int,
+    num_scenes: int,
+    params: TargetRasterParams = TargetRasterParams(),
 ) -> ValidationResult:
-    """Score finalists of a search, by name, on worlds of another seed, frame by frame against the same reference.
+    """Compare finalists with the start on held-out scenes, frame by frame with the same reference points.
 
-    A scenario without traffic is the same world for any seed, and is left out.
+    Scenarios without random traffic are excluded, because they are the same scene for any seed.
 
-    ValueError: the seed of the search; no scenario with traffic; a rig that cannot be mounted in a fresh world.
+    Args:
+        finalists: Rigs by name; side effects are those of the first.
+        start: Rig that they are compared with.
+        search_frames: Frames of the search.
+        test_seed: Seed of the held-out scenes.
+        num_scenes: Number of held-out scenes of each scenario.
+        params: Positions of test targets.
+
+    Raises:
+        ValueError: The seed is that of the search, no scenario has random traffic, or a rig cannot be mounted in a
+            held-out scene.
     """
     first = next(iter(finalists))
-    others, parts = _others(
-        search_frames.objectives, failures=max(len(start.sensors), len(finalists[first].sensors)) > 1
-    )
-    with closing(search_frames.resample(test_seed, num_scenes, others)) as fresh:
-        start_by_test = fresh.score(start).estimate
-        by_test = {
-            name: _differences(fresh.score(winner).estimate, start_by_test, search_frames.objectives)
-            for name, winner in finalists.items()
-        }
-    start_by_search = search_frames.score(start).estimate
-    gains, found = {}, by_test[first]
-    for name, winner in finalists.items():
-        in_search = search_frames.score(winner).estimate.compute_differences(start_by_search)
-        gains[name] = tuple(
+    has_failures = max(len(start.sensors), len(finalists[first].sensors)) > 1
+    extra_objectives, parts = _list_extra_objectives(search_frames.objectives, has_failures=has_failures)
+    with closing(search_frames.resample(test_seed, num_scenes, extra_objectives)) as held_out_frames:
+        start_estimate = held_out_frames.score(start).estimate
+        differences = {}
+        for name, rig in finalists.items():
+            estimate = held_out_frames.score(rig).estimate
+            differences[name] = _compute_differences(estimate, start_estimate, search_frames.objectives)
+    search_start = search_frames.score(start).estimate
+    improvements: dict[str, tuple[HeldOutImprovement, ...]] = {}
+    for name, rig in finalists.items():
+        search_differences = search_frames.score(rig).estimate.compute_differences(search_start)
+        improvements[name] = tuple(
             HeldOutImprovement(
                 objective,
-                asked.fixed_average or search_frames.average,
-                by_test[name][objective],
-                in_search[objective].improvement,
+                definition.fixed_average or search_frames.average,
+                differences[name][objective],
+                search_differences[objective].improvement,
             )
-            for objective, asked in search_frames.objectives.items()
+            for objective, definition in search_frames.objectives.items()
         )
-    tests = {name: test for name, test in found.items() if name in others or name.startswith(NOT_WORSE)}
-    tests |= _of_targets(finalists[first], start, search_frames)
-    shares: dict[str, dict[str, float]] = {name: {} for name in tests}
-    for objective, each in parts.items():
-        whole = sum(found[part].improvement for part in each)
-        for part in each if found[objective].is_significant and whole > 0 else ():  # of no gain there is no share
-            shares[part][objective] = found[part].improvement / whole
-    changes = [
-        SideEffect(name, test, p, shares[name])
-        for (name, test), p in zip(tests.items(), adjust_holm([test.p_value for test in tests.values()]), strict=True)
+    changes = differences[first]
+    changes |= _compare_targets(finalists[first], start, search_frames, params)
+    objective_names = [name for name in search_frames.objectives if not name.startswith(NOT_WORSE)]
+    side_effects = _build_side_effects(changes, objective_names, parts)
+    return ValidationResult(improvements, side_effects)
+
+
+def _build_side_effects(
+    changes: Mapping[str, Difference], objective_names: Sequence[str], parts: Mapping[str, list[str]]
+) -> tuple[SideEffect, ...]:
+    """Adjust the p values of all changes that are no objective, and sort significant deteriorations first."""
+    tested = {name: change for name, change in changes.items() if name not in objective_names}
+    objective_shares: dict[str, dict[str, float]] = {name: {} for name in tested}
+    for objective, part_names in parts.items():
+        total = sum(changes[part].improvement for part in part_names)
+        if not changes[objective].is_significant or not total > 0:
+            continue  # without an improvement there is no share of it
+        for part in part_names:
+            objective_shares[part][objective] = changes[part].improvement / total
+    p_values = adjust_holm([change.p_value for change in tested.values()])
+    side_effects = [
+        SideEffect(name, change, p_value, objective_shares[name])
+        for (name, change), p_value in zip(tested.items(), p_values, strict=True)
     ]
-    changes.sort(key=lambda one: (not one.is_worse, math.isnan(one.p_value), one.p_value, one.difference.improvement))
-    return ValidationResult(gains, tuple(changes))
+
+    def get_rank(side_effect: SideEffect) -> tuple[bool, bool, float, float]:
+        p_value = side_effect.p_value
+        return not side_effect.is_worse, math.isnan(p_value), p_value, side_effect.difference.improvement
+
+    return tuple(sorted(side_effects, key=get_rank))
 
 
-def _differences(one: Estimate, other: Estimate, asked: Mapping[str, Objective]) -> dict[str, Difference]:
-    """Of two rigs. What is required is looked at once and not in worlds, so that chance has no part in it."""
-    found = one.compute_differences(other)
-    for name in (name for name, each in asked.items() if each.requirement):
-        value = found[name].value
-        differs = abs(value) > ROUND_OFF
-        p = 0.0 if differs else 1.0
-        found[name] = found[name]._replace(error=0.0, low=value, high=value, is_significant=differs, p_value=p)
-    return found
+def _compute_differences(
+    estimate: Estimate, baseline: Estimate, objectives: Mapping[str, Objective]
+) -> dict[str, Difference]:
+    """Compute the differences of two rigs; those of requirements do not depend on scenes and have no error."""
+    differences = estimate.compute_differences(baseline)
+    for name, objective in objectives.items():
+        if objective.requirement:
+            value = differences[name].value
+            is_different = abs(value) > ROUND_OFF
+            p_value = 0.0 if is_different else 1.0
+            differences[name] = differences[name]._replace(
+                error=0.0, low=value, high=value, is_significant=is_different, p_value=p_value
+            )
+    return differences
 
 
 def adjust_holm(p_values: Sequence[float]) -> list[float]:
-    """Of each probability, what it is with all others looked at (Holm 1979); what is unknown stays so, and counts not.
+    """Adjust p values for multiple comparisons (Holm 1979).
+
+    Args:
+        p_values: p values; NaN is not counted and stays NaN.
+
+    Returns:
+        Adjusted p values in the same order.
 
     Example:
         >>> adjust_holm([0.02, 0.001, math.nan, 0.9])
         [0.04, 0.003, nan, 0.9]
     """
-    known = sorted((one, at) for at, one in enumerate(p_values) if not math.isnan(one))
-    adjusted, least = [math.nan] * len(p_values), 0.0
-    for rank, (one, at) in enumerate(known):
-        least = adjusted[at] = max(least, min((len(known) - rank) * one, 1.0))
+    ranked = sorted((p_value, index) for index, p_value in enumerate(p_values) if not math.isnan(p_value))
+    adjusted, largest = [math.nan] * len(p_values), 0.0
+    for rank, (p_value, index) in enumerate(ranked):
+        largest = max(largest, min((len(ranked) - rank) * p_value, 1.0))
+        adjusted[index] = largest
     return adjusted
 
 
-def _others(asked: Mapping[str, Objective], *, failures: bool) -> tuple[dict[str, Objective], dict[str, list[str]]]:
-    """Return further numbers to test, by their words, and the names of those that each objective is the mean of."""
-    found, parts = dict[str, Objective](), dict[str, list[str]]()
-    for name, objective in asked.items():
-        if name.startswith(NOT_WORSE) or len(objective.region_bands) < 2:
-            continue
-        each = {one.description: one for one in objective.parts}
-        found, parts[name] = found | each, list(each)
-    own = {region for objective in asked.values() if isinstance(objective.region, dict) for region in objective.region}
-    plain = make_detection_quantity(THRESHOLD_M).key
-    for region in RegionsOfInterest().build_query_plan(ANY_OUTLINE_M).regions:
-        for band in PAPER_HEIGHTS if region.name not in own else ():
-            one = Objective(region=region.name, band=band)
-            found[one.description] = one
-            if failures:
-                found[f"{one.description}, any one sensor failed"] = one.model_copy(
-                    update={"number": f"{plain}_without_any"}
-                )
-    return {name: one for name, one in found.items() if name not in asked}, parts
+def _list_extra_objectives(
+    objectives: Mapping[str, Objective], *, has_failures: bool
+) -> tuple[dict[str, Objective], dict[str, list[str]]]:
+    """List further numbers to test, by description, and the descriptions of the parts of each objective."""
+    extra: dict[str, Objective] = {}
+    parts: dict[str, list[str]] = {}
+    custom_regions: set[str] = set()
+    for name, objective in objectives.items():
+        if isinstance(objective.region, dict):
+            custom_regions |= set(objective.region)
+        if not name.startswith(NOT_WORSE) and len(objective.region_bands) > 1:
+            objective_parts = {part.description: part for part in objective.parts}
+            extra |= objective_parts
+            parts[name] = list(objective_parts)
+    # The names of the default regions do not depend on the outline of the vehicle.
+    outline_m = np.array([[-2.0, -1.0], [2.0, -1.0], [2.0, 1.0], [-2.0, 1.0]])
+    failure_key = f"{make_detection_quantity(DEFAULT_THRESHOLD_M).key}_without_any"
+    for region in RegionsOfInterest().build_query_plan(outline_m).regions:
+        for band in PAPER_HEIGHTS if region.name not in custom_regions else ():
+            objective = Objective(region=region.name, band=band)
+            extra[objective.description] = objective
+            if has_failures:
+                failure = objective.model_copy(update={"number": failure_key})
+                extra[f"{objective.description}, any one sensor failed"] = failure
+    return {name: objective for name, objective in extra.items() if name not in objectives}, parts
 
 
-def _of_targets(rig: Rig, start: Rig, searched: CommonFrames) -> dict[str, Difference]:
-    """Places within a few metres of the vehicle at which targets are seen, on empty ground."""
-    found = {}
+def _compare_targets(
+    rig: Rig, start: Rig, search_frames: CommonFrames, params: TargetRasterParams
+) -> dict[str, Difference]:
+    """Compare the shares of positions near the vehicle at which test targets are detected on flat ground."""
+    differences = {}
     for target in TARGETS:
-        ends = []
-        for one in (rig, start):
-            empty = set_ego(build_flat_ground().model_copy(update={"ego": searched.scenarios[0].ego}), {one.name: one})
-            raster = Raster.around(empty.compute_ego_box(), WITHIN_M, STEP_M)
-            seen = survey(one.apply_sensor_model("ideal"), empty, Target.load(target), raster)
-            there = seen.free & (seen.distance_m <= WITHIN_M)
-            # Every fourth cell along each axis is a block of its own: by them it is known what the raster leaves open.
-            rows, columns = (np.arange(count) % 4 for count in there.shape)
-            of = torch.from_numpy((4 * rows[:, None] + columns)[there])
-            cells = torch.bincount(of, minlength=16)
-            enough = torch.bincount(of, torch.from_numpy(seen.enough[there]).double(), minlength=16)
-            quantity = Quantity(target, f"{target} seen", "share", lower_is_better=False)
-            ends.append(Estimate.from_ratios((quantity,), cells.double(), enough[:, None], cells))
-        found[f"{target} within {WITHIN_M:g} m"] = ends[0].compute_differences(ends[1])[target]
-    return found
+        rig_share, start_share = (
+            _estimate_detected_share(tested_rig, target, search_frames, params) for tested_rig in (rig, start)
+        )
+        differences[f"{target} within {params.max_distance_m:g} m"] = rig_share.compute_differences(start_share)[target]
+    return differences
+
+
+def _estimate_detected_share(rig: Rig, target: str, search_frames: CommonFrames, params: TargetRasterParams) -> Estimate:
+    """Estimate the share of free positions near the vehicle at which a test target is detected."""
+    ground = build_flat_ground().model_copy(update={"ego": search_frames.scenarios[0].ego})
+    scenario = set_ego(ground, {rig.name: rig})
+    raster = Raster.around(scenario.compute_ego_box(), params.max_distance_m, params.spacing_m)
+    result = survey(rig.apply_sensor_model("ideal"), scenario, Target.load(target), raster)
+    is_tested = result.free & (result.distance_m <= params.max_distance_m)
+    # Every fourth cell along each axis is a block, so that the blocks estimate the error of a finite raster.
+    rows, columns = (np.arange(count) % 4 for count in is_tested.shape)
+    block_index = torch.from_numpy((4 * rows[:, None] + columns)[is_tested])
+    cells = torch.bincount(block_index, minlength=16)
+    detected = torch.from_numpy(result.enough[is_tested]).double()
+    detected_cells = torch.bincount(block_index, detected, minlength=16)
+    quantity = Quantity(target, f"{target} detected", "share", lower_is_better=False)
+    return Estimate.from_ratios((quantity,), cells.double(), detected_cells[:, None], cells)
 
 
 def format_signed_difference(difference: Difference) -> str:
-    """A difference with its interval and no unit, its sign turned so that more is better."""
+    """Format a difference with its interval, without unit, with a sign so that more is better.
+
+    Args:
+        difference: The difference.
+    """
     if difference.quantity.lower_is_better:
         difference = difference._replace(value=-difference.value, low=-difference.high, high=-difference.low)
     return format_difference(difference)
 
 
 def format_improvement(value: float, unit: str) -> str:
-    """A gain without its unit: shares in percentage points.
+    """Format an improvement without its unit: shares in percentage points.
+
+    Args:
+        value: The improvement.
+        unit: Its unit.
 
     Example:
         >>> format_improvement(0.01234, "share"), format_improvement(0.01234, "m")
@@ -290,29 +370,44 @@ def format_improvement(value: float, unit: str) -> str:
 
 
 def format_unit(unit: str) -> str:
-    """What stands behind it."""
+    """Return the unit of an improvement: "points" for a share.
+
+    Args:
+        unit: Unit of the number.
+    """
     return "points" if unit == "share" else unit
 
 
 def describe_improvement(improvement: HeldOutImprovement, *, optimism: bool = False) -> str:
-    """Describe an improvement; it is called one only if it is significant by Student's t at 95 %."""
-    test, unit = improvement.difference, improvement.difference.quantity.unit
-    if math.isnan(test.value):
-        return "unknown in the held-out worlds"
-    t = "t unknown" if math.isnan(improvement.t_statistic) else f"t {improvement.t_statistic:.1f}"
-    where = f"on {test.block_count} held-out worlds ({t}, better in {test.better_count})"
-    rest = f"{improvement.description} {format_unit(unit)} {'in any world' if test.low == test.high else where}"
+    """Describe an improvement; "improved" and "worsened" are significant by Student's t at 95 %.
+
+    Args:
+        improvement: Improvement on held-out scenes.
+        optimism: Whether to add the difference to the improvement in the search.
+    """
+    difference, unit = improvement.difference, improvement.difference.quantity.unit
+    if math.isnan(difference.value):
+        return "unknown on held-out scenes"
+    t_statistic = "unknown" if math.isnan(improvement.t_statistic) else f"{improvement.t_statistic:.1f}"
+    scenes = f"on {difference.block_count} held-out scenes (t {t_statistic}, better in {difference.better_count})"
+    if difference.low == difference.high:
+        scenes = "in any scene"
+    text = f"{improvement.description} {format_unit(unit)} {scenes}"
     if optimism and not math.isnan(improvement.optimism):
-        rest += f", optimism {format_improvement(improvement.optimism, unit)}"
-    if test.is_significant:
-        return f"{'gained' if test.improvement > 0 else 'lost'} {rest}"
-    return f"no gain is shown: {rest}"
+        text += f", optimism {format_improvement(improvement.optimism, unit)}"
+    if not difference.is_significant:
+        return f"no significant improvement: {text}"
+    return f"{'improved by' if difference.improvement > 0 else 'worsened by'} {text}"
 
 
-def replace_nan(value: Any) -> Any:  # noqa: ANN401  (whatever a record holds)
-    """A record as JSON can have it: what is unknown is None."""
+def replace_nan(value: Any) -> Any:  # noqa: ANN401  (any content of a record)
+    """Replace non-finite numbers of a record by None, for JSON.
+
+    Args:
+        value: Mapping, sequence or value.
+    """
     if isinstance(value, Mapping):
-        return {key: replace_nan(each) for key, each in value.items()}
+        return {key: replace_nan(content) for key, content in value.items()}
     if isinstance(value, list | tuple):
-        return [replace_nan(each) for each in value]
+        return [replace_nan(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
