@@ -28,7 +28,7 @@ from torchcover.placement.selection_solver import CandidateCoverage, SelectionLi
 from torchcover.simulation import Rig
 
 NEAR = ("front_3m", "rear_3m", "left_3m", "right_3m")
-FRAMES = {"worlds": 4, "per_world": 1, "frame_interval_s": 5.0, "rays": 4096}
+FRAMES = {"num_scenes": 4, "frames_per_scene": 1, "frame_interval_s": 5.0, "num_rays": 4096}
 
 
 def roof_lidar(name, vehicle, model, **mounts):
@@ -84,7 +84,7 @@ def search_gains(name, seeds, evaluations):
     for row, params in zip(gains, STRATEGIES.values(), strict=True):
         for seed in range(seeds):
             search = PlacementSearch(
-                space, evaluations=evaluations, seed=seed, optimizer=params, make_frames=lambda *_: frames
+                space, num_evaluations=evaluations, seed=seed, optimizer_params=params, make_frames=lambda *_: frames
             )
             while (candidate := search.ask()) is not None:
                 search.evaluate(candidate)
@@ -106,7 +106,7 @@ def compare_strategies(seeds, evaluations, processes):
     table(("free", "optimizer", "random", "difference", "better in"), rows)
 
 
-def compare_pairs(rigs=24, worlds=16):
+def compare_pairs(rigs=24, num_scenes=16):
     """Standard error of the difference of two rigs on the same and on other frames."""
     objective = {"near and far": Objective(region=["20m", "80m"])}
     start, (roof,) = Rig.load("front_roof_32"), Rig.load("front_roof_32").sensors
@@ -116,7 +116,7 @@ def compare_pairs(rigs=24, worlds=16):
         mount = roof.mount.model_copy(update={"x_m": x_m, "z_m": z_m, "pitch_deg": pitch_deg})
         each.append(start.model_copy(update={"sensors": (roof.model_copy(update={"mount": mount}),)}))
     rows = []
-    for measure in ("area", "known"):
+    for measure in ("area", "cells"):
         with CommonFrames("urban", objective, num_scenes=worlds, average=measure) as frames:
             began_s = time.process_time()
             first, *others = [frames.score(rig).estimate for rig in each]
@@ -139,15 +139,17 @@ CHOICE = {
     "vehicle": "suv",
     "candidates": {"wide": {"sensor": WIDE, "grid": GRID},
                    "narrow": {"sensor": NARROW, "grid": GRID | {"yaw_deg": [-20.0, 20.0]}}},
-    "choose": {"max_sensors": 8, "max_cost_eur": 9000, "min_distance_m": 0.2},
-    "cost": {"wide": 2500, "narrow": 900, "mount": 100},
+    "constraints": {"max_sensors": 8, "max_cost_eur": 9000, "min_distance_m": 0.2},
+    "prices_eur": {"wide": 2500, "narrow": 900, "mount": 100},
     "objectives": {"around": {"region": [*NEAR, "20m"]}},
 }  # fmt: skip
 
 
 def time_selections():
     space = SelectionSpace.model_validate(CHOICE)
-    with CommonFrames(space.scenarios, space.scored_objectives, num_scenes=4, frames_per_scene=2, rays=8192) as frames:
+    with CommonFrames(
+        space.scenarios, space.scored_objectives, num_scenes=4, frames_per_scene=2, num_rays=8192
+    ) as frames:
         rigs = [Rig(name=one.name, vehicle="suv", sensors=(one,)) for one in space.sensors]
         observed, weights = [observe_points(rig, frames)[0] for rig in rigs], compute_point_weights(frames)
     rows = []
@@ -182,7 +184,7 @@ NOTHING = {
 
 def count_false_alarms(searches):
     space = SearchSpace.model_validate(json.loads(json.dumps(NOTHING)))
-    given = {"evaluations": 6, "worlds": 2, "num_held_out_scenes": 8, "rays": 4096}
+    given = {"num_evaluations": 6, "num_scenes": 2, "num_held_out_scenes": 8, "num_rays": 4096}
     results = [run_search(PlacementSearch(space, seed=2 * seed, **given)) for seed in range(searches)]
     tests = [result.test for result in results if result.test is not None]
     worse = sum(any(change.is_worse for change in test.side_effects) for test in tests)
@@ -202,7 +204,7 @@ def main(arguments=()):
     parser.add_argument("--processes", type=int, default=2)
     options = parser.parse_args(arguments)
     if options.part == "optimizer":
-        compare_strategies(options.seeds, options.evaluations, options.processes)
+        compare_strategies(options.seeds, options.num_evaluations, options.processes)
     elif options.part == "pairs":
         compare_pairs()
     elif options.part == "selections":

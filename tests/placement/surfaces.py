@@ -86,8 +86,14 @@ def plan(**settings):
     """A plan that makes surfaces."""
     worth = settings.pop("worth", near_far)
     blind = settings.pop("blind", False)
-    makes = lambda space, plan, seed, worlds: Surface(  # noqa: E731
-        seed, worlds, plan.per_world, worth, objectives=space.numbers, blind=blind, average=plan.estimate
+    makes = lambda space, plan, seed, num_scenes: Surface(  # noqa: E731
+        seed,
+        num_scenes,
+        plan.frames_per_scene,
+        worth,
+        objectives=space.scored_objectives,
+        blind=blind,
+        average=plan.average,
     )
-    budget = {} if "budget_s" in settings else {"evaluations": 20}
+    budget = {} if "budget_s" in settings else {"num_evaluations": 20}
     return SearchPlan(**{**budget, "make_frames": makes, **settings})

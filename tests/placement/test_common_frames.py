@@ -25,7 +25,7 @@ TWO = rig(lidar(), NOISY, RADAR, name="two")
 
 def same(a, b):
     """Two scores, to the last bit."""
-    for name in ("value", "left_out", "steps"):
+    for name in ("value", "jackknife_values", "frame_counts"):
         np.testing.assert_array_equal(getattr(a.estimate, name), getattr(b.estimate, name))
     assert a.self_hit_share == b.self_hit_share
 
@@ -47,7 +47,7 @@ def test_another_rig_sees_what_it_would_see_in_frames_of_its_own(scenario):
 
 def test_ideal_sensors_have_a_point_for_every_hit():
     short = rig(lidar(range_at_10_percent_m=5.0))
-    ideal, real = held(worlds=1, sensor_model="ideal"), held(worlds=1)
+    ideal, real = held(num_scenes=1, sensor_model="ideal"), held(num_scenes=1)
     points = [[len(frame.sensor) for frame in of.iterate_frames(short)] for of in (ideal, real)]
     assert points[0] == [len(frame.sensor) for frame in real.iterate_frames(rig(name=short.name))]
     assert points[1][0] < points[0][0]
@@ -56,19 +56,19 @@ def test_ideal_sensors_have_a_point_for_every_hit():
 
 def test_rays_that_change_no_objective_are_not_cast_and_change_none(monkeypatch):
     near = {"near": Objective(threshold_m=0.2, band="ground", region={"ahead": {"x_m": (3, 8), "y_m": (-2, 2)}})}
-    some = held(objectives=near, worlds=1, rays=200)
-    monkeypatch.setattr(Queries, "within_m", None)
-    every = held(objectives=near, worlds=1, rays=200)
+    some = held(objectives=near, num_scenes=1, num_rays=200)
+    monkeypatch.setattr(Queries, "search_radius_m", None)
+    every = held(objectives=near, num_scenes=1, num_rays=200)
     same(every.score(TWO), some.score(TWO))
     assert len(next(some.iterate_frames(TWO)).sensor) < 0.7 * len(next(every.iterate_frames(TWO)).sensor)
 
 
 def test_numbers_are_those_of_evaluate_on_the_same_frames_to_the_last_bit():
     """By area and over known cells, in regions of several objectives, from frames that nobody has cut."""
-    held_by = {measure: held(worlds=4, per_world=2, estimate=measure) for measure in ("area", "known")}
+    held_by = {measure: held(num_scenes=4, frames_per_scene=2, average=measure) for measure in ("area", "cells")}
     found = held_by["area"]
     frames = SimulatedFrames(
-        found._worlds[0],
+        found._host_scenarios[0],
         TWO,
         num_frames=max(index.frame_index for index in found.indices) + 1,
         frame_interval_s=0.4,
@@ -87,7 +87,7 @@ def test_numbers_are_those_of_evaluate_on_the_same_frames_to_the_last_bit():
     in_order.__class__, in_order.num_frames = InOrder, len(steps)
     regions = {"20m": {"x_m": (0.0, 20.0), "y_m": (-5.0, 5.0)}, "80m": {"x_m": (0.0, 80.0), "y_m": (-20.0, 20.0)}}
     ask = RegionsOfInterest.model_validate({"regions": {**regions, **BAY}})
-    result = evaluate(frames=in_order, ask=ask, cell_m=0.5, thresholds_m=(0.2, 0.3))
+    result = evaluate(frames=in_order, regions=ask, cell_m=0.5, thresholds_m=(0.2, 0.3))
     for measure, frames_of in held_by.items():
         own = frames_of.score(TWO).estimate
         for column, objective in enumerate(OBJECTIVES.values()):
@@ -102,7 +102,7 @@ def test_numbers_are_those_of_evaluate_on_the_same_frames_to_the_last_bit():
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_it_makes_no_difference_who_holds_the_worlds(frames, workers):
-    with held(workers=workers) as elsewhere:
+    with held(num_workers=workers) as elsewhere:
         same(elsewhere.score(TWO), frames.score(TWO))
         assert all(
             seen.frame is None for seen in elsewhere._compute(TWO, [0, 3], is_measured=True)
@@ -116,14 +116,14 @@ def test_it_makes_no_difference_who_holds_the_worlds(frames, workers):
 
 def test_a_world_stays_with_the_process_that_has_built_it(monkeypatch, tmp_path):
     """The k-th batch of a DataLoader is for its k-th worker."""
-    built = CachedFrames._build
+    built = CachedFrames._build_reference
 
     def noted(self, index, number):
-        (tmp_path / f"{index.world} {number} {os.getpid()}").touch()
+        (tmp_path / f"{index.scene_id} {number} {os.getpid()}").touch()
         return built(self, index, number)
 
-    monkeypatch.setattr(CachedFrames, "_build", noted)
-    with held(workers=2, worlds=4) as elsewhere:
+    monkeypatch.setattr(CachedFrames, "_build_reference", noted)
+    with held(num_workers=2, num_scenes=4) as elsewhere:
         for _ in range(2):
             elsewhere.score(rig())
         elsewhere.score(TWO)
@@ -140,14 +140,14 @@ def test_the_order_of_rigs_makes_no_difference(frames):
     same(frames.score(TWO), whole)
     assert not torch.equal(other.estimate.value, whole.estimate.value)
     share = whole.self_hit_share
-    counts = [frame.counts for frame in frames.frames(TWO)]
+    counts = [frame.counts for frame in frames.iterate_frames(TWO)]
     assert share == sum(one["self_hits"] for one in counts) / sum(one["rays"] for one in counts)
 
 
 def test_what_some_worlds_do_not_show_is_about_the_others():
     obstacles = {"ahead": Objective(region="20m", band="obstacle"), "ground": Objective(region="20m", band="ground")}
     scenarios = [yard(WALL), yard(name="empty"), LOT]
-    found = held(scenarios, obstacles, worlds=1, per_world=1)
+    found = held(scenarios, obstacles, num_scenes=1, frames_per_scene=1)
     assert [index.scene_id for index in found.indices] == [0, 1, 2]
     estimate = found.score(rig()).estimate
     assert torch.isfinite(estimate.jackknife_values).all()
@@ -157,7 +157,7 @@ def test_what_some_worlds_do_not_show_is_about_the_others():
 
 
 def test_a_world_without_traffic_shows_each_instant_once():
-    found = held([yard(WALL)], per_world=4)
+    found = held([yard(WALL)], frames_per_scene=4)
     assert [index.scene_id for index in found.indices] == [0] * 4
     assert (
         len({float(frame.reference_weights.sum()) for frame in found.iterate_frames()}) == 4
@@ -167,22 +167,22 @@ def test_a_world_without_traffic_shows_each_instant_once():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"scenarios": []}, "scenarios: at least one"),
-        ({"objectives": {}}, "objectives: at least one"),
-        ({"worlds": 0}, "worlds: at least 1"),
-        ({"per_world": 4}, "per_world: a run of 'lot' has 3 frames that are 0.4 s apart; got 4"),
+        ({"scenarios": []}, "scenarios: got none"),
+        ({"objectives": {}}, "objectives: got none"),
+        ({"num_scenes": 0}, "num_scenes: got 0; give at least 1"),
+        ({"frames_per_scene": 4}, "frames_per_scene: got 4, but a run of 'lot' has 3 frames at intervals of 0.4 s"),
         ({"frame_interval_s": 0.3}, "frame_interval_s: a positive multiple"),
-        ({"workers": -1}, "workers: a number >= 0"),
+        ({"num_workers": -1}, "num_workers: got -1; give 0 or more"),
         ({"seed": -1}, "seed: a number >= 0"),
-        ({"budget_bytes": 1000.0}, "budget_bytes: 3 worlds .* in which 0 fit; use fewer worlds"),
-        ({"budget_bytes": 1000.0, "workers": 1}, "budget_bytes: 3 worlds"),
-        ({"scenarios": [LOT, "courtyard"]}, "their egos differ"),
-        ({"objectives": {"a": Objective(region="21m")}}, "objective 'a': region '21m': one of 20m, 80m"),
-        ({"objectives": {"a": Objective(region="20m", band="sky")}}, "objective 'a': band 'sky': 'ground' or 'obst"),
-        ({"objectives": {"a": Objective(region="20m", band=())}}, "objective 'a': band: at least one"),
+        ({"budget_bytes": 1000.0}, "budget_bytes: 3 scenes need .* enough for 0; use fewer scenes"),
+        ({"budget_bytes": 1000.0, "num_workers": 1}, "budget_bytes: 3 scenes"),
+        ({"scenarios": [LOT, "courtyard"]}, "the ego vehicles differ"),
+        ({"objectives": {"a": Objective(region="21m")}}, "objective 'a': region '21m': give one of 20m, 80m"),
+        ({"objectives": {"a": Objective(region="20m", band="sky")}}, "objective 'a': band 'sky': give 'ground' or 'obst"),
+        ({"objectives": {"a": Objective(region="20m", band=())}}, "objective 'a': band: got none"),
         (
             {"objectives": {"a": Objective(region="20m"), "b": Objective(region={"20m": BAY["bay"]})}},
-            "objective 'b': region '20m': another objective",
+            "objective 'b': region '20m': two objectives define it differently",
         ),
     ],
 )  # fmt: skip
@@ -200,13 +200,13 @@ def test_a_rig_for_another_vehicle_is_refused_unless_the_vehicle_was_said():
     open_lot = Scenario.model_validate({"name": "open", "bodies": [FLOOR], "ego": {"pose": {}}})
     near = {"near": Objective(region="20m", band="ground")}
     roof = rig(vehicle="renault_zoe")
-    with pytest.raises(ValueError, match="is for the vehicle renault_zoe, and these frames have suv: say which"):
+    with pytest.raises(ValueError, match="its vehicle is renault_zoe, and that of these frames suv; set vehicle="):
         held([open_lot], near).score(roof)
     assert len(held([open_lot], near, vehicle="renault_zoe").score(roof).estimate.value) == 1
 
 
 def test_a_process_that_was_killed_is_told_and_the_others_end_with_the_search():
-    frames = held(workers=9, worlds=2, per_world=1)
+    frames = held(num_workers=9, num_scenes=2, frames_per_scene=1)
     killed, other = frames._loader._iterator._workers
 
     def ask():
@@ -234,8 +234,8 @@ def test_threads_make_no_difference(frames):
 
 def test_a_recording_is_one_world_for_any_seed_and_none_of_it_is_fresh():
     with held(
-        ["tracks_table"], {"near": Objective(region="20m", band="ground")}, worlds=3, frame_interval_s=0.5
+        ["tracks_table"], {"near": Objective(region="20m", band="ground")}, num_scenes=3, frame_interval_s=0.5
     ) as recorded:
         assert [index.scene_id for index in recorded.indices] == [0, 0]
-        with pytest.raises(ValueError, match="one whose worlds are drawn is needed; 'tracks_table' is the same"):
+        with pytest.raises(ValueError, match="scenarios: 'tracks_table' is the same for any seed"):
             recorded.resample(9, 3, {})

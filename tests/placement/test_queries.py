@@ -20,7 +20,7 @@ TWO = rig(lidar(), lidar("low", mount={"x_m": 2.2, "z_m": 0.6}), name="two")
 def test_the_points_that_are_kept_are_those_in_the_regions_and_in_their_cells():
     near = Objective(region="20m", band="obstacle"), Objective(region="20m")
     asked = Queries.from_objectives(
-        OUTLINE_M, {"a": near[0], "b": Objective(region=LANE, threshold_m=0.1), "c": near[1]}
+        {"a": near[0], "b": Objective(region=LANE, threshold_m=0.1), "c": near[1]}, OUTLINE_M
     )
     assert asked.thresholds_m == (0.1, 0.4)
     assert asked.max_radius_m == 0.4
@@ -67,15 +67,15 @@ def test_an_objective_is_any_number_of_a_result_and_knows_its_direction(several)
     region = several.queries.regions["20m"]
     metric = CoverageMetric(
         several.queries.grid,
-        max_radius=several.queries.max_radius_m,
-        blocks=16,
+        max_radius_m=several.queries.max_radius_m,
+        num_blocks=16,
         aggregations=[Maximum(), Quantiles((0.5, 0.9))],
         regions=[region],
-        sensors=["top", "low"],
-        square_metres=True,
+        sensor_names=["top", "low"],
+        has_area_weights=True,
     )
     observer = CoverageObserver(metric)
-    for frame in several.frames(TWO):
+    for frame in several.iterate_frames(TWO):
         observer.update(frame)
     (row,) = (row for row in observer.compute().summary() if row.band == "ground")
     assert value["radius_m"] == row.numbers["radius_m"].value
@@ -99,14 +99,14 @@ def test_an_objective_is_any_number_of_a_result_and_knows_its_direction(several)
 
 
 def test_what_a_failure_leaves_is_over_known_cells_where_evaluate_has_it_so(several):
-    both = several, held(objectives=NUMBERS, estimate="known")
+    both = several, held(objectives=NUMBERS, average="cells")
     by_area, by_cells = (dict(zip(NUMBERS, of.score(TWO).estimate.value.tolist(), strict=True)) for of in both)
     region = several.queries.regions["20m"]
     metric = CoverageMetric(
-        several.queries.grid, max_radius=several.queries.max_radius_m, regions=[region], sensors=["top", "low"]
+        several.queries.grid, max_radius_m=several.queries.max_radius_m, regions=[region], sensor_names=["top", "low"]
     )
     observer = CoverageObserver(metric)
-    for frame in several.frames(TWO):
+    for frame in several.iterate_frames(TWO):
         observer.update(frame)
     for key in ("detection_0.4m", "radius_m", "seen_by_two_0.4m", "detection_0.4m_without_top"):
         assert by_cells[key] == float(observer.compute().estimate_number(key, region, "ground").value)
@@ -122,20 +122,18 @@ def test_a_number_without_any_sensor_says_so(several):
 
 
 def test_numbers_that_are_by_no_choice_of_estimate_are_the_same_by_both():
-    alone = {"known": Objective(number="cells_radius_m", region="20m")}
+    alone = {"cells": Objective(number="cells_radius_m", region="20m")}
     for asked in (NUMBERS, alone):
-        by_area, by_cells = (
-            held(objectives=asked, estimate=one).score(TWO).estimate.value for one in ("area", "known")
-        )
+        by_area, by_cells = (held(objectives=asked, average=one).score(TWO).estimate.value for one in ("area", "cells"))
         for objective, area, cells in zip(asked.values(), by_area, by_cells, strict=True):
             assert (area == cells) == (objective.fixed_average != ""), objective.key
-    assert alone["known"].fixed_average == "known"
+    assert alone["cells"].fixed_average == "cells"
 
 
 def test_what_the_second_sensor_loses_without_a_block_is_known_too(several):
     estimate = several.score(TWO).estimate
-    assert estimate.left_out.shape == (3, len(NUMBERS))
-    unknown = ~torch.isfinite(estimate.left_out).all(dim=0)
+    assert estimate.jackknife_values.shape == (3, len(NUMBERS))
+    unknown = ~torch.isfinite(estimate.jackknife_values).all(dim=0)
     # Of a largest value no error is known.
     assert [key for key, one in zip(NUMBERS, unknown.tolist(), strict=True) if one] == ["radius_maximum_m"]
 
@@ -154,16 +152,19 @@ def test_what_the_second_sensor_loses_without_a_block_is_known_too(several):
     ],
 )
 def test_a_number_that_no_result_has_is_refused_with_the_nearest(given, near):
-    asked = Queries.from_objectives(OUTLINE_M, {"odd": Objective(number=given, region="20m")})
-    with pytest.raises(ValueError, match=f"objective 'odd': no result has a number '{given}'; near is '{near}'"):
+    asked = Queries.from_objectives({"odd": Objective(number=given, region="20m")}, OUTLINE_M)
+    with pytest.raises(ValueError, match=f"objective 'odd': results have no number '{given}'; did you mean '{near}'"):
         asked.check(TWO)
 
 
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"number": "radius_m", "detection": 0.4, "region": "20m"}, "number, detection: one of the two"),
-        ({"number": "radius_m"}, r"region: it is needed for 'radius_m' \["),
+        (
+            {"number": "radius_m", "threshold_m": 0.4, "region": "20m"},
+            "number, threshold_m: got 'radius_m' and 0.4; give one of the two",
+        ),
+        ({"number": "radius_m"}, r"region: 'radius_m' needs one; add it \["),
     ],
 )
 def test_an_objective_that_makes_no_sense_is_refused(given, message):
@@ -173,11 +174,11 @@ def test_an_objective_that_makes_no_sense_is_refused(given, message):
 
 def test_the_worst_sensor_is_the_worst_without_each_block_too():
     from torchcover.coverage.quantity import RADIUS, make_detection_quantity
-    from torchcover.placement.queries import _worst
+    from torchcover.placement.queries import _select_worst
 
     value, left_out = torch.tensor([0.4]), torch.tensor([[0.3], [0.6]])
     other = torch.tensor([0.5]), torch.tensor([[0.5], [0.5]])
     for quantity, expected in ((make_detection_quantity(0.4), [0.4, 0.3, 0.5]), (RADIUS, [0.5, 0.5, 0.6])):
         each = [Estimate((quantity,), *one, torch.ones(2)) for one in ((value, left_out), other)]
-        worst = _worst(each)
+        worst = _select_worst(each)
         assert [*worst.value.tolist(), *worst.jackknife_values[:, 0].tolist()] == pytest.approx(expected)

@@ -14,7 +14,7 @@ from torchcover.targets import Target, survey_places
 
 # Ahead of an ego that is 4 m long; the last is within it, so that it has no room and is not checked.
 PLACES = [[4.5, 0.0], [6.5, 0.0], [9.0, 0.0], [0.0, 0.0]]
-CHILD = {"target": "child", "at": {"points_m": PLACES}, "points": 1}
+CHILD = {"target": "child", "positions": {"points_m": PLACES}, "points": 1}
 CROSSING = {"name": "a", "ego": {"speed_kmh": 30}, "other": {"body": "adult", "speed_kmh": 5, "from_m": 2}}
 ENCOUNTERS = {"name": "some", "encounters": [CROSSING, {**CROSSING, "name": "b", "ego": {"speed_kmh": 70}}]}
 SPAN = {"channels": 4, "vertical_fov_deg": [-4, 4], "columns": 361}
@@ -23,30 +23,30 @@ DOWN = rig(lidar(**SPAN, mount={"z_m": 1.9, "pitch_deg": 15.0}), name="down")
 
 
 def child(**changes):
-    return Objective.model_validate({"requires": {**CHILD, **changes}})
+    return Objective.model_validate({"requirement": {**CHILD, **changes}})
 
 
 @pytest.fixture(scope="module")
 def lot(tmp_path_factory):
     """Its file: a space names its worlds."""
-    path = tmp_path_factory.mktemp("worlds") / "lot.yaml"
+    path = tmp_path_factory.mktemp("scenes") / "lot.yaml"
     traffic = {"type": "parking", "duration_s": 1.0, "time_step_s": 0.2, "crossings": 0, "parked_share": 0.3}
     path.write_text(json.dumps({"name": "lot", "ego": EGO, "traffic": traffic}))
     return str(path)
 
 
-def searched(lot, out=None, *, objectives=None, resume=False, evaluations=8, **changes):
+def searched(lot, out=None, *, objectives=None, resume=False, num_evaluations=8, **changes):
     content = {
         "name": "nose", "start": LEVEL, "scenario": lot,
         "free": {"top": {"pitch_deg": (0.0, 30.0)}}, "objectives": objectives or {"child": child()}, **changes,
     }  # fmt: skip
     plan = SearchPlan(
-        num_evaluations=evaluations,
+        num_evaluations=num_evaluations,
         num_scenes=3,
         frames_per_scene=2,
         frame_interval_s=0.4,
         num_held_out_scenes=2,
-        rays=512,
+        num_rays=512,
     )
     return run_search(PlacementSearch(SearchSpace.model_validate(content), plan), out, resume=resume)
 
@@ -54,7 +54,7 @@ def searched(lot, out=None, *, objectives=None, resume=False, evaluations=8, **c
 def test_the_number_is_the_share_of_the_places_that_are_seen_well_enough_and_has_no_error():
     some = held(objectives={"near": Objective(region="20m"), "child": child(), "far": Objective(region="80m")})
     without = held(objectives={"near": Objective(region="20m"), "far": Objective(region="80m")})
-    empty, shares = build_flat_ground().model_copy(update={"ego": some._worlds[0].ego}), []
+    empty, shares = build_flat_ground().model_copy(update={"ego": some._host_scenarios[0].ego}), []
     for each in (LEVEL, DOWN):
         estimate = some.score(each).estimate
         points = survey_places(each, empty, Target.load("child"), np.array(PLACES)).least_points
@@ -70,28 +70,28 @@ def test_the_number_is_the_share_of_the_places_that_are_seen_well_enough_and_has
 
 
 def test_of_encounters_those_count_that_are_kept_in_all_phases_on_the_vehicle_of_the_search():
-    asked = {"requires": {"encounters": ENCOUNTERS, "in_time": {}}}
+    asked = {"requirement": {"encounters": ENCOUNTERS, "braking": {}}}
     some = held(
         [LOT.model_copy(update={"ego": None})],
         objectives={"crossings": Objective.model_validate(asked)},
         vehicle="van",
-        worlds=1,
+        num_scenes=1,
     )
     of_rig = rig(lidar(channels=32, mount={"z_m": 3.2}), vehicle="suv")  # which is not what carries it there
-    required = Requirements.model_validate({"requirements": [asked["requires"]]})
+    required = Requirements.model_validate({"requirements": [asked["requirement"]]})
     (verdict,) = check(of_rig, required, vehicle="van").verdicts["small"]
     assert verdict.total_count == 2
     assert some.score(of_rig).estimate.value.tolist() == [(2 - verdict.not_met_count - verdict.undecided_count) / 2]
 
 
 def test_a_search_finds_where_the_child_is_seen_and_resumed_it_finds_the_same(lot, tmp_path):
-    searched(lot, tmp_path, evaluations=2)
+    searched(lot, tmp_path, num_evaluations=2)
     resumed, found = (searched(lot, out, resume=out is not None) for out in (tmp_path, None))
     values = [[one.values for one in of.search.evaluations] for of in (resumed, found)]
     assert values[0] == values[1]
     start, best = (one.estimate.value[0] for one in (found.search.evaluations[0], found.best.evaluation))
     assert (start, best) == (0.0, 0.75)
-    assert found.summary.startswith("child: gained +75.0 points in any world, optimism +0.00. ")
+    assert found.summary.startswith("child: improved by +75.0 points in any scene, optimism +0.00. ")
     (gain,) = found.best.improvements
     assert (gain.average, gain.difference.p_value, gain.difference.error, gain.difference.is_significant) == (
         "-",
@@ -101,15 +101,15 @@ def test_a_search_finds_where_the_child_is_seen_and_resumed_it_finds_the_same(lo
     )
     assert gain.difference.value == gain.search_improvement == best - start
     resumed.save(tmp_path)
-    record = json.loads((tmp_path / "search.json").read_text())["found"][0]
-    assert record["gains"]["child"]["-"]["p"] == 0.0
+    record = json.loads((tmp_path / "search.json").read_text())["finalists"][0]
+    assert record["improvements"]["child"]["-"]["p_value"] == 0.0
 
 
 def test_what_must_not_be_worse_for_a_child_is_kept_and_changes_by_no_chance(lot):
     """Of the ground ahead more is seen with the nose down, and of an adult far ahead with the nose up."""
-    level = {"requires": {"target": "adult", "at": {"points_m": [[20.0, 0.0]]}, "points": 1}}
+    level = {"requirement": {"target": "adult", "positions": {"points_m": [[20.0, 0.0]]}, "points": 1}}
     objectives = {"near": {"region": ("front_3m", "20m"), "band": "ground"}}
-    free, kept = (searched(lot, objectives=objectives, evaluations=16, not_worse=worse) for worse in ((), (level,)))
+    free, kept = (searched(lot, objectives=objectives, num_evaluations=16, not_worse=worse) for worse in ((), (level,)))
     (name,) = kept.search.space.scored_objectives.keys() - {"near"}
     assert kept.search.evaluations[0].estimate.value.tolist()[1] == 1.0
     assert free.best.evaluation.values["top.pitch_deg"] > 8 > kept.best.evaluation.values["top.pitch_deg"]
@@ -119,11 +119,11 @@ def test_what_must_not_be_worse_for_a_child_is_kept_and_changes_by_no_chance(lot
 
 def test_where_nothing_is_ever_seen_nothing_is_unknown(lot, tmp_path):
     never = child(points=10**6)
-    found = searched(lot, objectives={"near": {"region": "20m"}, "never": never}, evaluations=6)
+    found = searched(lot, objectives={"near": {"region": "20m"}, "never": never}, num_evaluations=6)
     assert not np.isnan(found.improvements).any()
     assert (found.improvements[:, 1] == 0).all()
-    assert "never: no gain is shown: 0 points in any world" in found.summary
-    alone = searched(lot, objectives={"never": never}, evaluations=6)
+    assert "never: no significant improvement: 0 points in any scene" in found.summary
+    alone = searched(lot, objectives={"never": never}, num_evaluations=6)
     assert alone.best.is_start
     alone.save(tmp_path)
 
@@ -131,14 +131,17 @@ def test_where_nothing_is_ever_seen_nothing_is_unknown(lot, tmp_path):
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"requires": CHILD, "region": "20m", "band": "ground"}, "it makes an objective alone; leave out band, region"),
         (
-            {"requires": {"region": "20m", "height": "ground", "number": "radius_m", "most": 0.3}},
-            "requires: of a region give its number, band and region instead",
+            {"requirement": CHILD, "region": "20m", "band": "ground"},
+            "requirement: it needs no other keys; remove band, region",
         ),
-        ({"requires": {**CHILD, "share": 0.3}}, "requires: one number is needed; got points >= 1, share >= 0.3"),
-        ({"requires": {**CHILD, "at": "kerb"}}, "requires.at: write the place out, .* got the name 'kerb'"),
-        ({"requires": {"points": 5}}, "give target, region or encounters"),
+        (
+            {"requirement": {"region": "20m", "band": "ground", "number": "radius_m", "max_value": 0.3}},
+            "requirement: got one of a region; give number, band and region instead",
+        ),
+        ({"requirement": {**CHILD, "share": 0.3}}, "requirement: got points >= 1, share >= 0.3; give one bound"),
+        ({"requirement": {**CHILD, "positions": "kerb"}}, "requirement.positions: got the name 'kerb'"),
+        ({"requirement": {"points": 5}}, "give target, region or encounters"),
     ],
 )
 def test_what_cannot_be_an_objective_is_refused(given, message):
@@ -147,6 +150,6 @@ def test_what_cannot_be_an_objective_is_refused(given, message):
 
 
 def test_a_place_without_room_is_refused_with_the_start(lot):
-    inside = child(at={"x_m": [-0.5, 0.5], "y_m": [-0.3, 0.3]})
-    with pytest.raises(ValueError, match=r"objectives.child: .* there is no room for the target anywhere"):
+    inside = child(positions={"x_m": [-0.5, 0.5], "y_m": [-0.3, 0.3]})
+    with pytest.raises(ValueError, match=r"objectives.child: .* no position is free for the target"):
         searched(lot, objectives={"child": inside})

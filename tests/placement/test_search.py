@@ -24,7 +24,7 @@ def searched(out=None, *, of=None, resume=False, **settings):
 
 def contents(search):
     """All evaluations without their times, for comparison."""
-    return [json.dumps({**each.record(), "seconds": 0}) for each in search.evaluations]
+    return [json.dumps({**each.to_record(), "duration_s": 0}) for each in search.evaluations]
 
 
 class Ended(Exception):  # noqa: N818
@@ -38,11 +38,13 @@ def ending_after(count):
                 raise Ended
             return super().score(rig)
 
-    return lambda space, plan, seed, worlds: EndsAfter(seed, worlds, plan.per_world, objectives=space.numbers)
+    return lambda space, plan, seed, worlds: EndsAfter(
+        seed, worlds, plan.frames_per_scene, objectives=space.scored_objectives
+    )
 
 
 def test_the_start_comes_first_and_random_candidates_are_a_control_of_the_optimizer():
-    result = searched(evaluations=24)
+    result = searched(num_evaluations=24)
     evaluations = result.search.evaluations
     assert [each.number for each in evaluations] == list(range(25))
     strategies = [each.strategy for each in evaluations]
@@ -55,14 +57,17 @@ def test_the_start_comes_first_and_random_candidates_are_a_control_of_the_optimi
 def test_the_startup_covers_all_options_and_both_ends_of_each_range():
     models = ("hesai_pandar64", "ouster_os1_64", "ouster_os1_128", "velodyne_vlp16", "velodyne_hdl32e")
     of = space(free={"roof": {"model": models, "x_m": (-0.6, 0.8)}})
-    startup = searched(of=of, evaluations=5).search.evaluations[1:]
+    startup = searched(of=of, num_evaluations=5).search.evaluations[1:]
     assert {each.values["roof.model"] for each in startup} == set(models)
     assert sorted((each.values["roof.x_m"] + 0.6) // 0.28 for each in startup) == [0, 1, 2, 3, 4]
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_the_optimizer_is_better_than_random_candidates_and_so_it_is_on_held_out_worlds(seed):
-    result, random = searched(evaluations=20, seed=seed), searched(evaluations=20, seed=seed, optimizer=RANDOM_ONLY)
+    result, random = (
+        searched(num_evaluations=20, seed=seed),
+        searched(num_evaluations=20, seed=seed, optimizer_params=RANDOM_ONLY),
+    )
     best, control = result.finalists
     assert abs(best.evaluation.values["roof.pitch_deg"] - 4) < 1.5
     (gain,) = best.improvements
@@ -73,14 +78,16 @@ def test_the_optimizer_is_better_than_random_candidates_and_so_it_is_on_held_out
     assert gain.search_improvement >= max(
         control.improvements[0].search_improvement, np.nanmax(random.search.improvements)
     )
-    assert result.summary.startswith("near: gained ")
-    assert "The best of 10 random candidates: near: gained" in result.summary
+    assert result.summary.startswith("near: improved by ")
+    assert "Control, the best of 10 random candidates: near: improved by" in result.summary
     assert random.strategy_counts == {"optimizer": 0, "random": 20}
 
 
 def test_what_must_not_be_worse_is_kept():
     """Near likes the nose down, far likes it up: what is best near loses far."""
-    free, kept = (searched(of=space(not_worse=not_worse), evaluations=24) for not_worse in ((), ({"region": "80m"},)))
+    free, kept = (
+        searched(of=space(not_worse=not_worse), num_evaluations=24) for not_worse in ((), ({"region": "80m"},))
+    )
     assert free.best.evaluation.values["roof.pitch_deg"] > 2
     assert kept.best.evaluation.values["roof.pitch_deg"] < 0.8
     search = kept.search
@@ -93,18 +100,18 @@ def test_what_must_not_be_worse_is_kept():
     for each in search.evaluations:
         keeps[each.strategy].append(not search.find_shortfalls(each))
     assert np.mean(keeps["optimizer"]) > np.mean(keeps["random"])
-    assert "No candidate keeps" not in kept.summary
+    assert "No candidate meets" not in kept.summary
 
 
 def required(*bounds, **target):
-    regions = [{"region": "20m", "height": "ground", "number": "detection_0.4m", **bound} for bound in bounds]
-    child = [{"target": "child", "at": {"points_m": [[5.0, 0.0]]}, **target}] if target else []
+    regions = [{"region": "20m", "band": "ground", "number": "detection_0.4m", **bound} for bound in bounds]
+    child = [{"target": "child", "positions": {"points_m": [[5.0, 0.0]]}, **target}] if target else []
     return {"requirements": [*regions, *child]}
 
 
 def test_what_no_candidate_keeps_ends_with_the_least_shortfall():
     """The second number of a surface likes the nose up, and is 0.4 at most."""
-    result = searched(of=space(requirements=required({"least": 0.5})), evaluations=24)
+    result = searched(of=space(requirements=required({"min_value": 0.5})), num_evaluations=24)
     search = result.search
     missing = [sum(search.find_shortfalls(each).values()) for each in search.evaluations]
     best = missing[result.best.evaluation.number]
@@ -112,7 +119,7 @@ def test_what_no_candidate_keeps_ends_with_the_least_shortfall():
     assert result.best.evaluation.values["roof.pitch_deg"] < -1
     (name,) = search.find_shortfalls(result.best.evaluation)
     assert name == "required: 20m, ground, detection_0.4m >= 0.5"
-    assert f"keeps all that must be kept; this one misses the least: {best:.2%} of {name}." in result.summary
+    assert f"meets all bounds; this one has the smallest shortfall: {best:.2%} of {name}." in result.summary
     assert f"{best:.2%} of {name}" in [row[-1] for row in result.report.csv_tables["evaluations.csv"]]
 
 
@@ -125,7 +132,7 @@ def needing(pitch_deg):
         (bound,) = requirement.bounds
         counts = 1, int(margin < 0), 0, ()
         state = "kept" if margin >= 0 else "not kept"
-        verdict = Verdict(requirement.words, bound, state, 0, 0, 0, margin, *counts)
+        verdict = Verdict(requirement.text, bound, state, 0, 0, 0, margin, *counts)
         return CheckResult(required, {rig.name: [verdict]}, {})
 
     return check
@@ -135,7 +142,7 @@ def needing(pitch_deg):
 def test_requirements_of_targets_are_kept_or_missed_the_least(monkeypatch, needed_deg, lowest, highest):
     """The best near is 4 degrees; a child needs 5, or more than the range has."""
     monkeypatch.setattr("torchcover.placement.objective.check", needing(needed_deg))
-    result = searched(of=space(requirements=required(points=5)), evaluations=24)
+    result = searched(of=space(requirements=required(points=5)), num_evaluations=24)
     assert list(result.search.evaluations[0].shortfalls) == ["child_110cm, points_m [[5.0, 0.0]], points >= 5"]
     assert lowest <= result.best.evaluation.values["roof.pitch_deg"] <= highest
     assert bool(result.best.evaluation.shortfalls) == (needed_deg > 15)
@@ -143,21 +150,21 @@ def test_requirements_of_targets_are_kept_or_missed_the_least(monkeypatch, neede
 
 def test_a_child_is_looked_for_around_the_vehicle_of_the_space():
     for points, is_kept in ((5, True), (10**6, False)):
-        search = PlacementSearch(space(requirements=required(points=points)), plan(evaluations=1))
+        search = PlacementSearch(space(requirements=required(points=points)), plan(num_evaluations=1))
         search.evaluate(search.ask())
         assert (search.evaluations[0].shortfalls == {}) == is_kept
 
 
 def test_requirements_in_other_bands_or_directions_are_refused():
     with pytest.raises(ValueError, match=r"most: of detection_0\.4m more is better; least is meant"):
-        space(requirements=required({"least": 0.9}, {"most": 0.5}))
-    asked = required({"least": 0.5}) | {"heights": {"ground": [-0.2, 0.2]}}
-    with pytest.raises(ValueError, match=r"'ground' is \(-0\.2, 0\.2\) there"):
+        space(requirements=required({"min_value": 0.9}, {"max_value": 0.5}))
+    asked = required({"min_value": 0.5}) | {"heights": {"ground": [-0.2, 0.2]}}
+    with pytest.raises(ValueError, match=r"'ground' is \(-0\.2, 0\.2\)"):
         space(requirements=asked)
-    asked["requirements"][0]["height"] = "low"
+    asked["requirements"][0]["band"] = "low"
     with pytest.raises(ValueError, match="no height band is called 'low'"):
         space(requirements=asked)
-    with pytest.raises(ValueError, match=r"'low' is \(0\.0, 0\.3\) there"):
+    with pytest.raises(ValueError, match=r"'low' is \(0\.0, 0\.3\)"):
         space(requirements=asked | {"heights": {"low": [0.0, 0.3]}})
 
 
@@ -166,47 +173,50 @@ def test_numbers_that_ended_on_their_bounds_are_named():
         mount = rig.sensors[0].mount
         return np.full(2, 0.5 + 0.1 * mount.x_m - 1e-3 * (mount.pitch_deg - 3) ** 2)
 
-    result = searched(evaluations=20, worth=only_x)
-    assert "On the bounds of their ranges ended roof.x_m (0.8):" in result.summary
-    assert "ended roof.pitch" not in result.summary
+    result = searched(num_evaluations=20, worth=only_x)
+    assert "Variables at the end of their range: roof.x_m (0.8);" in result.summary
+    assert "roof.pitch_deg (" not in result.summary
 
 
 @pytest.mark.parametrize("objectives", [("near",), ("near", "far")])
 def test_a_search_that_was_ended_goes_on_to_the_same_candidates(tmp_path, objectives):
     of = space(objectives=objectives)
-    whole = searched(tmp_path / "whole", of=of, evaluations=14)
+    whole = searched(tmp_path / "whole", of=of, num_evaluations=14)
     out = tmp_path / "ended"
     for most in (0, 4, 9):
         with pytest.raises(Ended):
-            searched(out, of=of, resume=True, evaluations=14, make_frames=ending_after(most))
+            searched(out, of=of, resume=True, num_evaluations=14, make_frames=ending_after(most))
     if (out / JOURNAL).exists():
         with (out / JOURNAL).open("ab") as file:
             file.write(b'{"op_code":4,"wor')  # torn by the end of the process
-    resumed = searched(out, of=of, resume=True, evaluations=14)
+    resumed = searched(out, of=of, resume=True, num_evaluations=14)
     assert contents(resumed.search) == contents(whole.search)
     assert [each.role for each in resumed.finalists] == [each.role for each in whole.finalists]
-    assert contents(searched(out, of=of, resume=True, evaluations=14).search) == contents(whole.search)
-    longer = searched(out, of=of, resume=True, evaluations=16)
-    assert contents(longer.search) == contents(searched(of=of, evaluations=16).search)
+    assert contents(searched(out, of=of, resume=True, num_evaluations=14).search) == contents(whole.search)
+    longer = searched(out, of=of, resume=True, num_evaluations=16)
+    assert contents(longer.search) == contents(searched(of=of, num_evaluations=16).search)
 
 
 def test_a_budget_that_is_too_small_takes_nothing_away(tmp_path):
-    searched(tmp_path, evaluations=3)
+    searched(tmp_path, num_evaluations=3)
     before = (tmp_path / JOURNAL).read_bytes()
-    with pytest.raises(ValueError, match="less than two evaluations"):
+    with pytest.raises(ValueError, match="too short for two evaluations"):
         searched(tmp_path, budget_s=1e-6)
     assert (tmp_path / JOURNAL).read_bytes() == before
 
 
 def test_the_journal_of_another_search_is_refused(tmp_path):
-    searched(tmp_path, evaluations=2)
+    searched(tmp_path, num_evaluations=2)
     before = (tmp_path / JOURNAL).read_bytes()
-    with pytest.raises(ValueError, match=r"the journal of another search: seed \(0 there, 3 here\), worlds \(6 there"):
-        searched(tmp_path, evaluations=2, seed=3, worlds=4, resume=True)
-    with pytest.raises(BadFileError, match="the start has another score today"):
-        searched(tmp_path, evaluations=2, worth=lambda rig: near_far(rig) + 1e-9, resume=True)
-    with pytest.raises(ValueError, match="journal of another search: "):
-        searched(tmp_path, of=space(objectives=("near", "far")), evaluations=2, resume=True)
+    with pytest.raises(
+        ValueError,
+        match=r"the journal belongs to another search: num_scenes \(6 there, 4 here\), seed \(0 there, 3 here",
+    ):
+        searched(tmp_path, num_evaluations=2, seed=3, num_scenes=4, resume=True)
+    with pytest.raises(BadFileError, match="the start has a different score now"):
+        searched(tmp_path, num_evaluations=2, worth=lambda rig: near_far(rig) + 1e-9, resume=True)
+    with pytest.raises(ValueError, match="journal belongs to another search: "):
+        searched(tmp_path, of=space(objectives=("near", "far")), num_evaluations=2, resume=True)
     assert (tmp_path / JOURNAL).read_bytes() == before
 
 
@@ -225,12 +235,12 @@ def damaged(text):
 
 
 def test_a_damaged_journal_is_one_line(tmp_path):
-    searched(tmp_path, evaluations=2)
+    searched(tmp_path, num_evaluations=2)
     path = tmp_path / JOURNAL
     for text in damaged(path.read_text()):
         path.write_text(text)
         with pytest.raises(BadFileError, match=JOURNAL) as error:
-            searched(tmp_path, evaluations=2, resume=True)
+            searched(tmp_path, num_evaluations=2, resume=True)
         assert "\n" not in str(error.value)
 
 
@@ -238,17 +248,17 @@ def test_a_journal_is_neither_written_through_links_nor_waits_for_locks(tmp_path
     out = tmp_path / "out"
     (tmp_path / "out").mkdir()
     (out / f"{JOURNAL}.lock").symlink_to("nothing")  # a killed process leaves one; Optuna would wait for its end
-    searched(out, evaluations=2)
+    searched(out, num_evaluations=2)
     (out / JOURNAL).rename(tmp_path / "mine")
     with (tmp_path / "mine").open("a") as file:
         file.write("a line that was not finished")
     before = (tmp_path / "mine").read_bytes()
     (out / JOURNAL).symlink_to(tmp_path / "mine")
     with pytest.raises(ValueError, match=rf"{JOURNAL}: a symbolic link; nothing is written through links"):
-        searched(out, evaluations=3, resume=True)
+        searched(out, num_evaluations=3, resume=True)
     (out / JOURNAL).unlink()
     (out / JOURNAL).hardlink_to(tmp_path / "mine")
-    assert len(searched(out, evaluations=3, resume=True).search.evaluations) == 4
+    assert len(searched(out, num_evaluations=3, resume=True).search.evaluations) == 4
     assert (tmp_path / "mine").read_bytes() == before
 
 
@@ -276,10 +286,10 @@ class Clock:
                 clock.now += clock.frame_s * len(self)
                 return super().score(rig)
 
-            def resampled(self, seed, worlds, more):
-                return clock.makes(space, plan, seed, worlds, more)
+            def resample(self, seed, num_scenes, extra_objectives):
+                return clock.makes(space, plan, seed, num_scenes, extra_objectives)
 
-        return Slow(seed, worlds, plan.per_world, objectives={**space.numbers, **dict(more)})
+        return Slow(seed, worlds, plan.frames_per_scene, objectives={**space.scored_objectives, **dict(more)})
 
 
 def timed(budget_s, monkeypatch):
@@ -296,11 +306,13 @@ def test_a_budget_of_seconds_is_kept_with_the_test_and_proposes_what_a_number_of
     assert 65 < clock.now < 80
     count = len(result.search.evaluations) - 1
     assert count > 10
-    assert contents(result.search) == contents(searched(evaluations=count).search)
+    assert contents(result.search) == contents(searched(num_evaluations=count).search)
 
 
 def test_a_budget_below_two_evaluations_says_what_they_take(monkeypatch):
-    with pytest.raises(ValueError, match=r"30 s are less than two .* 11\.8 s, .* 1\.8 s, .* 46\.5 s; give 62"):
+    with pytest.raises(
+        ValueError, match=r"30 s is too short for two .* 11\.8 s, .* 1\.8 s, .* 46\.5 s; give at least 62"
+    ):
         timed(30.0, monkeypatch)
     timed(62.0, monkeypatch)
 
@@ -308,10 +320,10 @@ def test_a_budget_below_two_evaluations_says_what_they_take(monkeypatch):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"budget_s": 3.0, "evaluations": 3}, "seconds or a number of evaluations is needed; got both"),
-        ({"evaluations": 0}, "evaluations: 1 or more is needed; got 0"),
-        ({"budget_s": 0.0}, "more than 0 s is needed"),
-        ({"estimate": "mean"}, "one of area, known is needed"),
+        ({"budget_s": 3.0, "num_evaluations": 3}, "budget, num_evaluations: got both"),
+        ({"num_evaluations": 0}, "num_evaluations: got 0; give 1 or more"),
+        ({"budget_s": 0.0}, "budget: got 0 s; give more than 0 s"),
+        ({"average": "mean"}, "average: got 'mean'; give area or cells"),
     ],
 )
 def test_a_plan_that_makes_no_sense(settings, message):
@@ -328,11 +340,11 @@ def only_the_start(rig):
 
 
 def test_where_no_candidate_is_possible_the_start_stays_and_the_words_say_so():
-    result = searched(evaluations=8, worth=only_the_start)
+    result = searched(num_evaluations=8, worth=only_the_start)
     assert [each.infeasible_reason for each in result.search.evaluations] == ["", *["inside the wall"] * 8]
     assert result.best.is_start
     assert result.rig == result.search.space.start
-    assert result.summary == "None of 8 candidates is possible, the last for this reason: inside the wall."
+    assert result.summary == "All 8 candidates are infeasible; reason of the last: inside the wall."
 
 
 def test_impossible_rigs_are_avoided_after_some_of_them():
@@ -343,7 +355,7 @@ def test_impossible_rigs_are_avoided_after_some_of_them():
             raise ValueError("behind")
         return near_far(rig) - 0.1 * rig.sensors[0].mount.x_m
 
-    search = searched(evaluations=24, worth=worth).search
+    search = searched(num_evaluations=24, worth=worth).search
     modeled = [each for each in search.evaluations if each.strategy == "optimizer"]
     assert np.mean([not each.infeasible_reason for each in modeled[-6:]]) > 0.5
     assert 0 <= search.evaluations[search.find_best()[0]].values["roof.x_m"] < 0.15
@@ -358,39 +370,41 @@ def tilted():
 
 
 def test_a_start_that_is_impossible_is_compared_with_but_does_not_win():
-    with pytest.warns(UserWarning, match="'tilted' is none of the space"):
+    with pytest.warns(UserWarning, match="'tilted' is outside the space"):
         of = space(constraints={"max_self_hit_share": 0.2}, start=tilted())
-    result = searched(of=of, evaluations=12)
+    result = searched(of=of, num_evaluations=12)
     start = result.search.evaluations[0]
-    assert start.infeasible_reason == "30.0% of its rays end on the vehicle; max_self_hit_share is 20.0%"
+    assert start.infeasible_reason == "30.0% of its rays hit the vehicle; max_self_hit_share is 20.0%"
     assert not result.best.is_start
     assert result.best.evaluation.values["roof.pitch_deg"] <= 20
 
 
 def test_too_many_rays_on_the_vehicle_are_infeasible():
-    search = searched(of=space(constraints={"max_self_hit_share": 0.05}), evaluations=12).search
+    search = searched(of=space(constraints={"max_self_hit_share": 0.05}), num_evaluations=12).search
     refused = [each for each in search.evaluations if each.infeasible_reason]
     assert {each.number for each in refused} == {
         each.number for each in search.evaluations if each.values["roof.pitch_deg"] > 5
     }
-    assert "of its rays end on the vehicle; max_self_hit_share is 5.0%" in refused[0].infeasible_reason
+    assert "of its rays hit the vehicle; max_self_hit_share is 5.0%" in refused[0].infeasible_reason
 
 
 def test_an_objective_that_is_unknown_is_refused():
-    with pytest.raises(ValueError, match=r"objectives\.near: unknown in all 18 frames: one of its regions"):
-        searched(evaluations=10, blind=True)
+    with pytest.raises(
+        ValueError, match=r"objectives\.near: unknown in all 18 frames: a region and band is never visible"
+    ):
+        searched(num_evaluations=10, blind=True)
 
 
 def test_noise_alone_and_one_world_are_not_called_a_gain():
-    result = searched(evaluations=12, worth=lambda rig: np.array([0.5, 0.5]), seed=4)
+    result = searched(num_evaluations=12, worth=lambda rig: np.array([0.5, 0.5]), seed=4)
     assert "gained" not in result.summary
     assert result.best.improvements[0].difference.is_significant is False
     assert result.best.improvements[0].optimism > 0
-    assert "no gain is shown" in searched(evaluations=6, worlds=1, fresh_worlds=1).summary
+    assert "no significant improvement" in searched(num_evaluations=6, num_scenes=1, num_held_out_scenes=1).summary
 
 
 def test_of_several_objectives_the_ends_of_the_front_and_a_compromise_are_tested():
-    result = searched(of=space(objectives=("near", "far")), evaluations=24)
+    result = searched(of=space(objectives=("near", "far")), num_evaluations=24)
     assert [each.role for each in result.finalists] == ["compromise", "near", "far"]
     gains = {each.role: result.improvements[each.evaluation.number] for each in result.finalists}
     assert gains["near"][0] == result.improvements[:, 0].max()
@@ -398,27 +412,27 @@ def test_of_several_objectives_the_ends_of_the_front_and_a_compromise_are_tested
     front = result.search.find_best()
     pitches = [result.search.evaluations[at].values["roof.pitch_deg"] for at in front]
     assert min(pitches) < 0 < max(pitches)
-    assert f"Of the front's {len(front)} rigs, " in result.summary
+    assert f" of {len(front)} rigs of the front are random candidates (12)" in result.summary
 
 
 def test_asking_and_telling_is_what_a_run_does():
-    run = searched(evaluations=9).search
-    search = PlacementSearch(space(), plan(evaluations=9))
+    run = searched(num_evaluations=9).search
+    search = PlacementSearch(space(), plan(num_evaluations=9))
     while (candidate := search.ask()) is not None:
         search.tell(candidate, search.frames.score(candidate.rig))
     assert contents(search) == contents(run)
-    search = PlacementSearch(space(), plan(evaluations=2))
+    search = PlacementSearch(space(), plan(num_evaluations=2))
     start = search.ask()
     with pytest.raises(ValueError, match="the start, front_roof_32, cannot be scored: no"):
         search.reject(start, "no")
     search.tell(start, search.frames.score(start.rig))
-    with pytest.raises(ValueError, match="candidate 1 is to be told next; got candidate 0"):
+    with pytest.raises(ValueError, match="candidate: got number 0; give the last of `ask`, 1"):
         search.tell(start, search.frames.score(start.rig))
 
 
 def test_each_choice_is_tried_once_and_the_search_ends_when_all_were():
     of = space(free={"roof": {"model": ("hesai_pandar64", "ouster_os1_64", "ouster_os1_128")}})
-    evaluations = searched(of=of, evaluations=50).search.evaluations
+    evaluations = searched(of=of, num_evaluations=50).search.evaluations
     tried = [each.values["roof.model"] for each in evaluations[1:]]
     assert sorted(tried) == ["hesai_pandar64", "ouster_os1_128", "ouster_os1_64"]
 
@@ -437,8 +451,8 @@ def test_a_real_search_does_not_depend_on_the_number_of_workers(tmp_path):
             "objectives": {"near": {"region": "20m"}},
         }
     )
-    small = {"worlds": 3, "num_held_out_scenes": 3, "per_world": 2, "frame_interval_s": 0.4, "rays": 512}
-    results = [run_search(PlacementSearch(of, evaluations=3, workers=workers, **small)) for workers in (0, 1)]
+    small = {"num_scenes": 3, "num_held_out_scenes": 3, "frames_per_scene": 2, "frame_interval_s": 0.4, "num_rays": 512}
+    results = [run_search(PlacementSearch(of, num_evaluations=3, num_workers=workers, **small)) for workers in (0, 1)]
     assert contents(results[0].search) == contents(results[1].search)
     assert results[0].summary == results[1].summary
     assert 0 < results[0].search.evaluations[0].estimate.value[0] < 1

@@ -24,8 +24,8 @@ PLACES = {
 SPACE = {
     "name": "ends",
     "scenario": "lot.yaml",
-    "candidates": {"wide": {"sensor": SENSOR, "places": PLACES}},
-    "choose": {"max_sensors": 2},
+    "candidates": {"wide": {"sensor": SENSOR, "mounts": PLACES}},
+    "constraints": {"max_sensors": 2},
     "objectives": {"around": {"band": "ground", "region": ["front_3m", "rear_3m"]}},
 }
 
@@ -47,7 +47,7 @@ def loaded(folder, **changes):
 CHOSEN_BY = [Objective(threshold_m=0.3, region=["80m", "20m"]), Objective(region=BAY, band="ground")]
 
 
-@pytest.mark.parametrize("measure", ["area", "known"])
+@pytest.mark.parametrize("measure", ["area", "cells"])
 @pytest.mark.parametrize("objective", CHOSEN_BY)
 def test_what_points_are_worth_is_what_evaluate_says_of_the_rig(objective, measure):
     """The OR of what sensors see, in bits, and the coverage of all of them."""
@@ -56,7 +56,7 @@ def test_what_points_are_worth_is_what_evaluate_says_of_the_rig(objective, measu
         lidar("b", mount={"y_m": 1.2, "z_m": 0.9, "yaw_deg": 70}, channels=24, horizontal_fov_deg=200),
         lidar("c"),
     ]
-    with held(objectives={"a": objective}, estimate=measure) as instants:
+    with held(objectives={"a": objective}, average=measure) as instants:
         worth = compute_point_weights(instants)
         assert worth.sum() == pytest.approx(1.0, rel=1e-12)
         seen = [observe_points(rig(sensor), instants)[0] for sensor in sensors]
@@ -65,25 +65,25 @@ def test_what_points_are_worth_is_what_evaluate_says_of_the_rig(objective, measu
             assert worth[0] @ np.any([seen[one] for one in each], axis=0) == pytest.approx(expected, rel=1e-12)
 
 
-@pytest.mark.parametrize("measure", ["area", "known"])
+@pytest.mark.parametrize("measure", ["area", "cells"])
 def test_worlds_that_know_nothing_of_a_part_count_for_nothing(measure):
     yard = {"name": "yard", "ego": EGO, "bodies": [FLOOR]}
     walled = {"name": "walled", "ego": EGO, "bodies": [FLOOR, WALL]}
     scenarios = [type(LOT).model_validate(one) for one in (yard, walled)]
     asked = {"a": Objective(region="20m", band="obstacle")}
-    with held(scenarios, asked, per_world=1, frame_interval_s=0.1, estimate=measure) as two:
+    with held(scenarios, asked, frames_per_scene=1, frame_interval_s=0.1, average=measure) as two:
         value = float(two.score(rig()).estimate.value[0])
         assert compute_point_weights(two)[0] @ observe_points(rig(), two)[0] == pytest.approx(value, rel=1e-12)
     with (
-        held(scenarios[:1], asked, per_world=1, frame_interval_s=0.1) as one,
-        pytest.raises(ValueError, match="no frame shows any surface of obstacle in 20m"),
+        held(scenarios[:1], asked, frames_per_scene=1, frame_interval_s=0.1) as one,
+        pytest.raises(ValueError, match="no frame contains a visible surface of obstacle in 20m"),
     ):
         compute_point_weights(one)
 
 
 def test_the_choice_is_the_rig_with_the_best_score_and_its_files_say_so(folder):
-    space = loaded(folder, now=["wide_left"])
-    with held(space.scenarios, space.scored_objectives, worlds=2) as instants:
+    space = loaded(folder, baseline=["wide_left"])
+    with held(space.scenarios, space.scored_objectives, num_scenes=2) as instants:
         found = run_selection(space, instants, test_seed=5, num_held_out_scenes=3)
         pairs = [("front", "rear"), ("front", "left"), ("rear", "left")]
         named = {sensor.name: sensor for sensor in space.sensors}
@@ -110,19 +110,19 @@ def test_the_choice_is_the_rig_with_the_best_score_and_its_files_say_so(folder):
     }  # fmt: skip
     assert Rig.load(folder / "out" / "best.yaml").sensors == found.rig.sensors
     rows = list(csv.DictReader((folder / "out" / "candidates.csv").read_text().splitlines()))
-    assert [row["name"] for row in rows if row["chosen"] == "True"] == sorted(
+    assert [row["name"] for row in rows if row["selected"] == "True"] == sorted(
         found.get_sensor_names(found.best.selected)
     )
-    assert "inside" in rows[-1]["why_not"]
+    assert "inside" in rows[-1]["reason"]
     assert found.to_dataframe()["name"].tolist() == [row["name"] for row in rows]
     assert found.summary in repr(found)
-    assert json.loads((folder / "out" / "search.json").read_text())["found"][0]["proven"] is True
+    assert json.loads((folder / "out" / "search.json").read_text())["selections"][0]["is_proven"] is True
 
 
 def test_what_must_not_be_worse_is_kept_by_the_best_of_several_objectives(folder):
-    objectives = {side: {"band": "ground", "region": f"{side}_3m", "detection": 0.3} for side in ("front", "rear")}
-    space = loaded(folder, objectives=objectives, now=["wide_left"], not_worse=["left_3m"])
-    with held(space.scenarios, space.scored_objectives, worlds=2) as instants:
+    objectives = {side: {"band": "ground", "region": f"{side}_3m", "threshold_m": 0.3} for side in ("front", "rear")}
+    space = loaded(folder, objectives=objectives, baseline=["wide_left"], not_worse=["left_3m"])
+    with held(space.scenarios, space.scored_objectives, num_scenes=2) as instants:
         found = run_selection(space, instants, test_seed=5, num_held_out_scenes=3)
         kept = found.coverage.compute_values(found.baseline)[2]
         # The thresholds differ: what a point is worth is a matter of both.
@@ -135,16 +135,16 @@ def test_what_must_not_be_worse_is_kept_by_the_best_of_several_objectives(folder
     assert [one.values[at] for at, one in enumerate(found.selections[1:])] == [
         max(one.values[at] for one in found.selections) for at in range(2)
     ]
-    assert "between the best of front, rear" in found.summary
+    assert "compromise between front, rear" in found.summary
     written = {path.name for path in found.save(folder / "several", files=["numbers"])}
     assert {"best.yaml", "best_front.yaml", "best_rear.yaml"} < written
 
 
 def test_where_no_choice_keeps_what_is_there_the_least_bad_says_by_how_much(folder):
     space = loaded(
-        folder, choose={"max_sensors": 1}, now=["wide_front", "wide_rear"], not_worse=["front_3m", "rear_3m"]
+        folder, constraints={"max_sensors": 1}, baseline=["wide_front", "wide_rear"], not_worse=["front_3m", "rear_3m"]
     )
-    with held(space.scenarios, space.scored_objectives, worlds=1) as instants:
+    with held(space.scenarios, space.scored_objectives, num_scenes=1) as instants:
         found = run_selection(space, instants, test_seed=5, num_held_out_scenes=1)
         each = {at: found.coverage.compute_values([at])[1:] for at in range(len(found.sensors))}
         kept = found.coverage.compute_values(found.baseline)[1:]
@@ -155,16 +155,16 @@ def test_where_no_choice_keeps_what_is_there_the_least_bad_says_by_how_much(fold
     lost = kept - each[found.best.selected[0]]
     names = [name for name in space.scored_objectives if name not in space.objectives]
     told = [f"{100 * lack:.2f} points of {name}" for lack, name in zip(lost, names, strict=True) if lack > 1e-6]
-    assert f"keeps all that must be kept, and this one lacks the least: {'; '.join(told)}" in found.summary
+    assert f"meets all bounds, and this one has the smallest shortfall: {'; '.join(told)}" in found.summary
 
 
 def test_a_candidate_with_too_many_rays_on_the_vehicle_is_refused(folder):
     low = {"front": PLACES["front"], "flat": {"z_m": 1.51}}
-    candidates, limits = {"wide": {"sensor": SENSOR, "places": low}}, {"max_sensors": 1, "max_self_hit_share": 0.4}
-    space = loaded(folder, candidates=candidates, choose=limits)
-    with held(space.scenarios, space.scored_objectives, worlds=1) as instants:
+    candidates, limits = {"wide": {"sensor": SENSOR, "mounts": low}}, {"max_sensors": 1, "max_self_hit_share": 0.4}
+    space = loaded(folder, candidates=candidates, constraints=limits)
+    with held(space.scenarios, space.scored_objectives, num_scenes=1) as instants:
         found = run_selection(space, instants, test_seed=5, num_held_out_scenes=1)
-    assert "of its rays end on the vehicle; max_self_hit_share is 40.0%" in found.excluded["wide_flat"]
+    assert "of its rays hit the vehicle; max_self_hit_share is 40.0%" in found.excluded["wide_flat"]
 
 
 def test_places_all_over_a_region_lie_on_its_skin(tmp_path):
@@ -183,16 +183,22 @@ def test_places_all_over_a_region_lie_on_its_skin(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"choose": {}}, "max_sensors, max_cost_eur: one of the two is needed"),
-        ({"choose": {"max_cost_eur": 500}}, "cost: no price of wide"),
-        ({"choose": {"max_cost_eur": 500}, "cost": {"wide": 600}}, "500, but the cheapest candidate costs 600"),
-        ({"cost": {"narrow": 1}}, "cost: narrow: no group of candidates"),
-        ({"now": ["wide_top"]}, "now: wide_top: no candidate"),
-        ({"now": ["wide_left", "wide_left"]}, "now: wide_left is there once at most"),
-        ({"always": "front_roof_32", "now": ["roof"]}, "now: roof: no candidate; they are wide_front"),
+        ({"constraints": {}}, "max_sensors, max_cost_eur: got neither"),
+        ({"constraints": {"max_cost_eur": 500}}, "prices_eur: wide has no price"),
+        (
+            {"constraints": {"max_cost_eur": 500}, "prices_eur": {"wide": 600}},
+            "got 500, but the cheapest candidate costs 600",
+        ),
+        ({"prices_eur": {"narrow": 1}}, "prices_eur: narrow is no group of candidates"),
+        ({"baseline": ["wide_top"]}, "baseline: wide_top is no candidate"),
+        ({"baseline": ["wide_left", "wide_left"]}, "baseline: wide_left is named twice"),
+        ({"fixed_rig": "front_roof_32", "baseline": ["roof"]}, "baseline: roof is no candidate; they are wide_front"),
         ({"scenario": "moon"}, "'moon' is neither"),
-        ({"candidates": {"wide": {"sensor": SENSOR}}}, "places, grid: at least one of the two is needed"),
-        ({"candidates": {"wide": {"sensor": {**SENSOR, "name": "x"}, "places": PLACES}}}, "name: the places make them"),
+        ({"candidates": {"wide": {"sensor": SENSOR}}}, "mounts, grid: got neither"),
+        (
+            {"candidates": {"wide": {"sensor": {**SENSOR, "name": "x"}, "mounts": PLACES}}},
+            "name: mounts and grid define them",
+        ),
         (
             {"candidates": {"wide": {"sensor": SENSOR, "grid": {"region": ["wing"], "spacing_m": 1}}}},
             "candidates.wide.grid.region: .* has no 'wing'",
@@ -200,10 +206,10 @@ def test_places_all_over_a_region_lie_on_its_skin(tmp_path):
         ({"objectives": {"a": {"band": "sky", "region": "20m"}}}, "sky"),
         (
             {"objectives": {"a": {"number": "radius_m", "region": "20m"}}},
-            "candidates are chosen by a detection, .* 'radius_m'",
+            "got 'radius_m', but a selection needs a detection rate",
         ),
         ({"objectives": {"a": {"region": "behind"}}}, "behind"),
-        ({"not_worse": ["20m"]}, "not_worse: say what is there today"),
+        ({"not_worse": ["20m"]}, "not_worse: there is no baseline"),
         ({"candidates": {}}, "candidates"),
     ],
 )
@@ -214,32 +220,32 @@ def test_what_cannot_be_chosen_is_refused_in_one_line(folder, changes, message):
 
 
 def test_candidates_that_are_all_inside_are_refused(folder):
-    space = loaded(folder, candidates={"wide": {"sensor": SENSOR, "places": {"a": {"z_m": 0.7}}}})
+    space = loaded(folder, candidates={"wide": {"sensor": SENSOR, "mounts": {"a": {"z_m": 0.7}}}})
     with (
-        held(space.scenarios, space.scored_objectives, worlds=1) as instants,
-        pytest.raises(ValueError, match=r"none of 1 can be there; of wide_a: .* inside the ego"),
+        held(space.scenarios, space.scored_objectives, num_scenes=1) as instants,
+        pytest.raises(ValueError, match=r"none of 1 can be mounted; wide_a: .* inside the ego"),
     ):
         run_selection(space, instants, test_seed=5, num_held_out_scenes=1)
 
 
 def test_candidates_that_see_nothing_that_counts_are_refused(folder):
     up = {**SENSOR, "vertical_fov_deg": [60, 80]}
-    space = loaded(folder, candidates={"wide": {"sensor": up, "places": PLACES}})
+    space = loaded(folder, candidates={"wide": {"sensor": up, "mounts": PLACES}})
     with (
-        held(space.scenarios, space.scored_objectives, worlds=1) as instants,
-        pytest.raises(ValueError, match="none of the 3 that can be there adds anything"),
+        held(space.scenarios, space.scored_objectives, num_scenes=1) as instants,
+        pytest.raises(ValueError, match="none of the 3 that can be mounted improves"),
     ):
         run_selection(space, instants, test_seed=5, num_held_out_scenes=1)
 
 
 def test_of_few_fresh_worlds_there_is_no_error_and_no_gain_is_shown(folder):
-    space = loaded(folder, now=["wide_left"])
-    with held(space.scenarios, space.scored_objectives, worlds=1) as instants:
+    space = loaded(folder, baseline=["wide_left"])
+    with held(space.scenarios, space.scored_objectives, num_scenes=1) as instants:
         found = run_selection(space, instants, test_seed=5, num_held_out_scenes=1)
-    assert "no gain is shown" in found.summary
+    assert "no significant improvement" in found.summary
     assert "nan" not in found.summary
     found.save(folder / "few")
-    assert json.loads((folder / "few" / "search.json").read_text())["fresh"]["around, area"]["error"] is None
+    assert json.loads((folder / "few" / "search.json").read_text())["improvements"]["around, area"]["error"] is None
 
 
 def test_the_example_has_money_for_two_but_not_for_two_wide_ones():

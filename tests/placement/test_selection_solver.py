@@ -8,6 +8,7 @@ import pytest
 from torchcover.placement.selection_solver import (
     CandidateCoverage,
     SelectionLimits,
+    SolverParams,
     sample_selections,
     select_for_objectives,
     select_sensors,
@@ -33,7 +34,7 @@ def slow_values(seen, worth, chosen):
 def all_allowed(limits, count=COUNT):
     for size in range(limits.max_sensors + 1):
         for chosen in combinations(range(count), size):
-            if all(limits.allow(chosen[:at], one) for at, one in enumerate(chosen)):
+            if all(limits.can_add(chosen[:at], one) for at, one in enumerate(chosen)):
                 yield chosen
 
 
@@ -124,7 +125,7 @@ def test_a_solver_without_time_says_how_far_off_it_may_be():
     generator = np.random.default_rng(0)
     seen = list(generator.random((60, 3000)) < 0.05)
     coverage = CandidateCoverage.from_points([np.full(3000, 1 / 3000)], seen, np.zeros(3000, dtype=bool))
-    selection = select_sensors(coverage, SelectionLimits(12), time_limit_s=0.5)
+    selection = select_sensors(coverage, SelectionLimits(12), params=SolverParams(time_limit_s=0.5))
     assert not selection.is_proven
     assert selection.gap > 0
 

@@ -45,7 +45,7 @@ def space(free, start=PAIR, **keys):
 def drawn(searched, count=20):
     """Values all over a space."""
     for shares in np.random.default_rng(1).random((count, len(searched.variables))).tolist():
-        yield {variable.name: variable.at(u) for variable, u in zip(searched.variables, shares, strict=True)}
+        yield {variable.name: variable.get_value(u) for variable, u in zip(searched.variables, shares, strict=True)}
 
 
 def place(sensor):
@@ -159,10 +159,10 @@ def test_a_model_brings_its_whole_pattern():
 def test_a_rig_costs_its_models_and_its_mounts():
     cost = {"velodyne_vlp16": 3000.0, "velodyne_vlp32c": 9000.0, "right": 500.0, "mount": 100.0}
     free = {"model": ("velodyne_vlp16", "velodyne_vlp32c"), "present": (True, False)}
-    with pytest.raises(ValueError, match="no price of 'left', for the sensor 'left'"):
-        space({"left": free}, cost=cost)
+    with pytest.raises(ValueError, match="'left' of the sensor 'left' has no price"):
+        space({"left": free}, prices_eur=cost)
     start = Rig(name="start", sensors=(Lidar.model_validate({"name": "left", "model": "velodyne_vlp16"} | HIGH), RIGHT))
-    searched = space({"left": free}, start, cost=cost)
+    searched = space({"left": free}, start, prices_eur=cost)
     prices = {
         (model, there): searched.compute_cost_eur(
             searched.build_rig({"left.model": model, "left.present": there}, "found")
@@ -180,10 +180,10 @@ def test_what_a_rig_cannot_be_is_told():
     cost = {"left": 1000.0, "right": 1000.0}
     constraints = {"min_distance_m": 0.3, "symmetric": True, "max_cost_eur": 1500.0}
     keys = {"y_m": (-0.6, 0.6), "z_m": (-1.0, 2.0)}
-    with pytest.warns(UserWarning, match=r"'pair' is none of the space \(it costs 2000 EUR"):
+    with pytest.warns(UserWarning, match=r"'pair' is outside the space \(it costs 2000 EUR"):
         searched = space(
             {"left": keys | {"present": (True, False)}, "right": {"y_m": (-0.6, 0.6)}},
-            cost=cost,
+            prices_eur=cost,
             constraints=constraints | {"symmetric": False},
         )
     free = space({"left": keys}, constraints={"min_distance_m": 0.3})
@@ -206,9 +206,9 @@ def test_values_that_make_no_rig_are_refused():
     searched = space({"left": everything | {"x_m": (-9.0, 0.0), "z_above_body_m": (0.1, 0.2)}, "right": everything})
     values = {"left.present": True, "left.x_m": -0.5, "left.z_above_body_m": 0.15, "right.present": True}
     for changed, message in (
-        ({"left.x_m": -8.0}, r"left: z_above_body_m: nothing of suv is below x = -8\.000 m, y = 0\.500 m"),
+        ({"left.x_m": -8.0}, r"left: z_above_body_m: suv has no body at x = -8\.000 m, y = 0\.500 m"),
         ({"left.present": False, "right.present": False}, "no sensor is left"),
-        ({"left.x_m": 5.0}, r"left\.x_m: a number from -9 to 0 is needed; got 5\.0"),
+        ({"left.x_m": 5.0}, r"left\.x_m: got 5\.0; give a number from -9 to 0"),
         ({"left.yaw_deg": 5.0}, r"missing or unknown: left\.yaw_deg"),
     ):
         with pytest.raises(ValueError, match=message):
@@ -218,58 +218,64 @@ def test_values_that_make_no_rig_are_refused():
 MISTAKES = [
     ({"free": {}}, "free: "),
     ({"free": {"rof": {"x_m": [0, 1]}}}, "free.rof: 'front_roof_32' has no such sensor; it has roof"),
-    ({"free": {"roof": {}}}, "free.roof: nothing of it is free"),
-    ({"free": {"roof": {"x_m": 0.5}}}, "free: every number is set"),
+    ({"free": {"roof": {}}}, "free.roof: nothing is free"),
+    ({"free": {"roof": {"x_m": 0.5}}}, "free: all numbers are fixed"),
     ({"free": {"roof": {"x_cm": [0, 1]}}}, "free.roof.x_cm: "),
-    ({"free": {"roof": {"x_m": [1, 1]}}}, "free.roof.x_m: the lowest must be below the highest; got (1, 1)"),
-    ({"free": {"roof": {"x_m": [2, 1]}}}, "free.roof.x_m: the lowest must be below"),
-    ({"free": {"roof": {"x_m": [0, float("nan")]}}}, "free.roof.x_m: from -1e+09 to 1e+09 is allowed"),
-    ({"free": {"roof": {"x_m": [0, 1, 2]}}}, "free.roof.x_m: a number, or the lowest and the highest"),
-    ({"free": {"roof": {"x_m": True}}}, "free.roof.x_m: a number, or the lowest"),
-    ({"free": {"roof": {"z_m": [1.7, 1.8], "z_above_body_m": [0, 1]}}}, "z_m or z_above_body_m, not both"),
-    ({"free": {"roof": {"z_m": [-2.0, -1.0]}}}, "free.roof: in none of 256 places of its ranges can it be: roof at"),
+    ({"free": {"roof": {"x_m": [1, 1]}}}, "free.roof.x_m: got (1, 1); the first value must be below the second"),
+    ({"free": {"roof": {"x_m": [2, 1]}}}, "free.roof.x_m: got (2, 1); the first value must be below"),
+    ({"free": {"roof": {"x_m": [0, float("nan")]}}}, "free.roof.x_m: got (0, nan); give values from -1e+09 to 1e+09"),
+    ({"free": {"roof": {"x_m": [0, 1, 2]}}}, "free.roof.x_m: got (0, 1, 2); give a number, or [smallest, largest]"),
+    ({"free": {"roof": {"x_m": True}}}, "free.roof.x_m: got True; give a number"),
+    ({"free": {"roof": {"z_m": [1.7, 1.8], "z_above_body_m": [0, 1]}}}, "z_m, z_above_body_m: got both"),
+    ({"free": {"roof": {"z_m": [-2.0, -1.0]}}}, "free.roof: none of 256 sampled positions is possible: roof at"),
     ({"free": {"roof": {"x_m": [-0.5, 0.0], "z_m": [0.7, 1.4]}}}, "is inside the vehicle's body"),
-    ({"free": {"roof": {"x_m": [5.0, 6.0], "z_above_body_m": [0.1, 0.2]}}}, "z_above_body_m: nothing of suv is below"),
-    ({"free": {"roof": {"u": [0, 1]}}}, "free.roof: u: they are places in a region"),
-    ({"free": {"roof": {"region": "roof", "x_m": [0, 1]}}}, "free.roof: x_m: the place is that in the region"),
+    ({"free": {"roof": {"x_m": [5.0, 6.0], "z_above_body_m": [0.1, 0.2]}}}, "z_above_body_m: suv has no body at"),
+    ({"free": {"roof": {"u": [0, 1]}}}, "free.roof: u: there is no region"),
+    ({"free": {"roof": {"region": "roof", "x_m": [0, 1]}}}, "free.roof: x_m: a region defines the position"),
     ({"free": {"roof": {"region": "spoiler"}}}, "free.roof.region: suv has no 'spoiler'; it has roof, hood, grille"),
-    ({"free": {"roof": {"region": "roof"}}, "vehicle": "cyclist"}, "cyclist has no 'roof'; it has none at all"),
-    ({"free": {"roof": {"region": ["roof"]}}}, "free.roof: region: at least two different options are needed"),
-    ({"free": {"roof": {"region": "roof", "u": [0.5, 1.5]}}}, "free.roof.u: from 0 to 1 is allowed"),
-    ({"free": {"roof": {"region": "roof", "height_m": [-0.1, 0.5]}}}, "free.roof.height_m: from 0.001 to 10"),
+    ({"free": {"roof": {"region": "roof"}}, "vehicle": "cyclist"}, "cyclist has no 'roof'; it has none"),
+    ({"free": {"roof": {"region": ["roof"]}}}, "free.roof: region: got roof; give at least two different options"),
+    ({"free": {"roof": {"region": "roof", "u": [0.5, 1.5]}}}, "free.roof.u: got (0.5, 1.5); give values from 0 to 1"),
+    (
+        {"free": {"roof": {"region": "roof", "height_m": [-0.1, 0.5]}}},
+        "free.roof.height_m: got (-0.1, 0.5); give values from 0.001 to 10",
+    ),
     ({"free": {"roof": {"model": ["velodyne_vlp16"]}}}, "free.roof.model: "),
-    ({"free": {"roof": {"model": ["velodyne_vlp16", "velodyne_vlp16"]}}}, "model: at least two different options"),
+    (
+        {"free": {"roof": {"model": ["velodyne_vlp16", "velodyne_vlp16"]}}},
+        "model: got velodyne_vlp16, velodyne_vlp16; give at least two different options",
+    ),
     ({"free": {"roof": {"model": ["velodyne_vlp16", "velodine"]}}}, "built-in lidars; is "),
-    ({"free": {"roof": {"present": [True, True]}}}, "free.roof: present: [true, false] is the choice"),
+    ({"free": {"roof": {"present": [True, True]}}}, "free.roof: present: got [True, True]; give [true, false]"),
     (
         {"free": {"roof": {"mirror_of": "left"}}},
-        "free.roof.mirror_of: a free sensor is needed, one of none",
+        "free.roof.mirror_of: got 'left'; give a free sensor, one of none",
     ),
-    ({"free": {"roof": {"mirror_of": "roof"}}}, "free.roof.mirror_of: a free sensor is needed"),
-    ({"free": {"roof": {"mirror_of": "left", "x_m": [0, 1]}}}, "mirror_of: the mirror image has nothing of its own"),
-    ({"constraints": {"max_cost_eur": 100}}, "constraints.max_cost_eur: nothing has a price"),
-    ({"constraints": {"max_cost_eur": 100}, "cost": {"roof": 200}}, "the cheapest rig of the space costs 200"),
-    ({"cost": {"velodyne_vlp16": 200}}, "cost: no price of 'roof', for the sensor 'roof'"),
-    ({"cost": {"roof": 200, "rof": 200}}, "cost: rof: no LiDAR model, no sensor"),
+    ({"free": {"roof": {"mirror_of": "roof"}}}, "free.roof.mirror_of: got 'roof'; give a free sensor"),
+    ({"free": {"roof": {"mirror_of": "left", "x_m": [0, 1]}}}, "mirror_of: a mirror image has no other keys"),
+    ({"constraints": {"max_cost_eur": 100}}, "constraints.max_cost_eur: there are no prices"),
+    ({"constraints": {"max_cost_eur": 100}, "prices_eur": {"roof": 200}}, "the cheapest rig of the space costs 200"),
+    ({"prices_eur": {"velodyne_vlp16": 200}}, "prices_eur: 'roof' of the sensor 'roof' has no price"),
+    ({"prices_eur": {"roof": 200, "rof": 200}}, "prices_eur: rof is no LiDAR model, no sensor"),
     ({"constraints": {"min_distance": 1}}, "constraints.min_distance: "),
     (
         {"constraints": {"symmetric": True}, "free": {"roof": {"yaw_deg": [5, 9]}}},
-        "constraints: none of 256 candidates",
+        "constraints: none of 256 sampled candidates",
     ),
     ({"objectives": {}}, "objectives: "),
     ({"objectives": {name: {"region": "20m"} for name in "abcd"}}, "objectives: "),
-    ({"objectives": {"near": {"region": "21m"}}}, "objective 'near': region '21m': one of 20m, 80m, 160m"),
+    ({"objectives": {"near": {"region": "21m"}}}, "objective 'near': region '21m': give one of 20m, 80m, 160m"),
     ({"objectives": {"near": {"region": "20m", "band": "sky"}}}, "objective 'near': "),
     ({"scenario": []}, "scenario: "),
     ({"scenario": "nowhere"}, "'nowhere' is neither a .yaml file nor one of the built-in scenarios"),
     ({"vehicle": "spaceship"}, "vehicle: 'spaceship' is neither a .yaml file nor one of the built-in vehicles"),
-    ({"vehicle": "body.ply"}, "vehicle: the name of a vehicle, or the path of its YAML file, is needed"),
+    ({"vehicle": "body.ply"}, "vehicle: got 'body.ply'; give the name of a vehicle or the path of its YAML file"),
     ({"start": "none"}, "start: 'none' is neither a .yaml file nor one of the built-in rigs"),
     ({"start": 3}, "start: Input should be a valid dictionary (got 3)"),
 ]
 
 
-@pytest.mark.filterwarnings("ignore:.*is none of the space")
+@pytest.mark.filterwarnings("ignore:.*is outside the space")
 @pytest.mark.parametrize(("changed", "message"), MISTAKES)
 def test_a_space_that_cannot_be_searched_is_refused_at_the_door(changed, message, tmp_path):
     keys = {"name": "here", "start": "front_roof_32", "scenario": "courtyard", "objectives": NEAR}
@@ -289,13 +295,13 @@ def test_scenarios_with_different_egos_need_a_vehicle(tmp_path):
     keys = {"name": "here", "start": PAIR, "scenario": ["courtyard", str(tmp_path / "own.yaml")], "objectives": NEAR}
     keys["free"] = {"left": {"z_m": (3.0, 3.5)}}
     with warnings.catch_warnings(action="ignore"):
-        with pytest.raises(ValueError, match=r"their egos differ \(courtyard suv, own van\)"):
+        with pytest.raises(ValueError, match=r"the ego vehicles differ \(courtyard suv, own van\)"):
             SearchSpace(**keys)
         assert SearchSpace(**keys, vehicle="bus").scenarios[1].ego_name == "bus"
 
 
 def test_a_start_outside_of_the_space_is_told_and_has_no_values_there():
-    with pytest.warns(UserWarning, match=r"'pair' is none of the space \(left\.x_m is -0\.5\)"):
+    with pytest.warns(UserWarning, match=r"'pair' is outside the space \(left\.x_m is -0\.5\)"):
         searched = space({"left": {"x_m": (0.0, 0.1), "yaw_deg": (-5.0, 5.0)}})
     assert searched.get_start_values() == {"left.yaw_deg": 0.0}
 

@@ -7,7 +7,7 @@ from scipy import stats
 from tests.placement.worlds import estimate_of, held, lidar, rig, yard
 from torchcover.placement import Objective, validation
 from torchcover.placement.search import compute_improvements, find_non_dominated
-from torchcover.placement.validation import SideEffect, _others, adjust_holm, validate
+from torchcover.placement.validation import SideEffect, _list_extra_objectives, adjust_holm, validate
 
 WORLDS, PER_WORLD = 6, 3
 WORLD = np.repeat(np.arange(WORLDS), PER_WORLD)
@@ -54,17 +54,17 @@ def test_a_number_that_is_by_no_choice_of_estimate_is_tested_once():
     low, high = rig(lidar(mount={"z_m": 1.6}), name="low"), rig(lidar(mount={"z_m": 2.4}), name="high")
     keys = {"near": "radius_m", "largest": "radius_maximum_m", "cells": "cells_radius_m"}
     objectives = {name: Objective(number=key, region="20m") for name, key in keys.items()}
-    with held(objectives=objectives, estimate="known", worlds=2) as searched:
+    with held(objectives=objectives, average="cells", num_scenes=2) as searched:
         found = validate({"higher": high}, low, searched, test_seed=1, num_scenes=2).improvements["higher"]
-    said = [("near", "known"), ("largest", "-"), ("cells", "known")]
+    said = [("near", "cells"), ("largest", "-"), ("cells", "cells")]
     assert [(gain.objective, gain.average) for gain in found] == said
 
 
 def test_the_fresh_test_is_about_other_worlds_and_says_what_was_optimism(frames):
     low, high = rig(lidar(mount={"z_m": 1.6}), name="low"), rig(lidar(mount={"z_m": 2.4}), name="high")
     test = validate({"higher": high}, low, frames, test_seed=1, num_scenes=8)
-    found, others = test.improvements["higher"], _others(frames.objectives, failures=False)[0]
-    anew = held(seed=1, worlds=8, objectives={**frames.objectives, **others})
+    found, others = test.improvements["higher"], _list_extra_objectives(frames.objectives, has_failures=False)[0]
+    anew = held(seed=1, num_scenes=8, objectives={**frames.objectives, **others})
     assert [(gain.objective, gain.average) for gain in found] == [(name, "area") for name in ("near", "far", "bay")]
     by_test, by_search = ([of.score(one).estimate for one in (high, low)] for of in (anew, frames))
     expected, in_search = by_test[0].compute_differences(by_test[1]), by_search[0].subtract(by_search[1])
@@ -77,13 +77,13 @@ def test_the_fresh_test_is_about_other_worlds_and_says_what_was_optimism(frames)
     # What a gain is made of sums up to it, whatever else the parts are; a loss has no share of a gain.
     for name in ("near", "far", "bay"):
         shares = [change.objective_shares[name] for change in test.side_effects if name in change.objective_shares]
-        assert len(shares) == len(frames.objectives[name].places)
+        assert len(shares) == len(frames.objectives[name].region_bands)
         assert sum(shares) == pytest.approx(1)
     lost = validate({"lower": low}, high, frames, test_seed=1, num_scenes=2)
     assert not any(change.objective_shares for change in lost.side_effects)
-    with pytest.raises(ValueError, match="seed: another one than that of these worlds is needed; got 0 for both"):
-        frames.resampled(0, 4, {})
-    with pytest.raises(ValueError, match="one whose worlds are drawn is needed; 'yard' is the same for any seed"):
+    with pytest.raises(ValueError, match="seed: got 0, the seed of these frames; give another one"):
+        frames.resample(0, 4, {})
+    with pytest.raises(ValueError, match="scenarios: 'yard' is the same for any seed"):
         held([yard()], {"far": frames.objectives["far"]}).resample(1, 4, {})
 
 
@@ -104,7 +104,7 @@ def test_of_twenty_searches_that_change_nothing_at_most_one_says_that_something_
 def test_targets_are_counted_around_the_vehicle(frames, monkeypatch):
     monkeypatch.setattr(validation, "TARGETS", ("child",))
     low, high = rig(lidar(mount={"z_m": 1.6}), name="low"), rig(lidar(mount={"z_m": 2.4}), name="high")
-    (change,) = validation._of_targets(high, low, frames).values()
+    (change,) = validation._compare_targets(high, low, frames, validation.TargetRasterParams()).values()
     assert change.improvement > 0
     assert change.p_value < 0.05
     assert change.block_count == 16

@@ -42,7 +42,9 @@ def rig(*sensors, name="small", **keys):
 
 def held(scenarios=(LOT,), objectives=OBJECTIVES, **keys):
     return CommonFrames(
-        scenarios, objectives, **{"worlds": 3, "per_world": 2, "frame_interval_s": 0.4, "rays": 1024} | keys
+        scenarios,
+        objectives,
+        **{"num_scenes": 3, "frames_per_scene": 2, "frame_interval_s": 0.4, "num_rays": 1024} | keys,
     )
 
 

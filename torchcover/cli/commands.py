@@ -434,7 +434,7 @@ def search(
     ] = None,
     average: Annotated[
         Literal["area", "cells"],
-        typer.Option(help="Average of a score: `area`, the visible surface, or `known`, the observed cells."),
+        typer.Option(help="Average of a score: `area`, the visible surface, or `cells`, the observed cells."),
     ] = "area",
     num_scenes: Annotated[int | None, typer.Option(min=1, help="Worlds of each scenario to search in (6).")] = None,
     num_held_out_scenes: Annotated[
@@ -474,9 +474,9 @@ def search(
         out,
         resume=resume,
         file_kinds=files,
-        evaluations=num_evaluations,
+        num_evaluations=num_evaluations,
         budget_s=None if budget is None else parse_budget_s(budget),
-        estimate=average,
+        average=average,
         seed=seed,
         **{name: value for name, value in given.items() if value is not None},
     )

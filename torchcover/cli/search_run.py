@@ -19,7 +19,6 @@ from torchcover.placement import (
     run_search,
     run_selection,
 )
-from torchcover.placement.common_frames import WORLDS
 from torchcover.placement.plan import make_common_frames
 from torchcover.placement.running import JOURNAL
 from torchcover.report import Terminal, print_page_tables
@@ -47,7 +46,9 @@ def run_search_command(
     """
     find = _chosen if CHOICE_KEY in read_mapping(space_file) else _searched
     settings = {
-        "num_workers": compute_num_workers(FRAMES, settings.get("num_scenes", WORLDS), sends_frames=False),
+        "num_workers": compute_num_workers(
+            FRAMES, settings.get("num_scenes", SearchPlan.num_scenes), sends_frames=False
+        ),
         **settings,
     }
     with lock_folder(out):

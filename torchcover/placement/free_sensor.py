@@ -253,7 +253,9 @@ class FreeSensor(Document):
         Raises:
             ValueError: The vehicle's body is not at the position.
         """
-        sensor_values = {key: values.get(f"{start_sensor.name}.{key}", value) for key, value in self._get_values().items()}
+        sensor_values = {
+            key: values.get(f"{start_sensor.name}.{key}", value) for key, value in self._get_values().items()
+        }
         if sensor_values.get("present") is False:
             return None
         try:

@@ -63,7 +63,7 @@ class Objective(Document):
         >>> rear = {"rear": {"x_m": [-10.0, -3.0], "y_m": [-2.0, 2.0]}}
         >>> Objective(number="radius_m", region=rear).region_bands[0]
         ('rear', 'ground')
-        >>> child = {"target": "child", "at": {"within_m": 3.0, "sides": ["front"]}, "points": 5}
+        >>> child = {"target": "child", "positions": {"within_m": 3.0, "sides": ["front"]}, "points": 5}
         >>> Objective(requirement=child).description
         "child_110cm, within_m 3.0 sides ['front'], points >= 5"
     """
@@ -98,8 +98,10 @@ class Objective(Document):
         if requirement is not None and len(requirement.bounds) > 1:
             bounds = ", ".join(bound.text for bound in requirement.bounds)
             raise ValueError(f"requirement: got {bounds}; give one bound")
-        if isinstance(positions := getattr(requirement, "at", None), str):
-            raise ValueError(f"requirement.at: got the name {positions!r}; give the positions, as in within_m: 3")
+        if isinstance(positions := getattr(requirement, "positions", None), str):
+            raise ValueError(
+                f"requirement.positions: got the name {positions!r}; give the positions, as in within_m: 3"
+            )
         return self
 
     def compute_met_share(
@@ -199,5 +201,7 @@ class Objective(Document):
             return tuple(region.build_region(name) for name, region in self.region.items())
         names = dict.fromkeys(self._region_names)
         if unknown := [name for name in names if name not in named_regions]:
-            raise ValueError(f"region {unknown[0]!r}: give one of {', '.join(named_regions)}, or {{name: {{x_m, y_m}}}}")
+            raise ValueError(
+                f"region {unknown[0]!r}: give one of {', '.join(named_regions)}, or {{name: {{x_m, y_m}}}}"
+            )
         return tuple(named_regions[name] for name in names)

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, Self
 import torch
 from torch import Tensor
 
-from torchcover.coverage import AGGREGATIONS, Aggregation, BevGrid, CoverageSums, MeanOfMeans, Average, Region
+from torchcover.coverage import AGGREGATIONS, Aggregation, Average, BevGrid, CoverageSums, MeanOfMeans, Region
 from torchcover.coverage.grid import PAPER_HEIGHTS
 from torchcover.coverage.quantity import RADIUS, make_detection_quantity, make_failure_quantity
 from torchcover.estimation import Estimate
@@ -199,7 +199,9 @@ class Queries(NamedTuple):
             if name in met_shares:
                 values_without_block.append(values[-1].expand(len(steps)))
             elif all(len(estimate.jackknife_values) == len(steps) for estimate in estimates):
-                values_without_block.append(torch.cat([estimate.jackknife_values for estimate in estimates], dim=1).mean(dim=1))
+                values_without_block.append(
+                    torch.cat([estimate.jackknife_values for estimate in estimates], dim=1).mean(dim=1)
+                )
             else:
                 values_without_block.append(missing)
         return Estimate(tuple(quantities), torch.stack(values), torch.stack(values_without_block, dim=1), steps)

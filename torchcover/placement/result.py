@@ -288,7 +288,11 @@ class SearchResult(ReportMixin):
                 numbers = []
                 improvements, errors = search.compare_with_start(evaluation)
                 for index in range(len(search.space.objectives)):
-                    numbers += [float(evaluation.estimate.value[index]), float(improvements[index]), float(errors[index])]
+                    numbers += [
+                        float(evaluation.estimate.value[index]),
+                        float(improvements[index]),
+                        float(errors[index]),
+                    ]
             shortfalls = "" if evaluation.infeasible_reason else self._describe_shortfalls(evaluation)
             state = "infeasible" if evaluation.infeasible_reason else "violates bounds" if shortfalls else "complete"
             yield [

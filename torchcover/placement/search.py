@@ -177,9 +177,7 @@ class PlacementSearch:
         estimate, limit = score.estimate, self.space.constraints.max_self_hit_share
         reasons = [] if candidate.number else list(self.space.find_violations(self.space.start))
         if limit is not None and score.self_hit_share > limit:
-            reasons.append(
-                f"{score.self_hit_share:.1%} of its rays hit the vehicle; max_self_hit_share is {limit:.1%}"
-            )
+            reasons.append(f"{score.self_hit_share:.1%} of its rays hit the vehicle; max_self_hit_share is {limit:.1%}")
         if candidate.number == 0:
             self._check_start(estimate)
         scored = replace(
@@ -405,7 +403,9 @@ class PlacementSearch:
 
     def _check_turn(self, candidate: Evaluation) -> None:
         if candidate.number != len(self.evaluations):
-            raise ValueError(f"candidate: got number {candidate.number}; give the last of `ask`, {len(self.evaluations)}")
+            raise ValueError(
+                f"candidate: got number {candidate.number}; give the last of `ask`, {len(self.evaluations)}"
+            )
 
     def _check_start(self, estimate: Estimate) -> None:
         for name, value in zip(self.space.scored_objectives, estimate.value.tolist(), strict=True):

@@ -428,9 +428,7 @@ def _observe_candidates(
     return tuple(sensors), observed, excluded
 
 
-def _validate_result(
-    result: SelectionResult, frames: CommonFrames, test_seed: int, num_scenes: int
-) -> SelectionResult:
+def _validate_result(result: SelectionResult, frames: CommonFrames, test_seed: int, num_scenes: int) -> SelectionResult:
     if set(result.best.selected) == set(result.baseline):
         return replace(result, no_test_reason="it equals the baseline")
     baseline = result.build_rig(result.baseline, f"{result.space.name}_baseline")

@@ -74,7 +74,9 @@ class HeldOutImprovement(NamedTuple):
             "unit": quantity.unit,
             "improvement": difference.improvement,
             "error": difference.error,
-            "confidence_interval": sorted([quantity.compute_improvement(difference.low), quantity.compute_improvement(difference.high)]),
+            "confidence_interval": sorted(
+                [quantity.compute_improvement(difference.low), quantity.compute_improvement(difference.high)]
+            ),
             "t_statistic": self.t_statistic,
             "p_value": difference.p_value,
             "block_count": difference.block_count,
@@ -327,7 +329,9 @@ def _compare_targets(
     return differences
 
 
-def _estimate_detected_share(rig: Rig, target: str, search_frames: CommonFrames, params: TargetRasterParams) -> Estimate:
+def _estimate_detected_share(
+    rig: Rig, target: str, search_frames: CommonFrames, params: TargetRasterParams
+) -> Estimate:
     """Estimate the share of free positions near the vehicle at which a test target is detected."""
     ground = build_flat_ground().model_copy(update={"ego": search_frames.scenarios[0].ego})
     scenario = set_ego(ground, {rig.name: rig})
