@@ -125,7 +125,7 @@ def run(command, out, *options):
     os.dup2(nowhere, 2)
     sys.argv = ["torchcover", *command, *options, "--out", str(out)]
     if "space.yaml" in command:  # frames are made up
-        makes = lambda space, plan, seed, worlds: Surface(seed, worlds, plan.frames_per_scene)  # noqa: E731
+        makes = lambda space, plan, seed, num_scenes: Surface(seed, num_scenes, plan.frames_per_scene)  # noqa: E731
         search_run.SearchPlan = partial(SearchPlan, make_frames=makes)
     if command is not REAL:  # drawing takes most of the time
         result.plot_maps = lambda *_, **__: [("map1", Figure((1, 1)))]

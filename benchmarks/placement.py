@@ -117,7 +117,7 @@ def compare_pairs(rigs=24, num_scenes=16):
         each.append(start.model_copy(update={"sensors": (roof.model_copy(update={"mount": mount}),)}))
     rows = []
     for measure in ("area", "cells"):
-        with CommonFrames("urban", objective, num_scenes=worlds, average=measure) as frames:
+        with CommonFrames("urban", objective, num_scenes=num_scenes, average=measure) as frames:
             began_s = time.process_time()
             first, *others = [frames.score(rig).estimate for rig in each]
             score_s = (time.process_time() - began_s) / len(each) / len(frames)

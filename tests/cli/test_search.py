@@ -25,7 +25,7 @@ objectives: {near: {region: 20m}}
 def space(tmp_path, monkeypatch):
     """A file; frames are surfaces, and one target is looked at in the end."""
     monkeypatch.setattr("torchcover.placement.validation.TARGETS", ("pole",))
-    makes = lambda space, plan, seed, worlds: Surface(seed, worlds, plan.frames_per_scene)  # noqa: E731
+    makes = lambda space, plan, seed, num_scenes: Surface(seed, num_scenes, plan.frames_per_scene)  # noqa: E731
     monkeypatch.setattr(search_run, "SearchPlan", partial(SearchPlan, make_frames=makes))
     (tmp_path / "space.yaml").write_text(SPACE)
     return tmp_path / "space.yaml"

@@ -78,7 +78,7 @@ def numbers_of(rigs, steps=1, world=WORLD):
     for name, (coverage, *others) in observers.items():
         own = {}
         for row in coverage.compute().summary():
-            kinds = {"": row.numbers, "cells": row.known, "seen by": row.redundancy.seen_by, **row.redundancy.without}
+            kinds = {"": row.numbers, "known": row.known, "seen by": row.redundancy.seen_by, **row.redundancy.without}
             own |= {(row.region, row.height, kind, key): one for kind, of in kinds.items() for key, one in of.items()}
         found[name] = own | {number.quantity.key: number for other in others for number in other.compute()}
     return found

@@ -49,7 +49,7 @@ def drawn(searched, count=20):
 
 
 def place(sensor):
-    return sensor.mount.matrix()[:3, 3]
+    return sensor.mount.to_matrix()[:3, 3]
 
 
 @pytest.mark.parametrize("path", SPACES, ids=lambda path: path.stem)

@@ -286,7 +286,7 @@ class FrameMetric(MergeableSums):
 
 def describe_number(
     key: str, unit: str, counted_items: str, *, lower_is_better: bool = False, **parameters: Any
-) -> Number:
+) -> Number:  # noqa: ANN401
     """What a number of a metric is, before it has a value.
 
     Args:

@@ -108,11 +108,16 @@ class CachedFrames(Dataset[Frame | MeasuredFrame]):
             reference, radius_m = self._build_reference(index, position), self._queries.search_radius_m
             # A tensor that is sent to another process loses its memory, so the search structure gets a copy.
             points = reference.reference.numpy().copy()
-            self._references[position] = reference, None if radius_m is None else SearchSpheres.from_points(points, radius_m)
+            self._references[position] = (
+                reference,
+                None if radius_m is None else SearchSpheres.from_points(points, radius_m),
+            )
         reference, relevant_space = self._references[position]
         if rig is None:
             return reference
-        scans = self._get_simulator(rig, index.scenario_index).simulate_scans(index.frame_index, relevant_space)[rig.name]
+        scans = self._get_simulator(rig, index.scenario_index).simulate_scans(index.frame_index, relevant_space)[
+            rig.name
+        ]
         counts = {"rays": sum(scan.num_rays for scan in scans), "self_hits": sum(scan.self_hits for scan in scans)}
         return replace(reference, **build_rig_fields({rig.name: rig}, {rig.name: scans}), counts=counts)
 
@@ -369,8 +374,8 @@ class CommonFrames:
         for scenario, host_scenario in zip(self.scenarios, self._host_scenarios, strict=True):
             if set_ego(scenario, {rig.name: rig}).ego != host_scenario.ego:
                 raise ValueError(
-                    f"rig {rig.name!r}: its vehicle is {rig.vehicle}, and that of these frames {host_scenario.ego_name}; "
-                    "set vehicle="
+                    f"rig {rig.name!r}: its vehicle is {rig.vehicle}, and that of these frames {host_scenario.ego_name}"
+                    "; set vehicle="
                 )
         self._accepted_vehicles.add(rig.vehicle)
 
@@ -411,7 +416,7 @@ def _select_frames(simulator: Simulator, num_scenes: int, frames_per_scene: int)
     fewest = min(map(len, selected))
     if fewest < frames_per_scene:
         raise ValueError(
-            f"frames_per_scene: got {frames_per_scene}, but a run of {simulator.scenario.name!r} has {fewest} frames at "
-            f"intervals of {simulator.frame_interval_s:g} s; use fewer frames or a shorter interval"
+            f"frames_per_scene: got {frames_per_scene}, but a run of {simulator.scenario.name!r} has {fewest} frames "
+            f"at intervals of {simulator.frame_interval_s:g} s; use fewer frames or a shorter interval"
         )
     return selected

@@ -14,7 +14,7 @@ from torchcover.geometry.arrays import Float64
 from torchcover.placement.objective import NonEmptyName, Objective
 from torchcover.simulation import Rig, Scenario, set_ego
 from torchcover.simulation.bodies import get_mount_regions
-from torchcover.simulation.documents import SEVERAL, NameOrFile, FileDocument, build_name_validator, is_file_name
+from torchcover.simulation.documents import SEVERAL, FileDocument, NameOrFile, build_name_validator, is_file_name
 from torchcover.simulation.mount_regions import MountRegion, Skin
 
 NOT_WORSE = "not worse: "  # prefix of the name of a number that must not become worse

@@ -120,7 +120,10 @@ class SearchPlan:
         Raises:
             ValueError: The sensor model is "real", and no sensor of the start has known range limits.
         """
-        content = {"space": space.collect_content(), "scenarios": [scenario.collect_content() for scenario in space.scenarios]}
+        content = {
+            "space": space.collect_content(),
+            "scenarios": [scenario.collect_content() for scenario in space.scenarios],
+        }
         text = json.dumps(content, sort_keys=True, default=str)
         return {
             "torchcover": __version__,

@@ -34,7 +34,7 @@ class Queries(NamedTuple):
         objectives: Objectives of regions by name; requirements of targets and encounters are excluded.
         regions: Regions by name.
         grid: Cells of 0.5 m around the regions.
-        max_radius_m: Radius at which radii saturate: as in `evaluate`, or the largest threshold if no radius is queried.
+        max_radius_m: Radius at which radii saturate: as in `evaluate`, or the largest threshold without a radius.
         thresholds_m: Thresholds in meters.
         objective_names: Names of all objectives, in order.
     """

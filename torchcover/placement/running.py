@@ -120,8 +120,8 @@ class _Budget:
         needed_s = spent_s + 2 * self.evaluation_s + self.validation_s
         raise ValueError(
             f"budget: {self._search.plan.budget_s:g} s is too short for two evaluations: frames and start took "
-            f"{spent_s:.1f} s, a candidate takes up to {self.evaluation_s:.1f} s, and the validation on held-out scenes "
-            f"about {self.validation_s:.1f} s; give at least {math.ceil(needed_s)} s"
+            f"{spent_s:.1f} s, a candidate takes up to {self.evaluation_s:.1f} s, and the validation on held-out "
+            f"scenes about {self.validation_s:.1f} s; give at least {math.ceil(needed_s)} s"
         )
 
     def is_left(self) -> bool:

@@ -1,4 +1,4 @@
-"""Placement search with Optuna that proposes candidates, scores them on common frames, and compares them with the start."""
+"""Placement search with Optuna: propose candidates, score them on common frames, and compare them with the start."""
 
 import math
 import time

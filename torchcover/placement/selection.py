@@ -332,9 +332,9 @@ def observe_points(rig: Rig, frames: CommonFrames) -> tuple[Bools, float]:
 def compute_point_weights(frames: CommonFrames) -> Float64:
     """Compute the weight of each reference point in each number, so that sums equal the numbers of `CoverageMetric`.
 
-    By area, the weight is the share of the visible area. Over observed cells it is the share of the area in the cell and
-    frame, divided by the number of frames that observe the cell and by the number of observed cells. Weights are 0 for
-    thresholds other than that of the number.
+    By area, the weight is the share of the visible area. Over observed cells it is the share of the area in the cell
+    and frame, divided by the number of frames that observe the cell and by the number of observed cells. Weights are 0
+    for thresholds other than that of the number.
 
     Args:
         frames: Frames with P reference points in total, Q objectives and T thresholds.

@@ -28,7 +28,7 @@ class SearchSpace(PlacementSpace):
         vehicle: Host vehicle, by name or file; by default the vehicle that `start` is simulated on.
         free: Name of a sensor of `start` -> its free variables.
         constraints: Constraints of every candidate.
-        prices_eur: Prices in EUR, by LiDAR model, by name of a sensor without a model, and of the "mount" of each sensor.
+        prices_eur: Prices in EUR, by LiDAR model, by name of a sensor without a model, and of the "mount" of a sensor.
         objectives: One to three objectives, by name. Several give a compromise and the best of each.
         not_worse: Numbers that must not be worse than at the start: names of regions of `evaluate`, for detection
             within 0.4 m in both bands, or objectives.
