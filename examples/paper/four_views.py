@@ -7,7 +7,7 @@ import numpy as np
 from matplotlib.patches import Patch, Wedge
 
 from torchcover.coverage.quantity import RADIUS
-from torchcover.report.colours import (
+from torchcover.report.colors import (
     NEVER_PROBED,
     ColorScale,
     build_cell_legend,
@@ -15,8 +15,9 @@ from torchcover.report.colours import (
     plot_cells,
     plot_color_bar,
 )
+from torchcover.report.number_format import format_height_band, format_resolution
 from torchcover.report.overlay import get_sensor_color, plot_ego, plot_sensors
-from torchcover.report.sheet import (
+from torchcover.report.plot_layout import (
     HEADING_POINTS,
     create_sheets,
     find_lower_left,
@@ -25,7 +26,6 @@ from torchcover.report.sheet import (
     write_legend,
     write_title,
 )
-from torchcover.report.wording import format_height_band, format_resolution
 
 # A few cells beside the bumper hold most of the points.
 ROBUST_PERCENTILES = (1, 99.5)

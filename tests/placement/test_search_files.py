@@ -13,7 +13,7 @@ from torchcover.estimation import Difference
 from torchcover.placement import PlacementSearch, run_search
 from torchcover.placement.running import JOURNAL
 from torchcover.placement.validation import HeldOutImprovement, describe_improvement
-from torchcover.report.page.drawings import render_text_html
+from torchcover.report.page.svg import render_text_html
 from torchcover.simulation import Rig
 
 

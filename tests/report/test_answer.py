@@ -9,7 +9,7 @@ import pytest
 
 from torchcover.estimation import Number, Quantity
 from torchcover.report import DetectionShares
-from torchcover.report.page.drawings import render_detection_shares, render_target_maps
+from torchcover.report.page.svg import render_detection_shares, render_target_maps
 
 # Machado, Oliveira and Fernandes 2009, severity 1: of linear red, green and blue.
 SEEING = {

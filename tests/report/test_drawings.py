@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 
 from torchcover.geometry import build_transform, convert_euler_to_rotation
 from torchcover.report import ActorMark, SensorView, StaticFaces, plot_depth_images, plot_rig, plot_scene
-from torchcover.report.page.drawings import build_sensor_table, render_rig
-from torchcover.report.scene import PATH, REFERENCE, SENSOR, SKY
+from torchcover.report.page.svg import build_sensor_table, render_rig
+from torchcover.report.scene_plots import PATH, REFERENCE, SENSOR, SKY
 
 VERTICES = np.array([[x, y, z] for x in (-2.0, 2.0) for y in (-1.0, 1.0) for z in (0.0, 1.5)])
 FACES = np.array([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [1, 5, 7], [1, 7, 3], [0, 4, 5], [0, 5, 1]])

@@ -15,7 +15,7 @@ from torchcover.coverage import BevGrid
 from torchcover.coverage.quantity import RADIUS, make_detection_quantity
 from torchcover.geometry import build_transform, convert_euler_to_rotation
 from torchcover.report import ColorScale, SensorView, build_color_scale, plot_side_by_side
-from torchcover.report.colours import INFINITE, UNKNOWN
+from torchcover.report.colors import INFINITE, UNKNOWN
 
 SCALE = ColorScale("blind spot radius", "m", "viridis_r", 0.0, 1.0)
 SQUARE = BevGrid(x_m=(-20.0, 20.0), y_m=(-10.0, 10.0), cell_m=1.0)

@@ -34,7 +34,7 @@ from torchcover.report import (
 )
 from torchcover.report.page.content import Array
 from torchcover.report.page.map_content import CellBuffer, encode_values
-from torchcover.report.page.writing import fit_maps
+from torchcover.report.page.rendering import fit_maps
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 NASTY = "</script><script>document.title='broken'</script>"

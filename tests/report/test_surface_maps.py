@@ -8,7 +8,7 @@ import torch
 
 from torchcover.coverage import BevGrid, CoverageMetric, Region
 from torchcover.coverage.blocks import BlockSums
-from torchcover.report.map_subjects import (
+from torchcover.report.map_layers import (
     FAINTEST,
     MIN_POINTS,
     compute_opacity,

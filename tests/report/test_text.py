@@ -21,7 +21,7 @@ ORIGIN = torch.zeros(1, 3)
 def no_other_columns(monkeypatch):
     """But how much the numbers are means over: rows are as these tests say whatever else the table has."""
     kept = tuple(column for column in COLUMNS if column.key in ("visible_m2", "observed_share"))
-    monkeypatch.setattr("torchcover.report.layout.COLUMNS", kept)
+    monkeypatch.setattr("torchcover.report.table_layout.COLUMNS", kept)
 
 
 def metric(thresholds=(0.4, 1.0), **options) -> CoverageMetric:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from torchcover.coverage.quantity import RADIUS, make_detection_quantity
 from torchcover.estimation import Difference, Number
-from torchcover.report.wording import (
+from torchcover.report.number_format import (
     format_difference,
     format_error,
     format_number,

@@ -13,9 +13,9 @@ from torchcover.encounters.criterion import Criterion
 from torchcover.encounters.sighting import NEVER, IsEnough, Sighting, detections, enough_of, first_run
 from torchcover.geometry import BoundingBox, compute_contact_time_s, invert, transform_outline
 from torchcover.geometry.arrays import Float64, Int64
-from torchcover.recordings.vehicle_cloud import transform_to_vehicle
 from torchcover.recordings.objects import Track, extract_objects, find_vehicle_class
 from torchcover.recordings.recording import Recording
+from torchcover.recordings.vehicle_cloud import transform_to_vehicle
 from torchcover.simulation.lidar import Lidar
 from torchcover.simulation.rays import SearchSpheres
 from torchcover.simulation.simulator import Simulator

@@ -44,9 +44,9 @@ from torchcover.report import (
     render_page,
     summarize_findings,
 )
-from torchcover.report.map_subjects import list_map_quantities
+from torchcover.report.map_layers import list_map_quantities
 from torchcover.report.records import build_records
-from torchcover.report.remarks import get_main_quantity
+from torchcover.report.table_notes import get_main_quantity
 from torchcover.simulation import CameraSensor, Sensor
 from torchcover.simulation.memory import check_memory_fits
 from torchcover.simulation.sensor import ScanTimes

@@ -13,8 +13,8 @@ from pydantic import BaseModel
 from torchcover.coverage import AGGREGATIONS, Aggregation, Coverage, Region
 from torchcover.files import to_yaml
 from torchcover.report import BOLD_MARKS, MapLine, PageTable, SensorView, TextCell, build_page_tables
-from torchcover.report.remarks import explain_marks, list_notes
 from torchcover.report.table import CoverageTable
+from torchcover.report.table_notes import explain_marks, list_notes
 from torchcover.simulation import CameraSensor, Sensor, compute_vertical_fov_deg
 
 # What decides about the numbers, with this package.

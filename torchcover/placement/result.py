@@ -20,7 +20,7 @@ from torchcover.placement.validation import (
     format_unit,
 )
 from torchcover.report import PageTable, TextCell, build_file_stems, plot_fronts, plot_progress
-from torchcover.report.wording import UNKNOWN, get_display_unit
+from torchcover.report.number_format import UNKNOWN, get_display_unit
 from torchcover.simulation import Rig
 
 HEADINGS = (

@@ -18,7 +18,7 @@ from torchcover.placement.common_frames import CommonFrames
 from torchcover.placement.host_vehicle import NOT_WORSE
 from torchcover.placement.objective import DEFAULT_THRESHOLD_M, Objective
 from torchcover.report import PageTable, TextCell
-from torchcover.report.wording import format_difference, get_display_unit
+from torchcover.report.number_format import format_difference, get_display_unit
 from torchcover.simulation import RegionsOfInterest, Rig, set_ego
 from torchcover.targets import TARGETS, Raster, Target, survey
 

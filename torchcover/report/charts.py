@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 from numpy.typing import NDArray
 
-from torchcover.report.sheet import create_charts
+from torchcover.report.plot_layout import create_charts
 
 # Speed in km/h, least and most time to collision in s.
 DetectionBand = Sequence[tuple[float, float, float]]

@@ -14,8 +14,8 @@ from torch import Tensor
 
 from torchcover.coverage import BevGrid, Coverage, check_paired
 from torchcover.files import write_atomically
-from torchcover.report.colours import build_color_scale, build_difference_scale, plot_side_by_side
-from torchcover.report.map_subjects import (
+from torchcover.report.colors import build_color_scale, build_difference_scale, plot_side_by_side
+from torchcover.report.map_layers import (
     MapLayer,
     Window,
     build_map_layers,
@@ -24,8 +24,8 @@ from torchcover.report.map_subjects import (
     find_near_field_window,
     find_observed_window,
 )
+from torchcover.report.number_format import capitalize, format_height_band
 from torchcover.report.overlay import SensorView
-from torchcover.report.wording import capitalize, format_height_band
 
 MAX_FILE_NAME = 48
 NamedFigure = tuple[str, Figure]

@@ -15,7 +15,7 @@ from matplotlib.patheffects import AbstractPathEffect, withStroke
 from numpy.typing import NDArray
 
 from torchcover.geometry import convert_rotation_to_euler
-from torchcover.report.sheet import Sheet
+from torchcover.report.plot_layout import Sheet
 
 # Okabe and Ito's colours, which the colour-blind can tell apart; then all of them darker, then lighter.
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#777777")

@@ -19,10 +19,10 @@ from rich.table import Table
 from rich.text import Text
 
 from torchcover.files import escape_control_chars
-from torchcover.report.layout import BOLD_MARKS, PageTable, TextCell, build_page_tables
 from torchcover.report.records import render_csv, render_json
-from torchcover.report.remarks import explain_marks, list_notes, summarize_findings
 from torchcover.report.table import CoverageTable
+from torchcover.report.table_layout import BOLD_MARKS, PageTable, TextCell, build_page_tables
+from torchcover.report.table_notes import explain_marks, list_notes, summarize_findings
 
 # Survive files and terminals without bold type.
 SIGNS = {"best": "*", "significant": "!"}

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from torchcover.geometry import invert, transform_points
 from torchcover.geometry.arrays import Bools, Float32, Float64, Int64
-from torchcover.recordings.vehicle_cloud import transform_to_vehicle
 from torchcover.recordings.recording import Recording
+from torchcover.recordings.vehicle_cloud import transform_to_vehicle
 from torchcover.simulation.lidar import Lidar
 from torchcover.simulation.returns import SURE, Material, compute_log_excess
 from torchcover.simulation.rig import Rig

@@ -13,8 +13,8 @@ from torchcover.geometry import convert_rotation_to_quaternion, invert, transfor
 from torchcover.geometry.arrays import Bools, Float64, Int64
 from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.formats.ros_poses import PoseSeries
-from torchcover.recordings.vehicle_cloud import find_points_in_box
 from torchcover.recordings.recording import NO_RETURN_M, Recording
+from torchcover.recordings.vehicle_cloud import find_points_in_box
 
 # Elevations are counted in bins of this width and blurred with one width after the other.
 BIN_DEG, FINEST_DEG, COARSEST_DEG, GROWTH = 0.005, 0.01, 1.0, 1.15

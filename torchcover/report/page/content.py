@@ -11,17 +11,17 @@ from torch import Tensor
 
 from torchcover.coverage import Coverage, Layer
 from torchcover.estimation import Number
-from torchcover.report.colours import NEVER_PROBED, ColorScale, build_color_scale, build_difference_scale, to_array
-from torchcover.report.layout import PageTable
-from torchcover.report.map_subjects import (
+from torchcover.report.colors import NEVER_PROBED, ColorScale, build_color_scale, build_difference_scale, to_array
+from torchcover.report.map_layers import (
     NOTHING_FOUND,
     compute_difference,
     compute_square_sides,
     downsample_coverage,
     list_map_quantities,
 )
+from torchcover.report.number_format import format_height_band, get_display_unit
 from torchcover.report.overlay import SensorView
-from torchcover.report.wording import format_height_band, get_display_unit
+from torchcover.report.table_layout import PageTable
 
 Bounds = tuple[float, float]
 Array = NDArray[np.floating]

@@ -15,7 +15,7 @@ import numpy as np
 from matplotlib import colormaps
 from numpy.typing import NDArray
 
-from torchcover.report.colours import ColorScale
+from torchcover.report.colors import ColorScale
 from torchcover.report.overlay import SensorView
 from torchcover.report.page.content import Array, MapLine, Page, PageMap
 

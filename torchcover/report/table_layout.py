@@ -7,22 +7,22 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 from torchcover.estimation import Quantity
-from torchcover.report.records import COLUMNS
-from torchcover.report.remarks import (
-    format_failure_cells,
-    format_failure_headings,
-    format_failure_title,
-    get_failure_sensors,
-    get_main_quantity,
-)
-from torchcover.report.table import CoverageTable, Row
-from torchcover.report.wording import (
+from torchcover.report.number_format import (
     UNKNOWN,
     capitalize,
     format_difference,
     format_difference_heading,
     format_heading,
     format_number,
+)
+from torchcover.report.records import COLUMNS
+from torchcover.report.table import CoverageTable, Row
+from torchcover.report.table_notes import (
+    format_failure_cells,
+    format_failure_headings,
+    format_failure_title,
+    get_failure_sensors,
+    get_main_quantity,
 )
 
 MAX_HEADING_CHARS = 16

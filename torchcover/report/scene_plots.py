@@ -17,9 +17,10 @@ from matplotlib.ticker import LogLocator, NullFormatter
 from numpy.typing import NDArray
 
 from torchcover.coverage import BevGrid
-from torchcover.report.colours import UNKNOWN, ColorScale, plot_cells, plot_color_bar
+from torchcover.report.colors import UNKNOWN, ColorScale, plot_cells, plot_color_bar
+from torchcover.report.number_format import format_percent
 from torchcover.report.overlay import HALO, plot_ego
-from torchcover.report.sheet import (
+from torchcover.report.plot_layout import (
     BELOW_IN,
     COLOUR_BAR_IN,
     DOTS_PER_INCH,
@@ -35,7 +36,6 @@ from torchcover.report.sheet import (
     write_legend,
     write_title,
 )
-from torchcover.report.wording import format_percent
 
 Points = NDArray[np.floating]
 Image = NDArray[np.floating]

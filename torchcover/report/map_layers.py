@@ -21,8 +21,8 @@ from torchcover.coverage.blocks import BlockSums, ObservedCells
 from torchcover.coverage.quantity import make_area_quantity
 from torchcover.estimation import Quantity
 from torchcover.metrics import sum_rows
-from torchcover.report.colours import NEVER_PROBED, ColorScale, build_color_scale
-from torchcover.report.wording import format_resolution, get_display_unit
+from torchcover.report.colors import NEVER_PROBED, ColorScale, build_color_scale
+from torchcover.report.number_format import format_resolution, get_display_unit
 
 # A detection from 8 points is off by 18 percentage points at most: 1 / sqrt(4 * 8).
 MIN_POINTS = 8

@@ -22,8 +22,9 @@ from torch import Tensor
 
 from torchcover.coverage import BevGrid
 from torchcover.estimation import Quantity
+from torchcover.report.number_format import format_percent, get_display_unit
 from torchcover.report.overlay import SensorView, plot_ego, plot_sensor_positions, plot_sensors
-from torchcover.report.sheet import (
+from torchcover.report.plot_layout import (
     HEADING_POINTS,
     Sheet,
     create_sheets,
@@ -33,7 +34,6 @@ from torchcover.report.sheet import (
     write_legend,
     write_title,
 )
-from torchcover.report.wording import format_percent, get_display_unit
 
 # A few cells far behind an obstacle must not take the colours away from all others.
 ROBUST_PERCENTILE = 98

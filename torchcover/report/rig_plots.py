@@ -14,7 +14,7 @@ from matplotlib.patches import Polygon
 from numpy.typing import NDArray
 
 from torchcover.report.overlay import SensorView, get_sensor_color
-from torchcover.report.sheet import (
+from torchcover.report.plot_layout import (
     HEADING_POINTS,
     Bounds,
     fit_paper,

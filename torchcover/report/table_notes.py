@@ -8,8 +8,7 @@ from textwrap import fill
 from torchcover.coverage import Region, RegionRedundancy
 from torchcover.coverage.quantity import RADIUS, make_redundancy_quantity, make_sensor_count_quantity
 from torchcover.estimation import MIN_BLOCKS, Quantity, estimate_blocks_needed
-from torchcover.report.table import CoverageTable, Row
-from torchcover.report.wording import (
+from torchcover.report.number_format import (
     UNKNOWN,
     format_difference,
     format_difference_heading,
@@ -19,6 +18,7 @@ from torchcover.report.wording import (
     format_square_meters,
     format_value,
 )
+from torchcover.report.table import CoverageTable, Row
 
 MAX_HEADING_CHARS = 16
 NONE = "none"

@@ -7,12 +7,12 @@ from itertools import groupby
 import numpy as np
 
 from torchcover.notebooks import escape_html, escape_html_attribute
-from torchcover.report.layout import PageTable, TextCell
+from torchcover.report.number_format import UNKNOWN, format_number, format_square_meters
 from torchcover.report.overlay import SensorView, get_sensor_color
 from torchcover.report.page.content import Array, DetectionShares, TargetVisibilityMap
-from torchcover.report.remarks import detected_words, get_main_quantity, surface_words
 from torchcover.report.table import CoverageTable
-from torchcover.report.wording import UNKNOWN, format_number, format_square_meters
+from torchcover.report.table_layout import PageTable, TextCell
+from torchcover.report.table_notes import detected_words, get_main_quantity, surface_words
 
 # Of the plan, beyond which nothing is drawn; lines are so far from the vehicle.
 REACH_M = 3.4

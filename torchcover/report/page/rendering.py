@@ -13,16 +13,16 @@ from string import Template
 import numpy as np
 
 from torchcover.notebooks import escape_html_attribute
-from torchcover.report.layout import PageTable, TextCell
 from torchcover.report.page.content import Array, Page, PageMap, PagePicture, PageRig
-from torchcover.report.page.drawings import (
+from torchcover.report.page.map_content import CellBuffer, CellCodes, add_arrays, build_map_content
+from torchcover.report.page.svg import (
     build_sensor_table,
     render_detection_shares,
     render_rig,
     render_target_maps,
     render_text_html,
 )
-from torchcover.report.page.map_content import CellBuffer, CellCodes, add_arrays, build_map_content
+from torchcover.report.table_layout import PageTable, TextCell
 
 # What maps and pictures may take in a file that is sent by mail without a thought, and the maps in any case; and how
 # many times that they may take before they are packed.
@@ -71,7 +71,7 @@ def downsample_map(page_map: PageMap) -> PageMap:
     """A map with four cells in each, without errors: their mean as the weights say, or all alike.
 
     Example:
-        >>> from torchcover.report.colours import ColorScale
+        >>> from torchcover.report.colors import ColorScale
         >>> scale = ColorScale("radius", "m", "viridis_r", 0.0, 4.0)
         >>> cells = np.array([[1.0, 3.0], [np.nan, 2.0]])
         >>> coarser(PageMap("radius", "ground", "rig", (0.0, 2.0), (0.0, 2.0), 1.0, cells, scale)).values
