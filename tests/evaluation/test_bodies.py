@@ -14,7 +14,7 @@ YARD = {
     "ego": {"shape": {"type": "box", "size_m": [4, 2, 1]}},
     "bodies": [{"name": "floor", "shape": {"type": "plane", "size_m": [400, 400]}}],
 }
-SMALL = {"steps": 32, "cell_m": 4.0, "rays": 128, "probe": "pole", "workers": 0}
+SMALL = {"num_frames": 32, "cell_m": 4.0, "num_rays": 128, "test_targets": "pole", "num_workers": 0}
 SIDES = ["front_3m", "rear_3m", "left_3m", "right_3m"]
 
 
@@ -43,12 +43,12 @@ def both():
 
 
 def of_bodies(result, **wanted):
-    rows = [row for row in result.summary if row["measure"] == "places"]
+    rows = [row for row in result.summary if row["average"] == "places"]
     return [row for row in rows if all(row[name] == value for name, value in wanted.items())]
 
 
 def test_rows_of_bodies_take_the_place_of_those_of_traffic_in_the_near_field(both):
-    near = [(row["region"], row["height"]) for row in both.summary if row["rig"] == "roof" and row["region"] in SIDES]
+    near = [(row["region"], row["band"]) for row in both.summary if row["rig"] == "roof" and row["region"] in SIDES]
     bands = [(region, "ground") for region in SIDES if (region, "ground") in near]
     assert near == [*bands, *((region, "pole_100cm") for region in SIDES)]
     for row in of_bodies(both):
@@ -70,7 +70,7 @@ def test_rows_of_bodies_take_the_place_of_those_of_traffic_in_the_near_field(bot
     text = RENDERERS["text"](both.table)
     assert "Free places with 5 points or more (%)" in text
     assert "Bodies: at 8 steps" in " ".join(text.split())
-    assert "free places" in evaluate(RIGS[0], yard("yard"), **{**SMALL, "steps": 1}).tables[1].headings
+    assert "free places" in evaluate(RIGS[0], yard("yard"), **{**SMALL, "num_frames": 1}).tables[1].headings
 
 
 def test_files_keep_them_and_compare_reads_them(both, tmp_path):
@@ -85,10 +85,10 @@ def test_files_keep_them_and_compare_reads_them(both, tmp_path):
         == of_bodies(both, rig="roof")[2]["target_positions_5_points"]
     )
     rows = list(csv.DictReader((tmp_path / "summary.csv").read_text().splitlines()))
-    assert [row["region"] for row in rows if row["height"] == "pole_100cm"] == SIDES * 2
+    assert [row["region"] for row in rows if row["band"] == "pole_100cm"] == SIDES * 2
     assert json.loads((tmp_path / "summary.json").read_text())["rows"] == both.summary
     assert [one.band for one in both.page.maps].count("pole_100cm") == 2
-    without = evaluate(RIGS[1], yard("yard"), **{**SMALL, "steps": 1, "probe": "none"})
+    without = evaluate(RIGS[1], yard("yard"), **{**SMALL, "num_frames": 1, "test_targets": "none"})
     assert of_bodies(without) == []
     with pytest.raises(ValueError, match="other bodies were put beside them"):
         _ = compare([both, without]).table
@@ -96,10 +96,10 @@ def test_files_keep_them_and_compare_reads_them(both, tmp_path):
 
 def test_workers_and_checkpoints_change_no_bit(both, tmp_path):
     path = tmp_path / "run.npz"
-    evaluate(RIGS, yard("yard"), checkpoint=Checkpoint(path, keep=True), **{**SMALL, "steps": 14})
+    evaluate(RIGS, yard("yard"), checkpoint=Checkpoint(path, keep=True), **{**SMALL, "num_frames": 14})
     resumed = evaluate(RIGS, yard("yard"), checkpoint=Checkpoint(path), **SMALL)
     assert of_bodies(resumed) == of_bodies(both)
-    assert of_bodies(evaluate(RIGS, yard("yard"), **{**SMALL, "workers": 2})) == of_bodies(both)
+    assert of_bodies(evaluate(RIGS, yard("yard"), **{**SMALL, "num_workers": 2})) == of_bodies(both)
 
 
 def test_a_mixture_is_the_weighted_mean(both):
@@ -109,16 +109,16 @@ def test_a_mixture_is_the_weighted_mean(both):
         value = 0.75 * first["target_positions_5_points"] + 0.25 * second["target_positions_5_points"]
         assert row["target_positions_5_points"] == pytest.approx(value)
         assert row["observed_cells"] == first["observed_cells"] + second["observed_cells"]
-    without = evaluate(RIGS, yard("other"), **{**SMALL, "steps": 1, "probe": "none"})
+    without = evaluate(RIGS, yard("other"), **{**SMALL, "num_frames": 1, "test_targets": "none"})
     with pytest.raises(ValueError, match="other bodies"):
         _ = MixedResult.from_results({"yard": both, "other": without}, {"yard": 0.75, "other": 0.25})
 
 
 def test_who_asks_about_other_regions_asks_for_bodies_by_name_or_has_none():
     asked = RegionsOfInterest(regions={"ahead": {"x_m": (2.0, 22.0), "y_m": (-8.0, 8.0)}})
-    few = {**SMALL, "steps": 1, "ask": asked}
+    few = {**SMALL, "num_frames": 1, "regions": asked}
     assert {row["region"] for row in of_bodies(evaluate(RIGS[0], yard("yard"), **few))} == set(SIDES)
-    assert of_bodies(evaluate(RIGS[0], yard("yard"), **{**few, "probe": None})) == []
+    assert of_bodies(evaluate(RIGS[0], yard("yard"), **{**few, "test_targets": None})) == []
 
 
 @pytest.mark.parametrize(
@@ -126,4 +126,4 @@ def test_who_asks_about_other_regions_asks_for_bodies_by_name_or_has_none():
 )
 def test_bodies_that_make_no_sense_are_refused(probe, message):
     with pytest.raises(ValueError, match=message):
-        evaluate(RIGS[0], yard("yard"), **{**SMALL, "probe": probe})
+        evaluate(RIGS[0], yard("yard"), **{**SMALL, "test_targets": probe})

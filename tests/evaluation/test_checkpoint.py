@@ -99,13 +99,13 @@ def cut_short(*args, **settings):
 
 def bits(result):
     """All that was measured."""
-    found = {"observed": result.observed, "steps": result.run.steps, "counts": dict(result.run.counts)}
+    found = {"observed": result.observer_results, "num_frames": result.run.num_frames, "counts": dict(result.run.counts)}
     for name, coverage in result.coverages.items():
-        blocks = {"block sums": coverage.blocks.listed, "block steps": coverage.blocks.steps}
+        blocks = {"block sums": coverage.block_sums.sums, "block steps": coverage.block_sums.frame_counts}
         layers = {key: layer.values for key, layer in coverage.layers.items()}
-        for key, tensor in {**blocks, **layers, "points": coverage.points, "probed": coverage.probed_steps}.items():
+        for key, tensor in {**blocks, **layers, "points": coverage.point_counts, "probed": coverage.observed_frames}.items():
             found[f"{name} {key}"] = tensor.numpy().tobytes()
-    return {**found, "skipped": tuple(result.run.skipped)}
+    return {**found, "skipped_frames": tuple(result.run.skipped_frames)}
 
 
 def stamp(path):
@@ -121,7 +121,7 @@ def press():
 def test_it_goes_on_after_ctrl_c_to_the_same_bits(frame_of, path, workers):
     whole = bits(measured(Drive(frame_of, {7}), skip_bad_frames=True))
     for at in (0, 9, STEPS - 1):  # one run: it goes on twice
-        part = cut_short(Drive(frame_of, {7}), path, seen=Seen(at, press), skip_bad_frames=True, workers=workers)
+        part = cut_short(Drive(frame_of, {7}), path, seen=Seen(at, press), skip_bad_frames=True, num_workers=workers)
         assert isinstance(part.run.failure, KeyboardInterrupt)
         assert len(part.observer_results["seen"]) == part.run.num_frames == at + 1 - (at > 7)
     assert bits(measured(Drive(frame_of, {7}), path, skip_bad_frames=True)) == whole
@@ -143,21 +143,21 @@ def test_it_goes_on_after_being_killed_at_any_moment(frame_of, path):
         time.sleep(chance.uniform(0.0, 0.02))
         os.kill(child, signal.SIGKILL)
         kills += os.waitpid(child, 0)[1] == signal.SIGKILL
-        assert 0 < read_header(path)["run"]["steps"] <= STEPS
+        assert 0 < read_header(path)["run"]["num_frames"] <= STEPS
     assert kills >= 2
     assert bits(measured(Drive(frame_of), path)) == whole
     assert [file.name for file in path.parent.iterdir()] == [path.name]
 
 
 def test_a_complete_run_goes_on_when_more_steps_are_wanted(frame_of, path):
-    measured(Drive(frame_of), path, steps=5)
+    measured(Drive(frame_of), path, num_frames=5)
     seen = Seen()
-    assert bits(measured(Drive(frame_of), path, steps=12, seen=seen)) == bits(measured(Drive(frame_of), steps=12))
+    assert bits(measured(Drive(frame_of), path, num_frames=12, seen=seen)) == bits(measured(Drive(frame_of), num_frames=12))
     assert len(seen.names) == 12
-    again = measured(Drive(frame_of, range(STEPS)), path, steps=12)  # not a frame is made
-    assert bits(again) == bits(measured(Drive(frame_of), steps=12))
+    again = measured(Drive(frame_of, range(STEPS)), path, num_frames=12)  # not a frame is made
+    assert bits(again) == bits(measured(Drive(frame_of), num_frames=12))
     with pytest.raises(ValueError, match="steps: 12 are done in the checkpoint; got 11, which is less"):
-        measured(Drive(frame_of), path, steps=11)
+        measured(Drive(frame_of), path, num_frames=11)
 
 
 def test_looks_at_a_target_error_go_on_as_they_would_have(frame_of, path, monkeypatch):
@@ -185,7 +185,7 @@ def test_it_is_written_every_minute_and_more_seldom_where_that_took_a_twentieth_
     monkeypatch.setattr(checkpoint, "time", SimpleNamespace(monotonic=lambda: now_s))
     monkeypatch.setattr(checkpoint, "write_checkpoint", write)
     journal = checkpoint.CheckpointManager(Checkpoint(tmp_path / "a.npz"), {}, {})
-    run = SimpleNamespace(steps=1, counts=Counter(), skipped=[], seconds=0.0)
+    run = SimpleNamespace(num_frames=1, counts=Counter(), skipped_frames=[], duration_s=0.0)
     while now_s < 1800.0:
         now_s += 1.0
         journal.write_if_due(run)
@@ -197,7 +197,7 @@ def test_it_is_written_every_minute_and_more_seldom_where_that_took_a_twentieth_
 def test_what_one_observer_has_seen_and_another_has_not_is_not_kept(frame_of, path):
     with pytest.raises(ZeroDivisionError):
         cut_short(Drive(frame_of), path, seen=Seen(6, lambda: 1 / 0)).run.raise_failure()
-    assert read_header(path)["run"]["steps"] == 6
+    assert read_header(path)["run"]["num_frames"] == 6
     assert bits(measured(Drive(frame_of), path)) == bits(measured(Drive(frame_of)))
 
 
@@ -208,17 +208,17 @@ def test_what_one_observer_has_seen_and_another_has_not_is_not_kept(frame_of, pa
         ({"thresholds_m": (0.4, 1.0)}, r"thresholds_m \(\[0.4\] there, \[0.4, 1.0\] here\)"),
         ({"aggregations": ()}, r"aggregations \(other content\)"),
         ({"band_frame": "ground"}, r"band_frame \(\"vehicle\" there, \"ground\" here\)"),
-        ({"estimate": "known"}, r"estimate \(null there, \"known\" here\)"),
+        ({"average": "cells"}, r"average \(null there, \"cells\" here\)"),
         ({"target_error": "1%"}, r"target_error \(other content\)"),
         ({"observers": {}}, r"observers \(other content\)"),
     ],
 )
 def test_a_checkpoint_of_another_run_is_refused_by_what_differs(frame_of, path, changes, named):
-    measured(Drive(frame_of), path, steps=3)
+    measured(Drive(frame_of), path, num_frames=3)
     with pytest.raises(ValueError, match=rf"checkpoint.npz: a checkpoint of another run: {named}; resume with the"):
-        measured(Drive(frame_of), path, steps=3, **changes)
+        measured(Drive(frame_of), path, num_frames=3, **changes)
     with pytest.raises(ValueError, match=r"another run: frames \(\"drive\" there, \"other\" here\)"):
-        measured(Drive(frame_of, content="other"), path, steps=3)
+        measured(Drive(frame_of, content="other"), path, num_frames=3)
 
 
 def test_all_options_decide_about_a_run_but_those_that_it_names():
@@ -226,13 +226,13 @@ def test_all_options_decide_about_a_run_but_those_that_it_names():
 
 
 def test_without_resume_it_starts_anew(frame_of, path):
-    measured(Drive(frame_of), path, steps=3)
-    result = measured(Drive(frame_of, content="other"), Checkpoint(path, resume=False), steps=2)
-    assert (result.run.num_frames, read_header(path)["run"]["steps"]) == (2, 2)
+    measured(Drive(frame_of), path, num_frames=3)
+    result = measured(Drive(frame_of, content="other"), Checkpoint(path, resume=False), num_frames=2)
+    assert (result.run.num_frames, read_header(path)["run"]["num_frames"]) == (2, 2)
 
 
 def test_skipped_frames_are_not_forgotten(frame_of, path):
-    measured(Drive(frame_of, {1}), path, steps=3, skip_bad_frames=True)
+    measured(Drive(frame_of, {1}), path, num_frames=3, skip_bad_frames=True)
     with pytest.raises(ValueError, match=r"1 bad frames were skipped before the checkpoint, such as f1"):
         measured(Drive(frame_of, {1}), path)
 
@@ -242,14 +242,14 @@ def test_a_full_disk_is_told_of_once_and_the_run_goes_on(frame_of, path, monkeyp
     def full(_):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    measured(Drive(frame_of), path, steps=3)
+    measured(Drive(frame_of), path, num_frames=3)
     with monkeypatch.context() as patch:
         patch.setattr(os, "fsync", full)
         with pytest.warns(UserWarning, match="no checkpoint was written .*No space left.*; the run goes on") as told:
-            result = measured(Drive(frame_of), path, steps=9)
+            result = measured(Drive(frame_of), path, num_frames=9)
     assert len(told) == 1
-    assert (result.run.is_complete, bits(result)) == (True, bits(measured(Drive(frame_of), steps=9)))
-    assert read_header(path)["run"]["steps"] == 3
+    assert (result.run.is_complete, bits(result)) == (True, bits(measured(Drive(frame_of), num_frames=9)))
+    assert read_header(path)["run"]["num_frames"] == 3
     assert [file.name for file in path.parent.iterdir()] == [path.name]
     assert bits(measured(Drive(frame_of), path)) == bits(measured(Drive(frame_of)))
 
@@ -290,7 +290,7 @@ def test_states_come_back_bit_for_bit(tmp_path):
         "truth": torch.tensor([True, False]),
         "tree": {"list": [1, 0.1, None, "text", True, [torch.tensor([1.5])]], "": {}},
     }
-    header = {"identity": {}, "run": {"steps": 1, "counts": {}, "skipped": [], "seconds": 0.0}}
+    header = {"identity": {}, "run": {"num_frames": 1, "counts": {}, "skipped_frames": [], "duration_s": 0.0}}
     write_checkpoint(path, header, {"one": state})
     back = read_state(path, read_header(path), "one")
     tree, tree_back = state.pop("tree"), back.pop("tree")
@@ -306,7 +306,7 @@ def test_a_state_may_be_larger_than_what_the_first_zips_held(tmp_path, monkeypat
     """2 GiB, which are 1 kB here."""
     monkeypatch.setattr(zipfile, "ZIP64_LIMIT", 1000)
     path, state = tmp_path / "a.npz", {"large": torch.arange(1000)}
-    header = {"identity": {}, "run": {"steps": 1, "counts": {}, "skipped": [], "seconds": 0.0}}
+    header = {"identity": {}, "run": {"num_frames": 1, "counts": {}, "skipped_frames": [], "duration_s": 0.0}}
     write_checkpoint(path, header, {"one": state})
     assert torch.equal(read_state(path, read_header(path), "one")["large"], state["large"])
 
@@ -323,7 +323,7 @@ def test_a_state_may_be_larger_than_what_the_first_zips_held(tmp_path, monkeypat
 )
 def test_an_array_that_its_header_describes_wrongly_is_refused(tmp_path, change, message):
     path = tmp_path / "a.npz"
-    header = {"identity": {}, "run": {"steps": 1, "counts": {}, "skipped": [], "seconds": 0.0}}
+    header = {"identity": {}, "run": {"num_frames": 1, "counts": {}, "skipped_frames": [], "duration_s": 0.0}}
     write_checkpoint(path, header, {"one": {"of it": torch.arange(6).view(2, 3)}})
     header = read_header(path)
     header["states"]["one"]["dict"]["of it"]["tensor"] |= change
@@ -344,24 +344,24 @@ def test_an_array_that_is_listed_often_counts_as_often(tmp_path, monkeypatch):
 
 
 def test_a_damaged_checkpoint_is_named(frame_of, path):
-    measured(Drive(frame_of), path, steps=3)
+    measured(Drive(frame_of), path, num_frames=3)
     data = bytearray(path.read_bytes())
     third = len(data) // 3
     for damage in (data[:-100], data[:third] + bytes(third) + data[2 * third :], b"PK", b""):
         path.write_bytes(damage)
         with pytest.raises(BadFileError, match=r"checkpoint\.npz: "):
-            measured(Drive(frame_of), path, steps=3)
+            measured(Drive(frame_of), path, num_frames=3)
     np.savez(path, header=np.array("{}"))
     with pytest.raises(BadFileError, match="checkpoint format None; this torchcover reads format 2"):
-        measured(Drive(frame_of), path, steps=3)
+        measured(Drive(frame_of), path, num_frames=3)
 
 
 def test_an_edited_checkpoint_is_refused(frame_of, path):
-    measured(Drive(frame_of), path, steps=3)
+    measured(Drive(frame_of), path, num_frames=3)
     with np.load(path) as file:
         arrays = dict(file)
     header = json.loads(str(arrays["header"]))
-    header["run"]["steps"] = 9
+    header["run"]["num_frames"] = 9
     with zipfile.ZipFile(path) as archive:
         seal = archive.comment
     for edited in (arrays | {"header": np.array(json.dumps(header))}, dict(list(arrays.items())[1:])):
@@ -370,4 +370,4 @@ def test_an_edited_checkpoint_is_refused(frame_of, path):
             with zipfile.ZipFile(path, "a") as archive:
                 archive.comment = comment
             with pytest.raises(BadFileError, match="it was edited, or is damaged; begin anew"):
-                measured(Drive(frame_of), path, steps=3)
+                measured(Drive(frame_of), path, num_frames=3)

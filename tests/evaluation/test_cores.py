@@ -84,7 +84,7 @@ def test_who_lets_threads_spin_is_told_once(nothing_said):
 def test_it_points_at_the_line_of_the_user(nothing_said, monkeypatch):
     monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
     with pytest.warns(UserWarning, match="OMP_WAIT_POLICY") as said:
-        evaluate("front_roof_128", "courtyard", steps=1, rays=64)
+        evaluate("front_roof_128", "courtyard", num_frames=1, num_rays=64)
     assert [one.filename for one in said] == [__file__]
 
 
@@ -110,7 +110,7 @@ def test_who_does_not_is_told_nothing(nothing_said, said):
     ],
 )
 def test_workers_are_as_many_as_have_something_to_do(monkeypatch, count, frames, worlds, expected):
-    monkeypatch.setattr(module, "cores", lambda: count)
+    monkeypatch.setattr(module, "count_cores", lambda: count)
     monkeypatch.setattr(multiprocessing, "get_start_method", lambda allow_none: "fork")
     monkeypatch.setattr(module, "find_memory_limit_bytes", lambda: 1e12)
     assert compute_num_workers(frames, worlds, sends_frames=False) == expected
@@ -119,7 +119,7 @@ def test_workers_are_as_many_as_have_something_to_do(monkeypatch, count, frames,
 
 
 def test_workers_need_memory_and_room_for_frames_that_they_hand_over(monkeypatch, tmp_path):
-    monkeypatch.setattr(module, "cores", lambda: 16)
+    monkeypatch.setattr(module, "count_cores", lambda: 16)
     monkeypatch.setattr(module, "SHARED_MEMORY", str(tmp_path))
     monkeypatch.setattr(multiprocessing, "get_start_method", lambda allow_none: "fork")
     for memory, room, whole, expected in (
@@ -139,11 +139,11 @@ def test_a_simulation_has_the_usual_workers_and_frames_of_others_none(monkeypatc
     class KnownError(Exception):
         """The number of workers."""
 
-    def observe(*_, workers, **__):
-        raise KnownError(workers)
+    def observe(*_, num_workers, **__):
+        raise KnownError(num_workers)
 
-    def usual(frames, worlds, *, whole):
-        asked.append((frames, worlds, whole))
+    def usual(frames, worlds, *, sends_frames):
+        asked.append((frames, worlds, sends_frames))
         return 2
 
     asked = []
@@ -151,9 +151,9 @@ def test_a_simulation_has_the_usual_workers_and_frames_of_others_none(monkeypatc
     monkeypatch.setattr(measuring, "compute_num_workers", usual)
     frames = SimulatedFrames("urban", "front_roof_32", num_frames=64)
     for given, expected in (
-        ({"scenario": "urban", "steps": 64}, 2),
-        ({"scenario": "urban", "steps": 9999, "metrics": "k_cover"}, 2),
-        ({"scenario": "urban", "steps": 64, "workers": 0}, 0),
+        ({"scenario": "urban", "num_frames": 64}, 2),
+        ({"scenario": "urban", "num_frames": 9999, "metrics": "k_cover"}, 2),
+        ({"scenario": "urban", "num_frames": 64, "num_workers": 0}, 0),
         ({"frames": frames}, 0),
     ):
         with pytest.raises(KnownError) as found:

@@ -23,7 +23,7 @@ from torchcover.evaluation import Settings, TargetError, task
 from torchcover.evaluation.result_page import HEAVY
 from torchcover.evaluation.target_error import MIN_GROWTH, MIN_STEPS
 
-SMALL = {"steps": 2, "cell_m": 4.0, "rays": 1024, "probe": "pole"}
+SMALL = {"num_frames": 2, "cell_m": 4.0, "num_rays": 1024, "test_targets": "pole"}
 
 
 class PointCount:
@@ -66,7 +66,7 @@ def test_the_random_states_and_the_default_device_of_the_user_are_neither_used_n
     expected = torchcover.evaluate("front_roof_32", **SMALL)
     before = torch.get_rng_state(), np.random.get_state(), random.getstate()  # noqa: NPY002
     with torch.device("meta"):  # a tensor that is made on the default device has no numbers
-        found = torchcover.evaluate("front_roof_32", **SMALL, workers=workers)
+        found = torchcover.evaluate("front_roof_32", **SMALL, num_workers=workers)
     assert found.summary == expected.summary
     after = torch.get_rng_state(), np.random.get_state(), random.getstate()  # noqa: NPY002
     assert torch.equal(before[0], after[0])
@@ -80,7 +80,7 @@ def test_one_rig(tmp_path):
     assert result.coverage is result.coverages["front_roof_32"]
     assert result.coverage.counts["num_frames"] == result.run.num_frames == 2
     # Of the near field, two sides hold a centre of such large cells, and of that the ground is asked about.
-    places = [(row["region"], row["height"]) for row in result.summary]
+    places = [(row["region"], row["band"]) for row in result.summary]
     assert places[:6:2] == [("20m", "ground"), ("80m", "ground"), ("160m", "ground")]
     assert places[6:8] == [("left_3m", "ground"), ("right_3m", "ground")]
     assert places[8:] == [(f"{side}_3m", "pole_100cm") for side in ("front", "rear", "left", "right")]
@@ -135,7 +135,7 @@ def test_any_source_of_frames_will_do():
     assert list(both.coverages) == ["low", "high"]
     assert both.record["frames"] == "made up"
     assert both.record["reference"] is None
-    one = torchcover.evaluate("high", frames=Source(), cell_m=4.0, steps=2)
+    one = torchcover.evaluate("high", frames=Source(), cell_m=4.0, num_frames=2)
     assert one.run.num_frames == 2
     assert torch.equal(one.coverage.radius.nan_to_num(-1.0), both.coverages["high"].radius.nan_to_num(-1.0))
     with pytest.raises(ValueError, match=r"no clouds of the rig middle; the frames have low, high"):
@@ -195,11 +195,11 @@ def test_a_result_that_was_cut_short_says_so_wherever_its_numbers_stand(error, r
 
 
 def test_a_run_that_came_to_its_end_says_nothing_of_one():
-    assert "cut short" not in str(torchcover.evaluate(frames=Single(), cell_m=4.0, steps=2))
+    assert "cut short" not in str(torchcover.evaluate(frames=Single(), cell_m=4.0, num_frames=2))
 
 
 def test_the_only_rig_of_a_source_goes_by_the_name_of_the_sensors_it_is():
-    result = torchcover.evaluate("kitti", frames=Single(), cell_m=4.0, steps=2)
+    result = torchcover.evaluate("kitti", frames=Single(), cell_m=4.0, num_frames=2)
     assert list(result.coverages) == list(result.sensors) == ["kitti"]
     with pytest.raises(FileNotFoundError, match=r"neither a \.yaml file nor one of the built-in rigs"):
         torchcover.evaluate("no_such_rig", frames=Single())
@@ -224,7 +224,7 @@ class Rigs:
 def test_observers_see_the_rigs_that_are_measured_under_their_names():
     one = torchcover.evaluate("high", frames=Source(), cell_m=4.0, observers={"rigs": Rigs()})
     assert one.observer_results["rigs"] == {("high",)}
-    named = torchcover.evaluate("kitti", frames=Single(), cell_m=4.0, steps=2, observers={"rigs": Rigs()})
+    named = torchcover.evaluate("kitti", frames=Single(), cell_m=4.0, num_frames=2, observers={"rigs": Rigs()})
     assert named.observer_results["rigs"] == {("kitti",)}
     both = torchcover.evaluate(["high", "low"], frames=Source(), cell_m=4.0, observers={"rigs": Rigs()})
     assert both.observer_results["rigs"] == {("high", "low")}
@@ -232,7 +232,7 @@ def test_observers_see_the_rigs_that_are_measured_under_their_names():
 
 def test_a_rig_may_be_called_what_no_file_can_be(tmp_path):
     rigs = [Rig.load("front_roof_32").model_copy(update={"name": name}) for name in ("a/b", "a b")]
-    result = torchcover.evaluate(rigs, **{**SMALL, "steps": 1})
+    result = torchcover.evaluate(rigs, **{**SMALL, "num_frames": 1})
     result.save(tmp_path)
     stems = [path.stem for path in sorted((tmp_path / "coverage").iterdir())]
     assert len(stems) == 2
@@ -241,9 +241,9 @@ def test_a_rig_may_be_called_what_no_file_can_be(tmp_path):
 
 def test_settings_have_one_form_whatever_they_are_given_as():
     result = torchcover.evaluate(
-        frames=Single(), cell_m=4.0, steps=1, thresholds_m=0.4, device=torch.device("cpu"), target_error="5%"
+        frames=Single(), cell_m=4.0, num_frames=1, thresholds_m=0.4, device=torch.device("cpu"), target_error="5%"
     )
-    assert result.coverage.thresholds == (0.4,)
+    assert result.coverage.thresholds_m == (0.4,)
     assert result.record["device"] == "cpu"
     assert result.target_error == TargetError(detection=0.05)
     json.dumps(result.record)
@@ -252,8 +252,8 @@ def test_settings_have_one_form_whatever_they_are_given_as():
 @pytest.mark.parametrize(
     ("settings", "error", "message"),
     [
-        ({"steps": 0}, ValueError, "steps: at least 1 is needed; got 0"),
-        ({"steps": -1}, ValueError, "steps: at least 1 is needed; got -1"),
+        ({"num_frames": 0}, ValueError, "steps: at least 1 is needed; got 0"),
+        ({"num_frames": -1}, ValueError, "steps: at least 1 is needed; got -1"),
         ({"thresholds_m": "0.4"}, TypeError, "thresholds_m: metres are needed, as in 0.4"),
         ({"target_error": 0.1}, TypeError, "target error: numbers with their units"),
         ({"aggregations": Maximum()}, TypeError, "aggregations: names such as maximum"),
@@ -296,8 +296,8 @@ def test_a_gpu_casts_rays_if_warp_is_there_and_no_workers_are_asked_for(monkeypa
 
     monkeypatch.setattr(task, "get_device", torch.device)
     monkeypatch.setattr(task, "find_spec", lambda name: name == "warp")
-    assert (device("cuda:1"), device("cuda", workers=0), device("cpu")) == ("cuda:1", "cuda", None)
-    assert device("cuda", workers=2) is None
+    assert (device("cuda:1"), device("cuda", num_workers=0), device("cpu")) == ("cuda:1", "cuda", None)
+    assert device("cuda", num_workers=2) is None
     monkeypatch.setattr(task, "find_spec", lambda _: None)
     assert device("cuda") is None
 
@@ -316,7 +316,7 @@ def test_every_argument_is_declared_once_and_stands_in_the_signature_and_in_the_
 
 
 def test_aggregations_are_measured_drawn_and_saved(tmp_path):
-    result = torchcover.evaluate(frames=Single(), cell_m=8.0, steps=1, aggregations=["maximum", Quantiles((0.5,))])
+    result = torchcover.evaluate(frames=Single(), cell_m=8.0, num_frames=1, aggregations=["maximum", Quantiles((0.5,))])
     assert all(
         row["radius_q0.5_m"] <= 1.13 * row["radius_maximum_m"] + 0.01 for row in result.summary if row["observed_cells"]
     )
@@ -332,7 +332,7 @@ def test_of_detections_alone_the_same_is_known_and_of_radii_nothing():
     """Of a rig that errs, beside one that does not: with and without the rays that change no detection."""
     errs = Rig.load("front_roof_32").sensors[0].model_copy(update={"range_noise_m": 0.2, "dropout": 0.1})
     rigs = [Rig(name="errs", sensors=(errs,)), "front_roof_32"]
-    given = {"steps": 2, "cell_m": 4.0, "rays": 300, "thresholds_m": (0.2, 0.4)}
+    given = {"num_frames": 2, "cell_m": 4.0, "num_rays": 300, "thresholds_m": (0.2, 0.4)}
     every, some = (torchcover.evaluate(rigs, "parking", **given, only_detection=only) for only in (False, True))
     for name, coverage in every.coverages.items():
         other = some.coverages[name]
@@ -351,11 +351,11 @@ def test_of_detections_alone_the_same_is_known_and_of_radii_nothing():
 
 
 def test_what_a_run_left_out_is_told_as_it_was_at_its_end(monkeypatch):
-    result = torchcover.evaluate(frames=Single(), cell_m=8.0, steps=1)
-    before = result.record["left_out"]
+    result = torchcover.evaluate(frames=Single(), cell_m=8.0, num_frames=1)
+    before = result.record["omissions"]
     for package in HEAVY:
         monkeypatch.setitem(sys.modules, package, sys)
-    assert result.record["left_out"] == before
+    assert result.record["omissions"] == before
 
 
 def test_a_folder_of_results_is_of_one_run(tmp_path):
@@ -363,7 +363,7 @@ def test_a_folder_of_results_is_of_one_run(tmp_path):
     for mine in ("notes.txt", "maps/mine.png"):
         (tmp_path / mine).write_text("mine")
     torchcover.evaluate(frames=Source(), cell_m=8.0, thresholds_m=(0.4, 1.0)).save(tmp_path)
-    files = torchcover.evaluate(frames=Single(), cell_m=8.0, steps=2).save(tmp_path)
+    files = torchcover.evaluate(frames=Single(), cell_m=8.0, num_frames=2).save(tmp_path)
     found = {path for path in tmp_path.rglob("*") if path.is_file()}
     assert found == {*files, tmp_path / "notes.txt", tmp_path / "maps" / "mine.png"}
     listed = json.loads((tmp_path / "summary.json").read_text())["files"]
@@ -379,7 +379,7 @@ def test_a_summary_that_lists_others_deletes_nothing(tmp_path, names):
     out.mkdir()
     named = [str(tmp_path / name) if name == "/mine.txt" else name for name in names] if names else names
     (out / "summary.json").write_text(json.dumps({"files": named}))
-    torchcover.evaluate(frames=Single(), cell_m=8.0, steps=1).save(out)
+    torchcover.evaluate(frames=Single(), cell_m=8.0, num_frames=1).save(out)
     assert (tmp_path / "mine.txt").read_text() == "mine"
 
 
@@ -393,7 +393,7 @@ def full(path):
 
 
 def test_a_result_stays_whole_until_the_numbers_of_the_next_are_there(tmp_path, monkeypatch):
-    result = torchcover.evaluate(frames=Single(), cell_m=8.0, steps=2)
+    result = torchcover.evaluate(frames=Single(), cell_m=8.0, num_frames=2)
     result.save(tmp_path)
     before = contents(tmp_path)
     monkeypatch.setattr(Coverage, "save", lambda self, path: full(path))
@@ -406,7 +406,7 @@ def test_numbers_are_safe_and_listed_although_a_map_could_not_be_written(tmp_pat
     torchcover.evaluate(frames=Source(), cell_m=8.0).save(tmp_path)
     monkeypatch.setattr(Figure, "savefig", lambda self, path, **_: full(path))
     with pytest.raises(OSError, match="no space left"):
-        torchcover.evaluate(frames=Single(), cell_m=8.0, steps=2).save(tmp_path)
+        torchcover.evaluate(frames=Single(), cell_m=8.0, num_frames=2).save(tmp_path)
     after = contents(tmp_path)
     assert set(after) == {"coverage.npz", "summary.csv", "summary.json"}
     assert list(json.loads(after["summary.json"])["files"]) == ["coverage.npz", "summary.csv"]
@@ -415,15 +415,15 @@ def test_numbers_are_safe_and_listed_although_a_map_could_not_be_written(tmp_pat
 def test_what_a_killed_process_left_aside_is_cleared(tmp_path):
     (tmp_path / ".torchcover_left").mkdir()
     (tmp_path / ".torchcover_left" / "coverage.npz").write_bytes(b"half")
-    torchcover.evaluate(frames=Single(), cell_m=8.0, steps=1).save(tmp_path)
+    torchcover.evaluate(frames=Single(), cell_m=8.0, num_frames=1).save(tmp_path)
     assert not [name for name in contents(tmp_path) if name.startswith(".")]
 
 
 def test_a_source_that_lacks_something_is_told_what():
     class Unfinished(Single):
-        square_metres = property()  # raises AttributeError, as what is not there does
+        has_area_weights = property()  # raises AttributeError, as what is not there does
 
-    with pytest.raises(TypeError, match="got Unfinished, which has no square_metres; for a list"):
+    with pytest.raises(TypeError, match="got Unfinished, which has no has_area_weights; for a list"):
         torchcover.evaluate(frames=Unfinished(), cell_m=8.0)
 
 
@@ -431,11 +431,11 @@ def test_hills_do_not_change_what_is_seen_of_far_obstacles():
     """The same cities with and without hills; by z of a vehicle that pitches the road is an obstacle there."""
     urban = Scenario.load("urban")
     flat = urban.model_copy(update={"traffic": urban.traffic.model_copy(update={"hills_m": 0.0})})
-    settings = {"steps": 8, "cell_m": 1.0, "rays": 2048, "seed": 1}
+    settings = {"num_frames": 8, "cell_m": 1.0, "num_rays": 2048, "seed": 1}
     hilly, level = (torchcover.evaluate("front_roof_128", each, **settings) for each in (urban, flat))
     assert (hilly.record["band_frame"], hilly.coverage.band_frame) == ("ground", "ground")
     far = [
-        {row["region"]: row["detection_0.4m"] for row in result.summary if row["height"] == "obstacle"}
+        {row["region"]: row["detection_0.4m"] for row in result.summary if row["band"] == "obstacle"}
         for result in (hilly, level)
     ]
     for region in ("80m", "160m"):
@@ -457,8 +457,8 @@ def test_an_ego_that_leans_finds_the_same_numbers():
     def obstacle(band_frame=None, **pose):
         ego = {"shape": {"type": "box", "size_m": [4, 2, 1.5]}, "pose": pose}
         scenario = Scenario.model_validate({"name": "walls", "ego": ego, "bodies": bodies})
-        result = torchcover.evaluate(rig, scenario, steps=4, cell_m=4, rays=1024, ask=ask, band_frame=band_frame)
-        (row,) = (row for row in result.summary if row["height"] == "obstacle")
+        result = torchcover.evaluate(rig, scenario, num_frames=4, cell_m=4, num_rays=1024, regions=ask, band_frame=band_frame)
+        (row,) = (row for row in result.summary if row["band"] == "obstacle")
         return np.array([row["detection_0.4m"], row["visible_m2"] / 10])
 
     level = obstacle()

@@ -63,8 +63,8 @@ def numbers_of(rigs, steps=1, world=WORLD):
     for name, one in rigs.items():
         sensors = [sensor.name for sensor in one.sensors]
         metric = CoverageMetric(
-            GRID, (0.2, 0.4, 3.0), max_radius=30.0, aggregations=(Maximum(),), regions=(AREA,), sensors=sensors,
-            square_metres=True,
+            GRID, (0.2, 0.4, 3.0), max_radius_m=30.0, aggregations=(Maximum(),), regions=(AREA,), sensor_names=sensors,
+            has_area_weights=True,
         )  # fmt: skip
         setup = MetricSetup(name, one.sensors, None, GRID, (AREA,), threshold_m=0.4, query_cache=FrameQueryCache())
         observers[name] = [
@@ -78,8 +78,8 @@ def numbers_of(rigs, steps=1, world=WORLD):
     for name, (coverage, *others) in observers.items():
         own = {}
         for row in coverage.compute().summary():
-            kinds = {"": row.numbers, "known": row.known, "seen by": row.redundancy.seen_by, **row.redundancy.without}
-            own |= {(row.region, row.height, kind, key): one for kind, of in kinds.items() for key, one in of.items()}
+            kinds = {"": row.numbers, "known": row.cell_averages, "seen by": row.redundancy.detecting_sensors, **row.redundancy.failure_numbers}
+            own |= {(row.region, row.band, kind, key): one for kind, of in kinds.items() for key, one in of.items()}
         found[name] = own | {number.quantity.key: number for other in others for number in other.compute()}
     return found
 
@@ -116,7 +116,7 @@ def test_what_s_mig_captures_falls_with_what_returns():
     rigs = {str(at): rig("lidar", str(at), **keys) for at, keys in enumerate(CHAINS["missing returns"])}
     frame, captured = SimulatedFrames(WORLD, rigs=rigs, num_frames=1, boxes=True)[0], []
     for name, one in rigs.items():
-        metric = SMig(one.sensors, 1.0, categories=("car",), ends_at_hits=True, rig=name)
+        metric = SMig(one.sensors, 1.0, categories=("car",), ends_at_hits=True, rig_name=name)
         metric.update(
             [frame, replace(frame, boxes=frame.boxes.select_categories())]
         )  # the cars are there every other time
@@ -138,10 +138,10 @@ def test_what_does_not_err_is_what_it_was(kind):
 
 @pytest.mark.parametrize("number", ["detection_0.2m", "radius_m", "seen_by_two_0.4m", "detection_0.4m_without_any"])
 def test_no_imperfection_lets_a_search_prefer_a_rig(number):
-    instants = CommonFrames([WORLD], {"asked": Objective(number=number, region="20m", band="ground")}, rays=1024)
+    instants = CommonFrames([WORLD], {"asked": Objective(number=number, region="20m", band="ground")}, num_rays=1024)
     for chain in ("range noise", "drop-out", "missing returns"):
         rigs = [rig("lidar", "r", **keys) for keys in CHAINS[chain]]
-        found = [float(instants.estimates(one)["area"].value[0]) for one in rigs]
+        found = [float(instants.score(one).estimate.value[0]) for one in rigs]
         found = [-value for value in found] if number == "radius_m" else found
         assert found == sorted(found, reverse=True)
         assert found[-1] < found[0]

@@ -35,7 +35,7 @@ class Drive(FrameDataset):
 
 @pytest.mark.usefixtures("blank_maps")
 def test_a_kill_at_any_file_operation_leaves_the_earlier_or_the_new_result(tmp_path):
-    earlier, new = (torchcover.evaluate(frames=Drive(), cell_m=8.0, steps=steps) for steps in (2, 3))
+    earlier, new = (torchcover.evaluate(frames=Drive(), cell_m=8.0, num_frames=steps) for steps in (2, 3))
     earlier.save(tmp_path / "out")
     copies = tmp_path / "copies"
     count, code = operations_of(lambda: new.save(tmp_path / "out"), copied=(tmp_path / "out", copies))
@@ -48,7 +48,7 @@ def test_a_kill_at_any_file_operation_leaves_the_earlier_or_the_new_result(tmp_p
                 Coverage.load(out / "coverage.npz")
             continue
         steps.append(Coverage.load(out / "coverage.npz").counts["num_frames"])
-        assert summary["counts"]["steps"] == steps[-1]
+        assert summary["counts"]["num_frames"] == steps[-1]
         assert [name for name in summary["files"] if not os.path.isfile(out / name)] == []
     assert steps == sorted(steps)
     assert set(steps) == {2, 3}

@@ -27,7 +27,7 @@ RIG = Rig.model_validate(
         ],
     }
 )
-FEW = {"probe": "none", "cell_m": 4.0, "rays": 64, "reference": "paper"}
+FEW = {"test_targets": "none", "cell_m": 4.0, "num_rays": 64, "reference": "paper"}
 
 
 @pytest.fixture
@@ -60,11 +60,11 @@ def errors(result):
 def test_going_round_again_makes_no_error_smaller(drive):
     # A reference whose own draws scatter little: only that becomes less. Four rounds of new data would have half the
     # error.
-    settings = {**FEW, "reference": "surface", "rays": 1024}
-    once, often = (torchcover.evaluate(RIG, drive(8), steps=steps, **settings) for steps in (8, 8 * 4))
+    settings = {**FEW, "reference": "surface", "num_rays": 1024}
+    once, often = (torchcover.evaluate(RIG, drive(8), num_frames=steps, **settings) for steps in (8, 8 * 4))
     known = errors(once) > 0
     assert np.median(errors(often)[known] / errors(once)[known]) > 0.75
-    assert often.coverage.blocks.steps.tolist() == [4] * 8 + [0] * 8
+    assert often.coverage.block_sums.frame_counts.tolist() == [4] * 8 + [0] * 8
     assert often.record["frame_counts"]["repeated_frames"] == 8 * 3
     assert "8 different instants in 32 steps: the scenario was seen again, which intervals know." in often.table.notes
     assert "seen again" not in " ".join(once.table.notes)
@@ -79,13 +79,13 @@ def test_a_target_error_does_not_go_round_and_round(drive):
 
 
 def test_a_few_instants_have_no_error_however_often_they_are_seen(drive):
-    result = torchcover.evaluate(RIG, drive(3), steps=24, **FEW)
+    result = torchcover.evaluate(RIG, drive(3), num_frames=24, **FEW)
     assert np.isnan(errors(result)).all()
-    assert result.coverage.blocks.steps.tolist()[:4] == [8, 8, 8, 0]
+    assert result.coverage.block_sums.frame_counts.tolist()[:4] == [8, 8, 8, 0]
 
 
 def test_where_nothing_moves_errors_are_about_the_reference_and_say_so():
-    result = torchcover.evaluate(RIG, "courtyard", steps=9, **FEW)
+    result = torchcover.evaluate(RIG, "courtyard", num_frames=9, **FEW)
     assert (errors(result)[:2] > 0).all()
     assert (
         "All 9 steps show the same instant: intervals are about the reference sensor's places only."
@@ -94,9 +94,9 @@ def test_where_nothing_moves_errors_are_about_the_reference_and_say_so():
 
 
 def test_nothing_is_said_of_errors_where_there_are_none(drive):
-    still = torchcover.evaluate(RIG, "courtyard", steps=7, **FEW)
+    still = torchcover.evaluate(RIG, "courtyard", num_frames=7, **FEW)
     assert "All 7 steps show the same instant." in still.table.notes
-    few = torchcover.evaluate(RIG, drive(3), steps=9, **FEW)
+    few = torchcover.evaluate(RIG, drive(3), num_frames=9, **FEW)
     assert "3 different instants in 9 steps: the scenario was seen again." in few.table.notes
     assert not any("interval" in note for note in (*still.table.notes, *few.table.notes))
 

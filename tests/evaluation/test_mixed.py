@@ -16,7 +16,7 @@ ASKED = RegionsOfInterest.model_validate(
         "grid": {"x_m": [0, 24], "y_m": [-8, 8]},
     }
 )
-SMALL = {"steps": 16, "cell_m": 1.0, "rays": 256, "ask": ASKED}
+SMALL = {"num_frames": 16, "cell_m": 1.0, "num_rays": 256, "regions": ASKED}
 RIGS = [
     Rig.model_validate({
         "name": name,
@@ -73,7 +73,7 @@ def test_marks_are_beyond_chance_in_the_mixture(mixed, yards):
     first, other = mixed.summary
     assert other["detection_0.4m_difference_significant"]
     assert first["detection_0.4m_best"] != other["detection_0.4m_best"]
-    few = evaluate(RIGS, [yards / "near.yaml", yards / "far.yaml"], **{**SMALL, "steps": 4})
+    few = evaluate(RIGS, [yards / "near.yaml", yards / "far.yaml"], **{**SMALL, "num_frames": 4})
     assert not any(row["detection_0.4m_best"] for row in few.summary)
     # Eight blocks in all are not eight in each.
     assert all(row["detection_0.4m_low"] is None for row in few.summary)
@@ -87,7 +87,7 @@ def test_redundancy_is_mixed_by_the_book(yards):
     given = {str(yards / "near.yaml"): 3, str(yards / "far.yaml"): 1}
     mixed = evaluate(rig, given, redundancy=True, **SMALL)
     (row,), parts = mixed.summary, [(mixed.weights[name], world.summary[0]) for name, world in mixed.worlds.items()]
-    assert row["indispensable_sensor"] == "high"
+    assert row["most_critical_sensor"] == "high"
     for key in ("sensors_0.4m", "detection_0.4m_without_high", "detection_0.4m_without_high_change"):
         assert row[key] == pytest.approx(sum(weight * part[key] for weight, part in parts))
         error = math.sqrt(sum((weight * part[f"{key}_error"]) ** 2 for weight, part in parts))
@@ -97,7 +97,7 @@ def test_redundancy_is_mixed_by_the_book(yards):
 def test_what_kinds_of_world_agree_in_is_said_once_and_else_of_each(mixed, yards, tmp_path):
     foggy = yards / "foggy.yaml"
     foggy.write_text(YARD.format(name="foggy", wall_m=8, height_m=1.5) + "weather: {name: fog, visibility_m: 30}\n")
-    other = evaluate(RIGS[0], [yards / "near.yaml", foggy], **{**SMALL, "steps": 2})
+    other = evaluate(RIGS[0], [yards / "near.yaml", foggy], **{**SMALL, "num_frames": 2})
     assert other.source["weather"] == {"high": "near clear, foggy fog"}
     assert {"foggy: Weather: fog.", "Vehicle: box.", "Sensor model: ideal, every hit is a point."} < set(
         other.table.notes
@@ -150,7 +150,7 @@ def test_files_hold_every_world_and_the_mixture(mixed, tmp_path):
 def test_each_world_has_a_checkpoint_of_its_own(mixed, yards, tmp_path):
     given = {str(yards / "near.yaml"): 0.75, str(yards / "far.yaml"): 0.25}
     checkpoint = Checkpoint(tmp_path / "checkpoint.npz", keep=False)
-    evaluate(RIGS, given, checkpoint=checkpoint, **{**SMALL, "steps": 8})
+    evaluate(RIGS, given, checkpoint=checkpoint, **{**SMALL, "num_frames": 8})
     assert sorted(path.parent.name for path in tmp_path.glob("*/checkpoint.npz")) == ["far", "near"]
     longer = evaluate(RIGS, given, checkpoint=checkpoint, **SMALL)
     assert longer.summary == mixed.summary
@@ -186,7 +186,7 @@ def test_who_cannot_be_mixed_is_refused_before_anything_is_measured(yards, monke
     tall.write_text(YARD.format(name="tall", wall_m=8, height_m=1.5).replace("[4, 2, 1.5]", "[6, 2, 1.5]"))
     near = str(yards / "near.yaml")
     with pytest.raises(ValueError, match="near, tall cannot be mixed: the regions around their egos differ"):
-        evaluate(RIGS[0], [near, tall], steps=1, cell_m=1.0, rays=64)
+        evaluate(RIGS[0], [near, tall], num_frames=1, cell_m=1.0, num_rays=64)
     with pytest.raises(TypeError, match="got int"):
         evaluate(RIGS[0], [near, 3], **SMALL)
     with pytest.raises(ValueError, match="observers"):

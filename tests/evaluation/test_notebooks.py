@@ -23,7 +23,7 @@ MOST_CHARS = 800
 @pytest.fixture(scope="module")
 def results():
     nasty = (rig := Rig.load("front_roof_32")).model_copy(update={"name": NASTY})
-    result = torchcover.evaluate([nasty, rig], steps=2, rays=1024, cell_m=1.0)
+    result = torchcover.evaluate([nasty, rig], num_frames=2, num_rays=1024, cell_m=1.0)
     return {
         "result": result,
         "coverage": result.coverages[NASTY],

@@ -58,4 +58,4 @@ def test_nobody_is_told_that_the_distortion_of_a_lens_was_left_out(lens, coeffic
 
     assert listed(straight) == ["kornia, for lenses with distortion: not imported"]
     assert listed(straight, bent) == []
-    assert listed(straight, workers=2) == []
+    assert listed(straight, num_workers=2) == []

@@ -139,7 +139,7 @@ def test_frames_are_measured_where_they_are_made_and_travel_only_if_somebody_els
 @pytest.mark.parametrize("workers", [0, 2])
 def test_what_cannot_be_measured_ends_the_run_with_what_was_seen_before(frames, workers):
     """The metric wants square metres, which one frame lacks."""
-    observer = CoverageObserver(CoverageMetric(GRID, square_metres=True), "a")
+    observer = CoverageObserver(CoverageMetric(GRID, has_area_weights=True), "a")
     frames[4] = replace(frames[4], reference_weights=None)
     run = observe(frames, [observer], num_workers=workers, keep_partial=True, skip_bad_frames=True)
     assert (run.num_frames, run.skipped_frames, int(observer.metric.num_frames)) == (4, [], 4)
@@ -200,11 +200,11 @@ def test_each_world_is_built_by_one_worker_whoever_gives_the_frames(monkeypatch,
         return build(self, seed, run, *rest)
 
     monkeypatch.setattr(Scenario, "world", world)
-    evaluate(frames=Told(frames), cell_m=8.0, workers=2)
+    evaluate(frames=Told(frames), cell_m=8.0, num_workers=2)
     assert sorted((tmp_path / "built").read_text().split()) == ["0", "1"]
 
 
-@pytest.mark.parametrize("get_frames", [Wrapped, lambda frames: Subset(Wrapped(frames), [0, 1])])
+@pytest.mark.parametrize("frames_of", [Wrapped, lambda frames: Subset(Wrapped(frames), [0, 1])])
 def test_a_source_that_does_not_know_its_worlds_is_refused_where_it_matters(frames, frames_of):
     source = frames_of(Told(frames))
     assert observe(source, [Names()], num_workers=1).num_frames == len(source)
@@ -273,7 +273,7 @@ def test_what_ended_a_run_is_raised_unless_the_caller_keeps_what_there_is(frames
 
 
 def test_square_metres_are_not_made_up(frames):
-    metric = CoverageMetric(GRID, square_metres=True)
+    metric = CoverageMetric(GRID, has_area_weights=True)
     with pytest.raises(ValueError, match="the square metres of each reference point are needed"):
         CoverageObserver(metric, "a").update(replace(frames[0], reference_weights=None))
     CoverageObserver(metric, "a").update(frames[0])

@@ -119,7 +119,7 @@ def test_all_get_the_result_of_a_single_process(frame_of, tmp_path, length, work
     source = Drive(frame_of, length, bad={4})
     single = measured(source, skip_bad_frames=True)
     for found, _ in in_ranks(
-        tmp_path, lambda ranks: measured(source, ranks, skip_bad_frames=True, workers=workers), size
+        tmp_path, lambda ranks: measured(source, ranks, skip_bad_frames=True, num_workers=workers), size
     ):
         check_equal(found, single)
 
@@ -277,7 +277,7 @@ def test_who_ends_all_ends_with_its_own_error_and_the_others_with_words_of_it(fa
 
 def test_a_run_over_ranks_goes_on_from_its_checkpoints(frame_of, tmp_path):
     path = tmp_path / "out" / "checkpoint.npz"
-    in_ranks(tmp_path, lambda ranks: measured(Drive(frame_of), ranks, steps=3, checkpoint=path))
+    in_ranks(tmp_path, lambda ranks: measured(Drive(frame_of), ranks, num_frames=3, checkpoint=path))
     assert sorted(file.name for file in path.parent.iterdir()) == ["checkpoint.npz", "checkpoint_rank1.npz"]
     done = {0, 1, 2}
     for found, _ in in_ranks(tmp_path, lambda ranks: measured(Drive(frame_of, bad=done), ranks, checkpoint=path)):
@@ -338,14 +338,14 @@ def test_who_waits_for_a_rank_that_is_gone_can_be_ended(frame_of, tmp_path):
 @pytest.mark.parametrize("frame_interval_s", [0.1, 10.0, 120.0])
 def test_shares_are_whole_worlds_and_more_steps_only_add_to_them(frame_interval_s):
     frames = SimulatedFrames("urban", "front_roof_32", num_frames=5000, frame_interval_s=frame_interval_s)
-    world_of, everybody = frames.simulator.get_run_index, [Ranks(None, rank, 3) for rank in range(3)]
-    shares = [list(ranks.iterate_share(range(5000), world_of)) for ranks in everybody]
+    get_scene_id, everybody = frames.simulator.get_run_index, [Ranks(None, rank, 3) for rank in range(3)]
+    shares = [list(ranks.iterate_share(range(5000), get_scene_id)) for ranks in everybody]
     assert sorted(index for share in shares for index in share) == list(range(5000))
-    worlds = [{world_of(index) for index in share} for share in shares]
+    worlds = [{get_scene_id(index) for index in share} for share in shares]
     assert not (worlds[0] & worlds[1] | worlds[0] & worlds[2] | worlds[1] & worlds[2])
     assert max(map(len, worlds)) - min(map(len, worlds)) <= 1
     for ranks, share in zip(everybody, shares, strict=True):
-        fewer = list(ranks.iterate_share(range(1234), world_of))
+        fewer = list(ranks.iterate_share(range(1234), get_scene_id))
         assert share[: len(fewer)] == fewer
 
 

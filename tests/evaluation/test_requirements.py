@@ -269,8 +269,8 @@ def test_numbers_of_regions_are_those_of_evaluate():
         world(), num_frames=12, num_workers=0,
     ).verdicts["small"]  # fmt: skip
     asking = RegionsOfInterest.model_validate(keys)
-    result = evaluate(THREE, world(), steps=12, workers=0, thresholds_m=0.3, redundancy=True, ask=asking)
-    (row,) = (row for row in result.summary if row["height"] == "ground")
+    result = evaluate(THREE, world(), num_frames=12, num_workers=0, thresholds_m=0.3, redundancy=True, regions=asking)
+    (row,) = (row for row in result.summary if row["band"] == "ground")
     for verdict, key, worse in zip(found, ("detection_0.3m", "radius_m"), (min, max), strict=True):
         assert verdict.value == worse(row[key], row[f"{key}_without_front"]) != row[key]
         assert verdict.total_count == 2
@@ -285,7 +285,7 @@ def test_requirements_of_regions_name_cameras_with_perfect_depth(more, is_named)
         asked({**NEAR, "number": "detection_0.4m", "min_value": 0.5}),
         "courtyard",
         num_frames=1,
-        workers=0,
+        num_workers=0,
     )
     for notes in (found.record["notes"], found.build_tables()[0].notes):
         assert any("Perfect depth is assumed for cameras of" in note for note in notes) == is_named
@@ -324,7 +324,7 @@ def test_times_to_collision_are_the_latest_of_all_phases(box):
 
 def test_who_is_seen_from_the_beginning_may_have_been_before(box):
     """So more than that is neither kept nor not, with a sensor lost, too; and nothing has more than the whole."""
-    way = {"name": "a", "ego": {"speed_kmh": 20}, "other": {"body": "adult", "speed_kmh": 5}, "seconds": 1.2}
+    way = {"name": "a", "ego": {"speed_kmh": 20}, "other": {"body": "adult", "speed_kmh": 5}, "duration_s": 1.2}
     one = {"encounters": {"name": "short", "encounters": [way]}, "points": 2, "looks": 2, "without": "any"}
     two = rig(lidar(), lidar("mast", mount={"z_m": 1.2}))
     brakes = {"deceleration": 9, "latency_s": 0.75}
@@ -347,7 +347,7 @@ def test_who_is_seen_from_the_beginning_may_have_been_before(box):
 @pytest.mark.parametrize(
     ("name", "rig_name", "keys"),
     [("robot", EXAMPLES / "robot" / "delivery_robot.yaml", {"vehicle": EXAMPLES / "robot" / "body.ply"}),
-     ("car", "kitti", {"steps": 16, "workers": 0})],
+     ("car", "kitti", {"num_frames": 16, "num_workers": 0})],
 )  # fmt: skip
 def test_the_examples_keep_what_they_require(name, rig_name, keys):
     found = check(rig_name, EXAMPLES / name / "needs.yaml", **keys)

@@ -31,7 +31,7 @@ def test_steps_hold_clouds_coloured_by_radius_and_boxes(tmp_path):
     for index in (3, 5):
         log.update(Frame({"a b": torch.zeros(1, 3)}, near_and_far, index, "f", boxes=car))
     log.update(Frame({"a b": torch.rand(3 * MOST_POINTS, 3)}, near_and_far, 6, "f"))
-    result = torchcover.evaluate("front_roof_32", steps=1, rays=1024, cell_m=1.0)
+    result = torchcover.evaluate("front_roof_32", num_frames=1, num_rays=1024, cell_m=1.0)
     log.finish(result)
     found = read(tmp_path / "run.rrd")
     points, reference = found["/a\\ b/points"], found["/a\\ b/reference\\ by\\ radius"]

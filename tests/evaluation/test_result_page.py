@@ -36,7 +36,7 @@ class Text(HTMLParser):
 def result():
     rig = Rig.load("front_roof_32")
     named = rig.model_copy(update={"name": NASTY})
-    return torchcover.evaluate([named, rig], steps=2, rays=1024, cell_m=1.0, redundancy=True)
+    return torchcover.evaluate([named, rig], num_frames=2, num_rays=1024, cell_m=1.0, redundancy=True)
 
 
 @pytest.mark.usefixtures("blank_maps")

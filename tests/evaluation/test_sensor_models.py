@@ -25,13 +25,13 @@ RIG = Rig.model_validate(
         ],
     }
 )
-SETTINGS = {"steps": 2, "rays": 1024}
+SETTINGS = {"num_frames": 2, "num_rays": 1024}
 
 
 def numbers(result, name):
     """Radius and detection by region and band, where known."""
     rows = [row for row in result.summary if row["rig"] == name]
-    return {(row["region"], row["height"]): row for row in rows if row["radius_m"] is not None}
+    return {(row["region"], row["band"]): row for row in rows if row["radius_m"] is not None}
 
 
 def columns(row):
@@ -87,7 +87,7 @@ def test_a_difference_of_sensor_models_is_said_with_the_answer(worse):
 
 
 def test_the_paper_measures_with_ideal_sensors():
-    result = evaluate(RIG, reference="paper", rays=256, steps=1)
+    result = evaluate(RIG, reference="paper", num_rays=256, num_frames=1)
     assert result.record["sensor_model"] == {"roof": "ideal"}
 
 
@@ -102,7 +102,7 @@ def test_the_paper_measures_with_ideal_sensors():
 )
 def test_what_cannot_be_is_told(given, told):
     with pytest.raises((ValueError, FileNotFoundError), match=told):
-        evaluate(**({"rigs": RIG, "steps": 1} | given))
+        evaluate(**({"rigs": RIG, "num_frames": 1} | given))
 
 
 def test_a_model_says_as_much_of_its_lidars_as_a_rig():

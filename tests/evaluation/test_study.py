@@ -25,7 +25,7 @@ def no_command(monkeypatch):
 def study():
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr("torchcover.evaluation.study.measure_command_s", lambda plan: 100.0)
-        return measure_error_against_time(StudyPlan(SMALL, ({"rays": 64}, {"reference": "paper", "rays": 1024})))
+        return measure_error_against_time(StudyPlan(SMALL, ({"num_rays": 64}, {"reference": "paper", "num_rays": 1024})))
 
 
 def trial(a, seconds=64.0, bias=0.0, options="", least=64):
@@ -52,7 +52,7 @@ def test_a_study_says_of_the_same_steps_what_an_evaluation_says(study):
     first, fewer, _ = study.trials
     # Of 8 blocks at least: here the others see all of them.
     for each, rays in ((first, 256), (fewer, 64)):
-        coverage = evaluate(*SMALL.rigs, "courtyard", steps=8, cell_m=4.0, rays=rays).coverage
+        coverage = evaluate(*SMALL.rigs, "courtyard", num_frames=8, cell_m=4.0, num_rays=rays).coverage
         rows = {(row.region, row.height): row.numbers for row in coverage.summary()}
         for one in each.numbers:
             number = rows[one.region, one.height][one.quantity.key]
@@ -86,10 +86,10 @@ def test_the_worst_awaited_number_decides_and_what_prints_no_error_is_not_recomm
 
 def test_another_setting_is_recommended_only_where_it_saves_a_fifth():
     plan = StudyPlan(SMALL)
-    for seconds, expected in ((60.0, ""), (40.0, "--set rays=64")):
-        found = Study(plan, [trial(0.04), trial(0.04, seconds, options="--set rays=64")], 1.0).find_recommended(0.01)
+    for seconds, expected in ((60.0, ""), (40.0, "--set num_rays=64")):
+        found = Study(plan, [trial(0.04), trial(0.04, seconds, options="--set num_rays=64")], 1.0).find_recommended(0.01)
         assert (found[0].options, found[1]) == (expected, 400)
-    biased = Study(plan, [trial(0.04), trial(0.04, 1.0, bias=0.02, options="--set rays=64")], 1.0)
+    biased = Study(plan, [trial(0.04), trial(0.04, 1.0, bias=0.02, options="--set num_rays=64")], 1.0)
     assert biased.find_recommended(0.01)[0].options == ""
     assert Study(plan, [trial(math.nan)], 1.0).find_recommended(0.01) is None
     assert Study(plan, [trial(math.nan)], 1.0).format_recommendation(0.01) == (
@@ -97,7 +97,7 @@ def test_another_setting_is_recommended_only_where_it_saves_a_fifth():
     )
     assert Study(plan, [trial(0.04)], 1.0).format_recommendation(0.01) == (
         "For 1 percentage point of every detection: front_roof_32 --set scenario=courtyard --set cell_m=4.0 "
-        "--set rays=256 --num-frames=400 (401 s)."
+        "--set num_rays=256 --num-frames=400 (401 s)."
     )
 
 
@@ -114,8 +114,8 @@ def test_records_are_json_without_nan_and_the_files_are_written(study, tmp_path)
     record = json.loads(json.dumps(study.record, allow_nan=False))
     assert [one["options"] for one in record["trials"]] == [
         "",
-        "--set rays=64",
-        "--set reference=paper --set rays=1024",
+        "--set num_rays=64",
+        "--set reference=paper --set num_rays=1024",
     ]
     assert [one["band_frame"] for one in record["trials"]] == ["ground", "ground", "vehicle"]
     assert [one["error"] for one in record["recommended"]] == [0.02, 0.01, 0.005]
@@ -127,9 +127,9 @@ def test_the_command_that_is_timed_has_every_option_that_is_not_as_usual():
     )
     assert StudyPlan(settings).command == [
         "evaluate", "rig", *("--set", "scenario=urban"), *("--set", "cell_m=0.5"), *("--set", "thresholds_m=0.2,1.0"),
-        *("--set", "frame_interval_s=5.0"), *("--set", "workers=2"),
+        *("--set", "frame_interval_s=5.0"), *("--set", "num_workers=2"),
     ]  # fmt: skip
-    assert StudyPlan(replace(settings, steps=None)).trial_settings[""].num_frames == 512
+    assert StudyPlan(replace(settings, num_frames=None)).trial_settings[""].num_frames == 512
 
 
 @pytest.mark.parametrize("settings", [Settings(), Settings(Rig.load("front_roof_32"))])

@@ -50,7 +50,7 @@ def measure_coverage(task: Task[FrameSource], settings: Settings, stopping_rule:
     coverages = {name: observer.compute() for name, observer in coverage.items()}
     if isinstance(probes := seen.get(BODIES), Probes):
         for name, one in coverages.items():
-            one.bodies = probes.seen_by(name)
+            one.target_sums = probes.seen_by(name)
     if len({coverage.counts["num_frames"] for coverage in coverages.values()}) > 1:
         run.raise_failure()  # within a step: the rigs have not seen the same
     report = None

@@ -100,7 +100,7 @@ def build_columns(table: CoverageTable) -> ColumnGetters:
     columns: ColumnGetters = {
         "rig": lambda row: row.rig,
         "region": lambda row: row.summary.region,
-        "height": lambda row: row.summary.band,
+        "band": lambda row: row.summary.band,
     }
     for key in keys:
         columns |= _of_summary(key)
@@ -111,7 +111,7 @@ def build_columns(table: CoverageTable) -> ColumnGetters:
         columns |= _compared(key)
     sensors = dict.fromkeys(sensor for rows in table.rows.values() for sensor in get_failure_sensors(rows))
     if sensors:
-        columns |= {"indispensable_sensor": _indispensable}
+        columns |= {"most_critical_sensor": _most_critical_sensor}
         for quantity in list_redundancy_quantities((), table.thresholds_m):
             columns |= _seen_by(quantity.key)
     for sensor in sensors:
@@ -125,18 +125,18 @@ def _of_summary(key: str) -> ColumnGetters:
 
 
 def _known(key: str) -> ColumnGetters:
-    return _number(f"known_{key}", lambda row: row.summary.cell_averages.get(key))
+    return _number(f"cells_{key}", lambda row: row.summary.cell_averages.get(key))
 
 
 def _compared(key: str) -> ColumnGetters:
     return {
         f"{key}_best": lambda row: key in row.leading_keys,
         **_number(f"{key}_difference", lambda row: row.differences.get(key)),
-        f"{key}_difference_significant": lambda row: getattr(row.differences.get(key), "significant", None),
+        f"{key}_difference_significant": lambda row: getattr(row.differences.get(key), "is_significant", None),
     }
 
 
-def _indispensable(row: Row) -> object:
+def _most_critical_sensor(row: Row) -> object:
     return "" if row.summary.redundancy is None else row.summary.redundancy.most_critical_sensor or ""
 
 
@@ -159,7 +159,7 @@ def _without(sensor: str, key: str) -> ColumnGetters:
     without = f"{key}_without_{sensor}"
     significant = f"{without}_change_significant"
     columns = _number(without, number) | _number(f"{without}_change", change)
-    return {**columns, significant: lambda row: getattr(change(row), "significant", None)}
+    return {**columns, significant: lambda row: getattr(change(row), "is_significant", None)}
 
 
 def _number(key: str, number: Callable[[Row], Number | Difference | None]) -> ColumnGetters:
