@@ -87,7 +87,7 @@ def test_redundancy_is_mixed_by_the_book(yards):
     given = {str(yards / "near.yaml"): 3, str(yards / "far.yaml"): 1}
     mixed = evaluate(rig, given, redundancy=True, **SMALL)
     (row,), parts = mixed.summary, [(mixed.weights[name], world.summary[0]) for name, world in mixed.worlds.items()]
-    assert row["most_critical_sensor"] == "high"
+    assert row["most_important_sensor"] == "high"
     for key in ("sensors_0.4m", "detection_0.4m_without_high", "detection_0.4m_without_high_change"):
         assert row[key] == pytest.approx(sum(weight * part[key] for weight, part in parts))
         error = math.sqrt(sum((weight * part[f"{key}_error"]) ** 2 for weight, part in parts))

@@ -133,7 +133,7 @@ def _aggregations(given: "str | Sequence[Aggregation | str]") -> "tuple[Aggregat
 def _metrics(given: str | Iterable[str]) -> tuple[str, ...]:
     if not given:
         return ()
-    names: tuple[str, ...] = load_contrib().metric_names(given)
+    names: tuple[str, ...] = load_contrib().parse_metric_names(given)
     return names
 
 

@@ -111,7 +111,7 @@ def build_columns(table: CoverageTable) -> ColumnGetters:
         columns |= _compared(key)
     sensors = dict.fromkeys(sensor for rows in table.rows.values() for sensor in get_failure_sensors(rows))
     if sensors:
-        columns |= {"most_critical_sensor": _most_critical_sensor}
+        columns |= {"most_important_sensor": _get_most_important_sensor}
         for quantity in list_redundancy_quantities((), table.thresholds_m):
             columns |= _seen_by(quantity.key)
     for sensor in sensors:
@@ -136,7 +136,7 @@ def _compared(key: str) -> ColumnGetters:
     }
 
 
-def _most_critical_sensor(row: Row) -> object:
+def _get_most_important_sensor(row: Row) -> object:
     return "" if row.summary.redundancy is None else row.summary.redundancy.most_critical_sensor or ""
 
 

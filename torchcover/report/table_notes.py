@@ -296,8 +296,8 @@ def describe_near_field(table: CoverageTable) -> str:
     rows = list(zip(*table.target_rows.values(), strict=True))
     if not rows:
         return ""
-    body, key = rows[0][0].summary.height, table.target_quantities[0].key
-    near = [of for of in rows if of[0].summary.height == body and of[0].region.name in SIDES]
+    body, key = rows[0][0].summary.band, table.target_quantities[0].key
+    near = [of for of in rows if of[0].summary.band == body and of[0].region.name in SIDES]
     of_sides = {SIDES[of[0].region.name]: of for of in near}
     enough = (table.first_conditions.blocks or 0) >= MIN_BLOCKS
     told = {

@@ -193,7 +193,7 @@ class MovingBodies:
         cosine, material = np.empty(len(part_indices), dtype=np.float32), np.empty(len(part_indices), dtype=np.uint8)
         for number in np.unique(kind[part_indices]).tolist():
             some = np.flatnonzero(kind[part_indices] == number)
-            alone = casters[number].struck(
+            alone = casters[number].compute_hit_attributes(
                 np.zeros(len(some), dtype=np.int32), triangle_indices[some], towards[:, some]
             )
             cosine[some], material[some] = alone.cos_incidence, alone.material

@@ -269,7 +269,7 @@ class SimulatedFrames(FrameDataset):
             velocity_mps=torch.tensor(velocities, dtype=torch.float32, device="cpu").view(-1, 2),
             ids=tuple(label.name for label in found),
             categories=tuple(label.category for label in found),
-            drawn_points=None if drawn is None else torch.from_numpy(drawn[[label.object_index for label in found]]),
+            sampled_points=None if drawn is None else torch.from_numpy(drawn[[label.object_index for label in found]]),
             bottom_heights_m=torch.from_numpy(self.simulator.compute_bottom_heights_m(index, found)),
         )
 
