@@ -264,7 +264,7 @@ class Study:
             "rig": rig,
             "scenario": scenario,
             "seed": self.plan.settings.seed,
-            "start_s": self.startup_s,
+            "startup_s": self.startup_s,
             "trials": [_record(trial) for trial in self.trials],
             "recommended": [
                 {"error": error, "options": one and one[0].options, "num_frames": one and one[1]}
@@ -312,14 +312,14 @@ def _record(trial: Trial) -> dict[str, Any]:
     numbers = []
     for one in trial.numbers:
         difference = one.difference._asdict() if one.difference else {}
-        told = {name: difference.get(name, math.nan) for name in ("value", "error", "p")}
-        own = {"region": one.region, "height": one.band, "quantity": one.quantity.key, "value": one.value}
+        told = {name: difference.get(name, math.nan) for name in ("value", "error", "p_value")}
+        own = {"region": one.region, "band": one.band, "quantity": one.quantity.key, "value": one.value}
         numbers.append(
             to_json_record(
-                {**own, "a": one.error.error_coefficient, "bias": one.error.bias, "difference": to_json_record(told)}
+                {**own, "error_coefficient": one.error.error_coefficient, "bias": one.error.bias, "difference": to_json_record(told)}
             )
         )
-    names = ("options", "num_frames", "min_frames", "duration_s", "processor_s", "band_frame")
+    names = ("options", "num_frames", "min_frames", "duration_s", "cpu_s", "band_frame")
     return {**{name: getattr(trial, name) for name in names}, "numbers": numbers}
 
 
