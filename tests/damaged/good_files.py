@@ -167,7 +167,7 @@ Tr_velo_to_cam: 0 -1 0 0.01 0 0 -1 -0.07 1 0 0 -0.27
 POSES = b"""sensor:
   vehicle_T_sensor: [[1, 0, 0, -0.52], [0, 1, 0, 0], [0, 0, 1, 1.73], [0, 0, 0, 1]]
 vehicle: {lower_m: [-2.4, -0.9, 0.05], upper_m: [2.4, 0.9, 1.6]}
-reference: {square_metres: true}
+reference: {area_weights: true}
 rigs:
   roof: {flip_y: true, min_range_m: 0.5, vehicle_T_sensor: [[1, 0, 0, 0.5], [0, 1, 0, 0], [0, 0, 1, 2.0], [0, 0, 0, 1]]}
 """

@@ -162,7 +162,7 @@ def test_archives_that_python_would_inflate_at_once_are_refused(tmp_path, compre
 def test_a_line_of_megabytes_is_refused_before_it_is_taken_apart(tmp_path, before):
     """Millions of words take fifty times as much as the file."""
     (path := tmp_path / "a.csv").write_text(before + "1," * 600_000 + "1\n")
-    with pytest.raises(BadFileError, match=r"a line of 12000[0-9]{2} characters; at most 1000000 are read of one"):
+    with pytest.raises(BadFileError, match=r"a line of 12000[0-9]{2} characters; at most 1000000 are allowed"):
         read_cloud(path)
 
 

@@ -241,7 +241,7 @@ def test_a_bad_list_of_sensors_names_file_and_field(tmp_path, content, message):
 def test_what_is_missing_is_named(tmp_path):
     recorded(tmp_path, ids=("roof", "left"))
     (tmp_path / "reference" / "poses.csv").write_text("frame,x,y,z,roll,pitch,yaw\n8,0,0,0,0,0,0\n")
-    with pytest.raises(ValueError, match=r"reference.poses\.csv: one row for every frame is needed; 1 missing \(10\)"):
+    with pytest.raises(ValueError, match=r"reference.poses\.csv: each frame needs one row; 1 are missing \(10\)"):
         RecordedFrames(tmp_path)
     (tmp_path / "reference" / "poses.csv").unlink()
     (tmp_path / "roof" / "8.npy").write_bytes(b"rubbish")

@@ -56,7 +56,7 @@ def test_points_of_the_reference_keep_their_weights_and_those_left_out_take_thei
         np.savez(tmp_path / "reference" / f"{name}.npz", points=points, weights=np.arange(1.0, 6.0))
     assert RecordedFrames(tmp_path)[0].reference_weights is None
     (tmp_path / "frames.yaml").write_text(
-        "{reference: {square_metres: true}, vehicle: {lower_m: [-1, -1, 0], upper_m: [1, 1, 1]}}"
+        "{reference: {area_weights: true}, vehicle: {lower_m: [-1, -1, 0], upper_m: [1, 1, 1]}}"
     )
     frames = RecordedFrames(tmp_path)
     assert frames.has_area_weights
@@ -80,8 +80,8 @@ def test_points_of_the_reference_keep_their_weights_and_those_left_out_take_thei
 )
 def test_bad_weights_are_a_bad_frame(tmp_path, arrays, message):
     clouds(tmp_path, sensor=CLOUD, reference=CLOUD)
-    (tmp_path / "frames.yaml").write_text("reference: {square_metres: true}")
-    with pytest.raises(BadFrameError, match=r"f2\.npy: weights are read from a \.npz"):
+    (tmp_path / "frames.yaml").write_text("reference: {area_weights: true}")
+    with pytest.raises(BadFrameError, match=r"f2\.npy: weights need a \.npz"):
         RecordedFrames(tmp_path)[0]
     (tmp_path / "reference" / "f2.npy").unlink()
     np.savez(tmp_path / "reference" / "f2.npz", **arrays)
@@ -93,10 +93,10 @@ def test_frames_that_are_no_news_to_each_other_share_an_instant(tmp_path):
     driven(clouds(tmp_path, sensor=CLOUD, reference=CLOUD))
     assert [frame.block_index for frame in RecordedFrames(tmp_path)] == [0, 1]
     text = (tmp_path / "poses.csv").read_text().splitlines()
-    (tmp_path / "poses.csv").write_text("\n".join([text[0] + ",instant", *(line + ",7" for line in text[1:])]))
+    (tmp_path / "poses.csv").write_text("\n".join([text[0] + ",block_index", *(line + ",7" for line in text[1:])]))
     assert [frame.block_index for frame in RecordedFrames(tmp_path)] == [7, 7]
-    (tmp_path / "poses.csv").write_text("\n".join([text[0] + ",instant", *(line + ",7.5" for line in text[1:])]))
-    with pytest.raises(ValueError, match=r"poses\.csv: instant: whole numbers are needed; got 7\.5"):
+    (tmp_path / "poses.csv").write_text("\n".join([text[0] + ",block_index", *(line + ",7.5" for line in text[1:])]))
+    with pytest.raises(ValueError, match=r"poses\.csv: block_index: whole numbers are needed; got 7\.5"):
         RecordedFrames(tmp_path)
 
 
@@ -112,10 +112,10 @@ ROWS = "\nf2,0,0,0,0,1,0,0,0\nf10,1,0,0,0,1,0,0,0"
         (HEADER[:-3] + ROWS, r"missing: qz$"),
         (HEADER + ",roll" + ROWS, r"unknown: roll$"),
         (HEADER + ",qw" + ROWS, r"there twice: qw$"),
-        (HEADER, r"one row for every frame is needed; 2 missing \(f2, f10\)"),
-        (HEADER + ROWS[:20], r"1 missing \(f10\)"),
-        (HEADER + ROWS + ROWS[:20], r"1 doubled \(f2\)"),
-        (HEADER + ROWS + "\nf11,2,0,0,0,1,0,0,0", r"1 unknown \(f11\)"),
+        (HEADER, r"each frame needs one row; 2 are missing \(f2, f10\)"),
+        (HEADER + ROWS[:20], r"1 are missing \(f10\)"),
+        (HEADER + ROWS + ROWS[:20], r"1 are repeated \(f2\)"),
+        (HEADER + ROWS + "\nf11,2,0,0,0,1,0,0,0", r"1 are unknown \(f11\)"),
         (HEADER + ROWS + ",9", r"line 3: 9 columns are needed .* got 10"),
         (HEADER + ROWS.replace("f10,1", "f10,nan"), r"line 3: time_s: a finite number is needed; got 'nan'"),
         (HEADER + ROWS.replace("f10,1,0", "f10,1,east"), r"line 3: x_m: a finite number is needed; got 'east'"),
@@ -139,7 +139,7 @@ def test_a_bad_table_of_poses_names_file_and_field(tmp_path, text, message):
     [
         ("1,2,3,4,5,6,inf,a,car", r"line 2: yaw_rad: a finite number is needed; got 'inf'"),
         ("1,2,3,4,-5,6,0,a,car", r"size_m: 1 of 1 boxes have a length, width or height that is not positive"),
-        ("1,2,3,4,5,6,0,a,car\n1,2,3,4,5,6,0,a,car", r"id: every object has its own; a: there twice"),
+        ("1,2,3,4,5,6,0,a,car\n1,2,3,4,5,6,0,a,car", r"id: every object needs its own; a appears more than once"),
         ("1,2,3,4,5,6,0,a", r"line 2: 9 columns are needed"),
     ],
 )
@@ -152,8 +152,8 @@ def test_bad_boxes_are_a_bad_frame(tmp_path, row, message):
         file.write(row)
     with pytest.raises(BadFrameError, match=rf"^f2 \(frame 0\): .*f2\.csv: {message}"):
         RecordedFrames(tmp_path)[0]
-    table(tmp_path / "boxes" / "f2.csv", (*BOX, "drawn_points", "id", "category"), [(*[1.0] * 7, 0.5, "", "")])
-    with pytest.raises(BadFrameError, match=r"f2\.csv: drawn_points: whole numbers are needed; got 0\.5"):
+    table(tmp_path / "boxes" / "f2.csv", (*BOX, "sampled_points", "id", "category"), [(*[1.0] * 7, 0.5, "", "")])
+    with pytest.raises(BadFrameError, match=r"f2\.csv: sampled_points: whole numbers are needed; got 0\.5"):
         RecordedFrames(tmp_path)[0]
     (tmp_path / "boxes" / "f2.csv").unlink()
     with pytest.raises(ValueError, match=r"1 missing in boxes/ \(f2\)"):
@@ -176,7 +176,7 @@ def test_a_mount_is_said_once(tmp_path):
     table(tmp_path / "reference" / "poses.csv", ("frame", *POSE), rows)
     np.testing.assert_allclose(RecordedFrames(tmp_path)[0].reference, CLOUD * [-1, -1, 1] + [0, 0, 2], atol=1e-6)
     (tmp_path / "frames.yaml").write_text(f"reference: {{vehicle_T_sensor: {HALF_TURN.tolist()}}}")
-    with pytest.raises(ValueError, match=r"reference\.vehicle_T_sensor: reference/poses\.csv says it too; keep one"):
+    with pytest.raises(ValueError, match=r"reference\.vehicle_T_sensor: reference/poses\.csv has it too; keep one"):
         RecordedFrames(tmp_path)
     (tmp_path / "frames.yaml").write_text("reference: {min_range_m: 1}")
     assert len(RecordedFrames(tmp_path)[0].reference) == 2

@@ -180,10 +180,10 @@ MATRIX = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
         ("sensor: {min_range_m: -1}", r"sensor\.min_range_m: Input should be greater than or equal to 0"),
         ("sensor: {min_range_m: 1}", r"sensor\.min_range_m: it needs vehicle_T_sensor"),
         ("sensor: {flip_y: 1}", r"sensor\.flip_y: Input should be a valid boolean"),
-        ("sensors: {roof: {}}", r"sensors\.roof: there is no sensors/roof/ beside it"),
-        ("reference: {square_metres: m2}", r"reference\.square_metres: Input should be a valid boolean"),
-        ("reference: {weight_kind: density}", r"reference\.weight_kind: Extra .* for the reference also square_metres"),
-        ("sensor: {square_metres: true}", r"sensor\.square_metres: Extra inputs are not permitted"),
+        ("sensors: {roof: {}}", r"sensors\.roof: the folder sensors/roof/ does not exist in the recording"),
+        ("reference: {area_weights: m2}", r"reference\.area_weights: Input should be a valid boolean"),
+        ("reference: {weight_kind: density}", r"reference\.weight_kind: Extra .* for the reference also area_weights"),
+        ("sensor: {area_weights: true}", r"sensor\.area_weights: Extra inputs are not permitted"),
         ("vehicle: {lower_m: [0, 0, 0]}", r"vehicle\.upper_m: Field required"),
         ("vehicle: {lower_m: [0, 0], upper_m: [1, 1, 1]}", r"vehicle\.lower_m: List should have at least 3"),
         ("vehicle: {lower_m: [0, 0, .nan], upper_m: [1, 1, 1]}", r"vehicle\.lower_m\.2: Input should be a finite"),
@@ -259,7 +259,7 @@ def test_several_rigs_share_a_reference_and_have_a_pose_each(tmp_path):
 def test_what_is_wrong_with_several_rigs_is_named(tmp_path):
     folder = record_rigs(tmp_path, a=CLOUD, b=CLOUD)
     (folder / "frames.yaml").write_text(f"rigs: {{c: {{vehicle_T_sensor: {MATRIX}}}}}")
-    with pytest.raises(ValueError, match=r"frames\.yaml: rigs\.c: there is no rigs/c/ beside it"):
+    with pytest.raises(ValueError, match=r"frames\.yaml: rigs\.c: the folder rigs/c/ does not exist in the recording"):
         RecordedFrames(folder)
     (folder / "frames.yaml").write_text(f"rigs: {{b: {{vehicle_T_sensor: {MATRIX[:3]}}}}}")
     with pytest.raises(ValueError, match=r"frames\.yaml: rigs\.b\.vehicle_T_sensor: a 4x4 matrix is needed"):

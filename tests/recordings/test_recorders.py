@@ -15,7 +15,7 @@ from torchcover.files import RECORDING, WRITING, BadFileError, read_manifest
 from torchcover.geometry import convert_euler_to_rotation, convert_quaternion_to_rotation
 from torchcover.geometry.rigid import convert_rotation_to_quaternion
 from torchcover.recordings.formats.kitti import BODY, read_calibration, read_labels
-from torchcover.recordings.recorders import NOTHING, KittiRecorder
+from torchcover.recordings.recorders import NO_OBJECT_LABEL, KittiRecorder
 from torchcover.simulation import SurfaceReference, writing
 
 PATTERN = {"channels": 8, "vertical_fov_deg": (-30, 5), "horizontal_fov_deg": 360, "columns": 60, "max_range_m": 60}
@@ -59,7 +59,7 @@ def test_a_plain_folder_gives_the_frames_that_were_written(both, tmp_path):
         assert torch.equal(read.boxes.rows, written.boxes.rows)
         assert written.boxes.velocity_mps.isfinite().all()
         assert torch.equal(read.boxes.velocity_mps, written.boxes.velocity_mps)
-        assert torch.equal(read.boxes.sampled_points, written.boxes.drawn_points)
+        assert torch.equal(read.boxes.sampled_points, written.boxes.sampled_points)
         assert (read.boxes.ids, read.boxes.categories) == (written.boxes.ids, written.boxes.categories)
         # Of what was written it is unknown where it truly is: a point may leave a box that it was on.
         hits = [next(iter(frame.boxes.points_in_box.values())) for frame in (read, written)]
@@ -152,7 +152,7 @@ def test_a_step_without_objects_has_an_empty_list_of_them(tmp_path):
     for layout in ("folder", "kitti"):
         write_recording(frames, tmp_path / layout, layout)
         assert len(RecordedFrames(tmp_path / layout)[0].boxes) == 0
-    assert (tmp_path / "kitti" / "label_2" / "000000.txt").read_text() == NOTHING + "\n"
+    assert (tmp_path / "kitti" / "label_2" / "000000.txt").read_text() == NO_OBJECT_LABEL + "\n"
 
 
 def test_without_boxes_none_are_written(tmp_path):

@@ -19,6 +19,8 @@ from torchcover.recordings.clouds.arrays import Points
 
 # Drivers store zeros for rays without a return, so points this close to the origin are no returns.
 NO_RETURN_M = 1e-3
+# Points below this height under the vehicle belong to the ground, not to the vehicle.
+GROUND_CLEARANCE_M = 0.05
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,13 @@ from torchcover.geometry import (
 )
 from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.formats.ros import RosBag
-from torchcover.recordings.recorders import CLEARANCE_M
-from torchcover.recordings.recording import CalibratedRecording, Recording, SensorCalibrations, UndistortedRecording
+from torchcover.recordings.recording import (
+    GROUND_CLEARANCE_M,
+    CalibratedRecording,
+    Recording,
+    SensorCalibrations,
+    UndistortedRecording,
+)
 from torchcover.simulation.bodies import build_actor_mesh, create_body_shape
 from torchcover.simulation.camera_sensor import MOUNT_T_CAMERA
 from torchcover.simulation.lidar import LidarModel
@@ -114,7 +119,7 @@ def build_ego_box(recording: Recording, vehicle: str | Path) -> BoundingBox:
     ego = BoundingBox.from_points(build_actor_mesh("vehicle", create_body_shape(vehicle)).vertices_m)
     mounts = recording.read_calibrations().mounts if isinstance(recording, RosBag) else {}
     top_m = max([ego.upper_m[2], *(float(mount[2, 3]) + ABOVE_SENSOR_M for mount in mounts.values())])
-    return BoundingBox((*ego.lower_m[:2], CLEARANCE_M), (*ego.upper_m[:2], top_m))
+    return BoundingBox((*ego.lower_m[:2], GROUND_CLEARANCE_M), (*ego.upper_m[:2], top_m))
 
 
 def _lidar(recording: Recording, name: str, known: SensorCalibrations, model: str | None) -> tuple[dict[str, Any], str]:

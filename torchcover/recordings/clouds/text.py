@@ -1,4 +1,4 @@
-"""Clouds as text: `.csv`, `.xyz`, and the rows of the ascii variants of other formats."""
+"""Clouds in text files: `.csv`, `.xyz`, and the rows of ASCII variants of other formats."""
 
 import io
 import re
@@ -13,29 +13,35 @@ from torchcover.files import check_memory
 
 COMMENT_MARKS = ("#", "//")
 AXES = ("x", "y", "z")
-# Of three float64, and once more while the array grows.
-ROW_BYTES = 48
 # NaN and infinity as C libraries of Windows print them: -1.#IND, 1.#QNAN0, 1.#INF, -nan(ind).
 NOT_FINITE = re.compile(r"(?<![\w.])[-+]?(?:1\.[#$][A-Za-z]*\d*|nan\([a-z]*\))", re.IGNORECASE)
-MAX_LINE = 1_000_000  # characters: a word takes 50 times as much, until it is known how many there should be
 
 
 def read_text(path: Path) -> NDArray[np.float64]:
-    """Read one point a line, separated by commas or white space.
+    """Read one point per line, separated by commas or white space.
 
-    A line above the points may name the columns (also as a comment); else the first three are x y z. All rows have as
-    many columns as there are names, or as the first row.
+    The line before the points may name the columns (also as a comment); else the first three are x y z. All rows need
+    the same number of columns as the header or the first row.
+
+    Args:
+        path: File.
+
+    Returns:
+        (N, 3) points.
+
+    Raises:
+        ValueError: A row has another number of columns or no numbers, or columns x, y and z are missing.
     """
     rows = read_lines(path.read_bytes())
-    above, first = "", next(rows, None)
+    comment, first = "", next(rows, None)
     while first is not None and first.startswith(COMMENT_MARKS):
-        above, first = first, next(rows, None)
+        comment, first = first, next(rows, None)
     if first is None:
         return np.empty((0, 3))
     points = (row for row in rows if not row.startswith(COMMENT_MARKS))
     names = _split(first)
     if not _is_numeric(names):
-        columns = _named_columns(names)
+        columns = _find_axis_columns(names)
         if columns is None:
             raise ValueError(
                 f"the header line has to name the columns x, y and z; got {first[:80]!r}. "
@@ -45,49 +51,72 @@ def read_text(path: Path) -> NDArray[np.float64]:
         if first_row is None:
             return np.empty((0, 3))
         return parse_rows(chain([first_row], points), columns, len(names), "," if "," in first_row else None)
-    commented = _split(above.lstrip("#/"))
-    width = len(names) if _named_columns(commented) is None else len(commented)
-    columns = _named_columns(commented) or (0, 1, 2)
-    return parse_rows(chain([first], points), columns, width, "," if "," in first else None)
+    comment_names = _split(comment.lstrip("#/"))
+    comment_columns = _find_axis_columns(comment_names)
+    num_columns = len(names) if comment_columns is None else len(comment_names)
+    return parse_rows(chain([first], points), comment_columns or (0, 1, 2), num_columns, "," if "," in first else None)
 
 
 def parse_rows(
     rows: Iterable[str], columns: Sequence[int], num_columns: int, delimiter: str | None = None
 ) -> NDArray[np.float64]:
-    """(N, 3) numbers of rows, of which none is blank; float64 keeps all digits of UTM-sized coordinates.
+    """Parse the coordinates of text rows.
 
-    ValueError: a row of another width, or one without three numbers.
+    Args:
+        rows: Rows, none of them blank.
+        columns: Indices of x, y and z.
+        num_columns: Number of columns of every row.
+        delimiter: Character between columns; None for white space.
+
+    Returns:
+        (N, 3) numbers; float64 keeps all digits of UTM coordinates.
+
+    Raises:
+        ValueError: A row has another number of columns, or no three numbers.
     """
-    checked = _of_width(rows, num_columns, delimiter)
+    checked_rows = _check_num_columns(rows, num_columns, delimiter)
     try:
-        return np.loadtxt(checked, np.float64, comments=None, delimiter=delimiter, usecols=columns, ndmin=2)
+        return np.loadtxt(checked_rows, np.float64, comments=None, delimiter=delimiter, usecols=columns, ndmin=2)
     except ValueError as error:
         raise ValueError(f"not three numbers in every row ({error})") from error
 
 
 def read_lines(data: bytes) -> Iterator[str]:
-    """Lines of UTF-8, with or without a byte order mark; blank ones are left out."""
-    check_memory(2 * len(data) + ROW_BYTES * max(data.count(b"\n"), data.count(b"\r")))
-    return _lines(data)
+    """Read the lines of UTF-8 text, with or without a byte order mark, and skip blank ones.
+
+    Args:
+        data: Content of a file.
+
+    Returns:
+        Stripped lines, in which NaN and infinity have one spelling.
+
+    Raises:
+        ValueError: A line is too long, or the text is not UTF-8.
+    """
+    row_bytes = 48  # three float64, twice while the array grows
+    check_memory(2 * len(data) + row_bytes * max(data.count(b"\n"), data.count(b"\r")))
+    return _iterate_lines(data)
 
 
-def _lines(data: bytes) -> Iterator[str]:
+def _iterate_lines(data: bytes) -> Iterator[str]:
+    max_chars = 1_000_000  # a split line takes up to 50 times its size before its columns are counted
     stream = io.TextIOWrapper(io.BytesIO(data), encoding="utf-8-sig")
     try:
         for line in stream:
-            if len(line) > MAX_LINE:
-                raise ValueError(f"a line of {len(line)} characters; at most {MAX_LINE} are read of one")
-            if row := line.strip():
+            if len(line) > max_chars:
+                raise ValueError(f"a line of {len(line)} characters; at most {max_chars} are allowed")
+            row = line.strip()
+            if row:
                 yield NOT_FINITE.sub("nan", row) if "#" in row or "(" in row else row
     except UnicodeDecodeError as error:
         raise ValueError(f"not text in UTF-8: there is a byte 0x{error.object[error.start]:02x}") from error
 
 
-def _of_width(rows: Iterable[str], width: int, delimiter: str | None) -> Iterator[str]:
+def _check_num_columns(rows: Iterable[str], num_columns: int, delimiter: str | None) -> Iterator[str]:
     for number, row in enumerate(rows, 1):
-        found = row.count(delimiter) + 1 if delimiter else len(row.split())
-        if found != width:
-            raise ValueError(f"row {number} has {found} columns where {width} are needed: {row[:80]!r}")
+        count = row.count(delimiter) + 1 if delimiter else len(row.split())
+        if count != num_columns:
+            raise ValueError(f"row {number} has {count} columns where {num_columns} are needed: {row[:80]!r}")
         yield row
 
 
@@ -97,13 +126,16 @@ def _split(line: str) -> list[str]:
 
 def _is_numeric(words: Sequence[str]) -> bool:
     try:
-        [float(word) for word in words if word.strip()]
+        for word in words:
+            if word.strip():
+                float(word)
     except ValueError:
         return False
     return True
 
 
-def _named_columns(names: Sequence[str]) -> tuple[int, ...] | None:
+def _find_axis_columns(names: Sequence[str]) -> tuple[int, ...] | None:
+    """Find the columns named x, y and z; None if one of them is missing."""
     bare = [name.strip(" \t\"'").lower() for name in names]
     if not set(AXES) <= set(bare):
         return None

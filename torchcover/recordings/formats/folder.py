@@ -1,4 +1,4 @@
-"""A recording in a folder: clouds of one or several sensors or rigs, and files beside them, as `frames.yaml`."""
+"""Plain folder format: clouds of one or several sensors or rigs, with optional poses, boxes and `frames.yaml`."""
 
 import os
 from pathlib import Path
@@ -21,44 +21,50 @@ from torchcover.recordings.formats.frame_files import (
 )
 from torchcover.recordings.recording import RecordingBase, Scan, check_times
 
-ALLOWED = (
-    "allowed are sensor, or sensors or rigs by name, and reference, each with a 4x4 vehicle_T_sensor, flip_y and "
-    "min_range_m, for the reference also square_metres (true or false); and vehicle with lower_m and upper_m"
-)
+SETTINGS_FILE = "frames.yaml"
+POSES_FILE = "poses.csv"
+REFERENCE = "reference"
+BOX_FOLDER = "boxes"
 
 
-class _Strict(BaseModel):
+class _StrictModel(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
 
-class _Place(_Strict):
+class _SensorEntry(_StrictModel):
     vehicle_T_sensor: list[list[float]] | None = None
     flip_y: bool = False
     min_range_m: Annotated[float, Field(ge=0)] = 0.0
 
 
-class _Reference(_Place):
-    square_metres: bool = False
+class _ReferenceEntry(_SensorEntry):
+    area_weights: bool = False
 
 
 Corner = Annotated[list[float], Field(min_length=3, max_length=3)]
 
 
-class _Vehicle(_Strict):
+class _VehicleEntry(_StrictModel):
     lower_m: Corner
     upper_m: Corner
 
 
-class _Settings(_Strict):
-    sensor: _Place | None = None
-    sensors: dict[str, _Place] = Field(default_factory=dict)
-    rigs: dict[str, _Place] = Field(default_factory=dict)
-    reference: _Reference | None = None
-    vehicle: _Vehicle | None = None
+class _SettingsFile(_StrictModel):
+    sensor: _SensorEntry | None = None
+    sensors: dict[str, _SensorEntry] = Field(default_factory=dict)
+    rigs: dict[str, _SensorEntry] = Field(default_factory=dict)
+    reference: _ReferenceEntry | None = None
+    vehicle: _VehicleEntry | None = None
 
 
 class CloudSettings(NamedTuple):
-    """How the clouds of a place are to be read."""
+    """Settings of the clouds of one sensor.
+
+    Args:
+        vehicle_T_sensor: (4, 4) extrinsics; None if the clouds are in the vehicle frame.
+        flip_y: True if y points to the right, as in CARLA.
+        min_range_m: Points closer to the sensor are missing returns.
+    """
 
     vehicle_T_sensor: Matrix | None = None
     flip_y: bool = False
@@ -66,9 +72,12 @@ class CloudSettings(NamedTuple):
 
 
 class FolderSettings(NamedTuple):
-    """What the file says, by `sensor`, `sensors/NAME`, `rigs/NAME` or `reference`, where it does.
+    """Content of `frames.yaml`.
 
-    With `has_area_weights` the reference's files have weights; `ego_box` is the vehicle itself, None if unknown.
+    Args:
+        cloud_settings: Settings by folder: `sensor`, `sensors/NAME`, `rigs/NAME` or `reference`.
+        has_area_weights: True if the files of the reference have weights.
+        ego_box: Bounding box of the ego vehicle; None if unknown.
     """
 
     cloud_settings: dict[str, CloudSettings]
@@ -77,37 +86,55 @@ class FolderSettings(NamedTuple):
 
 
 def read_folder_settings(path: Path) -> FolderSettings:
-    """Read the settings of a plain folder."""
-    return _read(path) if path.exists() else FolderSettings({})
+    """Read the settings of a plain folder.
+
+    Args:
+        path: `frames.yaml` of the recording; it may be missing.
+
+    Returns:
+        The settings, or defaults without the file.
+
+    Raises:
+        BadFileError: Keys are unknown, or values are invalid.
+    """
+    return _read_settings_file(path) if path.exists() else FolderSettings({})
 
 
 @guard_reader("a file of poses")
-def _read(path: Path) -> FolderSettings:
+def _read_settings_file(path: Path) -> FolderSettings:
+    allowed = (
+        "allowed are sensor, or sensors or rigs by name, and reference, each with a 4x4 vehicle_T_sensor, flip_y and "
+        "min_range_m, for the reference also area_weights (true or false); and vehicle with lower_m and upper_m"
+    )
     content = parse_yaml(read_short_text(path))
     if not isinstance(content, dict):
-        raise ValueError(f"got {type(content).__name__}, not a mapping; {ALLOWED}")
+        raise ValueError(f"got {type(content).__name__}, not a mapping; {allowed}")
     try:
-        settings = _Settings.model_validate(content)
+        settings = _SettingsFile.model_validate(content)
     except ValidationError as error:
-        complaints = [f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in error.errors()]
-        raise ValueError(f"{'; '.join(complaints)}; {ALLOWED}") from error
-    given: dict[str, _Place | None] = {"sensor": settings.sensor, "reference": settings.reference}
-    given |= {f"sensors/{name}": place for name, place in settings.sensors.items()}
-    given |= {f"rigs/{name}": place for name, place in settings.rigs.items()}
+        complaints = [f"{'.'.join(map(str, detail['loc']))}: {detail['msg']}" for detail in error.errors()]
+        raise ValueError(f"{'; '.join(complaints)}; {allowed}") from error
+    entries: dict[str, _SensorEntry | None] = {"sensor": settings.sensor, "reference": settings.reference}
+    entries |= {f"sensors/{name}": entry for name, entry in settings.sensors.items()}
+    entries |= {f"rigs/{name}": entry for name, entry in settings.rigs.items()}
+    cloud_settings = {}
+    for folder, entry in entries.items():
+        if entry is not None:
+            cloud_settings[folder] = _build_cloud_settings(folder.replace("/", "."), entry)
     return FolderSettings(
-        {name: _place(name.replace("/", "."), place) for name, place in given.items() if place is not None},
-        settings.reference is not None and settings.reference.square_metres,
-        None if settings.vehicle is None else _body(settings.vehicle),
+        cloud_settings,
+        settings.reference is not None and settings.reference.area_weights,
+        None if settings.vehicle is None else _build_ego_box(settings.vehicle),
     )
 
 
-def _place(name: str, place: _Place) -> CloudSettings:
-    pose = place.vehicle_T_sensor
-    matrix = None if pose is None else check_rigid(pose, f"{name}.vehicle_T_sensor")
-    return CloudSettings(matrix, place.flip_y, place.min_range_m)
+def _build_cloud_settings(key: str, entry: _SensorEntry) -> CloudSettings:
+    pose = entry.vehicle_T_sensor
+    matrix = None if pose is None else check_rigid(pose, f"{key}.vehicle_T_sensor")
+    return CloudSettings(matrix, entry.flip_y, entry.min_range_m)
 
 
-def _body(vehicle: _Vehicle) -> BoundingBox:
+def _build_ego_box(vehicle: _VehicleEntry) -> BoundingBox:
     (x0, y0, z0), (x1, y1, z1) = vehicle.lower_m, vehicle.upper_m
     try:
         return BoundingBox((x0, y0, z0), (x1, y1, z1))
@@ -115,44 +142,40 @@ def _body(vehicle: _Vehicle) -> BoundingBox:
         raise ValueError(f"vehicle: {error}") from error
 
 
-SETTINGS_FILE = "frames.yaml"
-POSES_FILE = "poses.csv"
-REFERENCE, BOXES = "reference", "boxes"
-# What the clouds of the only rig are called.
-ONLY_RIG = "recording"
-
-
 class FolderRecording(RecordingBase):
-    """A folder with `sensor/FRAME.*`, in natural order (frame2 before frame10), and whatever else is known.
+    """Folder with `sensor/FRAME.*` in natural order (frame2 before frame10) and optional files.
 
-    Several sensors of one rig have `sensors/NAME/FRAME.*` each, several rigs `rigs/NAME/FRAME.*`. Any format of
-    `read_cloud` will do, and places may differ. All that follows is optional:
+    Several sensors of one rig are in `sensors/NAME/FRAME.*`, several rigs in `rigs/NAME/FRAME.*`. Clouds have any
+    format of `read_cloud`, which may differ between folders. Optional are:
 
-    * `reference/FRAME.*`, what the reference sensor saw; a `.npz` may have the array `heights_m` beside its points,
-      their heights above the local ground, NaN where there is none at or below;
-    * `poses.csv`, time and place of the vehicle in each frame, see `PoseTable`: `get_world_T_vehicle`;
-    * `PLACE/poses.csv`, where that sensor was on the vehicle in each frame: `vehicle_T_sensor`;
+    * `reference/FRAME.*`, the points of the reference sensor; a `.npz` may have the array `heights_m` with heights
+      above the local ground, NaN where there is no ground;
+    * `poses.csv`, time and pose of the vehicle in each frame, see `PoseTable`;
+    * `FOLDER/poses.csv` next to the clouds of a sensor, its extrinsics in each frame;
     * `boxes/FRAME.csv`, the objects of each frame, see `read_boxes`;
-    * `frames.yaml`. Clouds are in the vehicle frame, unless it says where their sensor is:
+    * `frames.yaml`. Clouds are in the vehicle frame unless it gives extrinsics:
 
           sensor:                      # or sensors: {NAME: ...}, or rigs: {NAME: ...}; reference likewise
-            vehicle_T_sensor:          # 4x4, metres
+            vehicle_T_sensor:          # 4x4, meters
               - [1, 0, 0, 1.2]
               - [0, 1, 0, 0.0]
               - [0, 0, 1, 1.73]
               - [0, 0, 0, 1]
-            flip_y: true               # the cloud has y to the right, as CARLA's: turned before anything else
-            min_range_m: 0.5           # nearer to the sensor is no return
+            flip_y: true               # y of the cloud points right, as in CARLA; flipped before anything else
+            min_range_m: 0.5           # closer points are missing returns
           reference:
-            has_area_weights: true        # its files are .npz with points and weights
-          vehicle:                     # what lies in it is the vehicle itself
+            area_weights: true         # its files are .npz with points and weights
+          vehicle:                     # points inside belong to the ego vehicle
             lower_m: [-2.4, -0.9, 0.05]
             upper_m: [2.4, 0.9, 1.6]
 
+    Args:
+        path: Folder.
+
     Raises:
-        FileNotFoundError: The folder, or clouds of a sensor in it, are missing.
-        ValueError: No frames, a file that is no cloud, two files of one name, names in one place only, two of
-            `sensor`, `sensors` and `rigs`, or a bad `frames.yaml` or `poses.csv`.
+        FileNotFoundError: The folder, or the clouds of a sensor, are missing.
+        ValueError: There are no frames, a file is no cloud, frames differ between folders, two of `sensor`, `sensors`
+            and `rigs` exist, or `frames.yaml` or `poses.csv` is invalid.
     """
 
     layout: ClassVar[str] = (
@@ -163,94 +186,112 @@ class FolderRecording(RecordingBase):
         self.path = Path(path)
         if not self.path.is_dir():
             raise FileNotFoundError(f"{self.path}: no such folder; a recording holds {self.layout}")
-        self._places = _places(self.path)
-        self.sensors = tuple(self._places)
-        several_rigs = (self.path / "rigs").is_dir()
-        self.rigs = {name: (name,) for name in self.sensors} if several_rigs else {ONLY_RIG: self.sensors}
+        self._folders = _find_sensor_folders(self.path)
+        self.sensors = tuple(self._folders)
+        has_rigs = (self.path / "rigs").is_dir()
+        self.rigs = {name: (name,) for name in self.sensors} if has_rigs else {"recording": self.sensors}
         self.reference_sensors = (REFERENCE,) if (self.path / REFERENCE).is_dir() else ()
-        self._places |= {name: name for name in self.reference_sensors}
-        files = {
-            place: find_frame_files(self.path / place, ignored_files=(POSES_FILE,)) for place in self._places.values()
-        }
-        self._labelled = (self.path / BOXES).is_dir()
-        boxes = {BOXES: {path.stem: path for path in (self.path / BOXES).glob("*.csv")}} if self._labelled else {}
-        check_same_names(self.path, {**files, **boxes})
-        self._files = files
-        self.frame_names = tuple(next(iter(files.values())))
+        self._folders |= {name: name for name in self.reference_sensors}
+        self._files = {}
+        for folder in self._folders.values():
+            self._files[folder] = find_frame_files(self.path / folder, ignored_files=(POSES_FILE,))
+        self._has_boxes = (self.path / BOX_FOLDER).is_dir()
+        files_by_folder = dict(self._files)
+        if self._has_boxes:
+            files_by_folder[BOX_FOLDER] = {file.stem: file for file in (self.path / BOX_FOLDER).glob("*.csv")}
+        check_same_names(self.path, files_by_folder)
+        self.frame_names = tuple(next(iter(self._files.values())))
         self._settings = read_folder_settings(self.path / SETTINGS_FILE)
-        self.ego_box, self.has_area_weights = self._settings.ego_box, self._settings.has_area_weights
-        self._poses = self._table(self.path, timed=True)
+        self.ego_box = self._settings.ego_box
+        self.has_area_weights = self._settings.has_area_weights
+        self._poses = self._read_poses(self.path, has_times=True)
         self.block_indices = None if self._poses is None else self._poses.block_indices
-        times_s = None if self._poses is None else self._poses.times_s
-        self.times_s = (
-            None if times_s is None else check_times(times_s, len(self.frame_names), str(self.path / POSES_FILE))
-        )
-        self._moving = {place: self._table(self.path / place, timed=False) for place in files}
-        self._check(self._settings)
+        self.times_s = None
+        if self._poses is not None and self._poses.times_s is not None:
+            self.times_s = check_times(self._poses.times_s, len(self.frame_names), str(self.path / POSES_FILE))
+        self._extrinsics = {folder: self._read_poses(self.path / folder, has_times=False) for folder in self._files}
+        self._check_settings()
 
     @classmethod
     def can_read(cls, path: Path) -> bool:
-        """Whether it is a folder with clouds of a sensor, of sensors, of rigs or of a reference in it."""
-        if any((path / place).is_dir() for place in ("sensors", "rigs", REFERENCE)):
+        """Test whether a path is a folder with clouds of sensors, rigs or a reference.
+
+        Args:
+            path: Existing path.
+        """
+        if any((path / folder).is_dir() for folder in ("sensors", "rigs", REFERENCE)):
             return True
-        # Argoverse 2 has its logs in folders of `sensor`.
+        # The folder `sensor` of Argoverse 2 holds folders of logs instead of files.
         clouds = path / "sensor"
-        return clouds.is_dir() and (any(one.is_file() for one in clouds.iterdir()) or not any(clouds.iterdir()))
+        if not clouds.is_dir():
+            return False
+        entries = list(clouds.iterdir())
+        return not entries or any(entry.is_file() for entry in entries)
 
     def read_scan(self, sensor: str, index: int) -> Scan:
-        """Read a file."""
-        place = self._places[sensor]
-        path = self._files[place][self.frame_names[index]]
+        """Read the cloud of a sensor in a frame.
+
+        Args:
+            sensor: Name of the sensor.
+            index: Index of the frame.
+
+        Returns:
+            The scan; scans of the reference have weights and heights if the files do.
+        """
+        folder = self._folders[sensor]
+        path = self._files[folder][self.frame_names[index]]
         weights = None
         if sensor == REFERENCE and self.has_area_weights:
             points_m, weights = read_cloud_with_weights(path)
         else:
             points_m = read_cloud(path)
         heights_m = read_heights(path, len(points_m)) if sensor == REFERENCE else None
-        settings, moving = self._settings.cloud_settings.get(place, CloudSettings()), self._moving[place]
+        settings = self._settings.cloud_settings.get(folder, CloudSettings())
         if settings.flip_y:
             points_m[:, 1] *= -1
-        vehicle_T_sensor = settings.vehicle_T_sensor if moving is None else moving[index]
+        extrinsics = self._extrinsics[folder]
+        vehicle_T_sensor = settings.vehicle_T_sensor if extrinsics is None else extrinsics[index]
         return Scan(points_m, vehicle_T_sensor, str(path), settings.min_range_m, weights, heights_m)
 
     def get_world_T_vehicle(self, index: int) -> Matrix | None:
-        """Where the vehicle was, if there is a `poses.csv`."""
+        """Return the (4, 4) pose of the vehicle in a frame; None without `poses.csv`."""
         return None if self._poses is None else self._poses[index]
 
     def read_boxes(self, index: int) -> Boxes | None:
-        """The objects of a frame; None without the folder."""
-        return read_boxes(self.path / BOXES / f"{self.frame_names[index]}.csv") if self._labelled else None
+        """Read the objects of a frame; None without the folder `boxes`."""
+        return read_boxes(self.path / BOX_FOLDER / f"{self.frame_names[index]}.csv") if self._has_boxes else None
 
-    def _table(self, folder: Path, *, timed: bool) -> PoseTable | None:
+    def _read_poses(self, folder: Path, *, has_times: bool) -> PoseTable | None:
         path = folder / POSES_FILE
-        return PoseTable(path, self.frame_names, has_times=timed) if path.exists() else None
+        return PoseTable(path, self.frame_names, has_times=has_times) if path.exists() else None
 
-    def _check(self, settings: FolderSettings) -> None:
+    def _check_settings(self) -> None:
         file = self.path / SETTINGS_FILE
-        for place, said in settings.cloud_settings.items():
-            name = place.replace("/", ".")
-            if place not in self._files:
-                raise ValueError(f"{file}: {name}: there is no {place}/ beside it")
-            moving = self._moving[place] is not None
-            if moving and said.vehicle_T_sensor is not None:
-                raise ValueError(f"{file}: {name}.vehicle_T_sensor: {place}/{POSES_FILE} says it too; keep one of them")
-            if said.min_range_m and not moving and said.vehicle_T_sensor is None:
-                raise ValueError(f"{file}: {name}.min_range_m: it needs vehicle_T_sensor, to say where the sensor is")
+        for folder, settings in self._settings.cloud_settings.items():
+            key = folder.replace("/", ".")
+            if folder not in self._files:
+                raise ValueError(f"{file}: {key}: the folder {folder}/ does not exist in the recording")
+            has_table = self._extrinsics[folder] is not None
+            has_matrix = settings.vehicle_T_sensor is not None
+            if has_table and has_matrix:
+                raise ValueError(f"{file}: {key}.vehicle_T_sensor: {folder}/{POSES_FILE} has it too; keep one of them")
+            if settings.min_range_m and not has_table and not has_matrix:
+                raise ValueError(f"{file}: {key}.min_range_m: it needs vehicle_T_sensor, the pose of the sensor")
 
 
-def _places(folder: Path) -> dict[str, str]:
-    """Name of each sensor of the vehicle -> its folder within the recording; its settings are under the same path."""
-    found = [kind for kind in ("sensor", "sensors", "rigs") if (folder / kind).exists()]
-    if len(found) > 1:
+def _find_sensor_folders(folder: Path) -> dict[str, str]:
+    """Find the folder of each sensor on the vehicle, relative to the recording."""
+    kinds = [kind for kind in ("sensor", "sensors", "rigs") if (folder / kind).exists()]
+    if len(kinds) > 1:
         raise ValueError(
-            f"{folder}: both {found[0]}/ and {found[1]}/; sensor/ is for one sensor, sensors/NAME/ for several of one "
+            f"{folder}: both {kinds[0]}/ and {kinds[1]}/; sensor/ is for one sensor, sensors/NAME/ for several of one "
             "rig, rigs/NAME/ for several rigs"
         )
-    if not found or found == ["sensor"]:
+    if not kinds or kinds == ["sensor"]:
         return {"sensor": "sensor"}
-    (kind,) = found
+    (kind,) = kinds
     names = [path.name for path in (folder / kind).iterdir() if not path.name.startswith(".")]
     if not names or REFERENCE in names:
-        wrong = f"a {kind[:-1]} called reference" if names else f"no {kind[:-1]}"
-        raise ValueError(f"{folder / kind}: {wrong}; each has a folder {kind}/NAME/ of its own")
+        fault = f"a {kind[:-1]} called reference" if names else f"no {kind[:-1]}"
+        raise ValueError(f"{folder / kind}: {fault}; each has a folder {kind}/NAME/ of its own")
     return {name: f"{kind}/{name}" for name in sorted(names, key=make_natural_sort_key)}

@@ -1,4 +1,4 @@
-"""Files of frames in a folder, one a frame in natural order, and tables of poses and boxes beside them."""
+"""Frame files in folders (one file per frame, in natural order) and tables of poses and boxes."""
 
 import os
 import re
@@ -16,8 +16,11 @@ from torchcover.geometry import build_transform, convert_quaternion_to_rotation
 from torchcover.geometry.rigid import RIGID_TOLERANCE, Matrix
 from torchcover.recordings.clouds import READERS, split_name
 
-MAX_NAMES_SHOWN = 5
-CLOUDS = f"a cloud; allowed are files ending in {', '.join(READERS)}"
+# Columns of `poses.csv` and of `boxes/FRAME.csv`.
+POSITION_COLUMNS = ("x_m", "y_m", "z_m")
+QUATERNION_COLUMNS = ("qw", "qx", "qy", "qz")
+BOX_COLUMNS = (*POSITION_COLUMNS, "length_m", "width_m", "height_m", "yaw_rad")
+VELOCITY_COLUMNS = ("vx_mps", "vy_mps")
 
 
 def find_frame_files(
@@ -27,152 +30,217 @@ def find_frame_files(
     *,
     is_depth: bool = False,
 ) -> dict[str, Path]:
-    """The clouds, or depth images in PNG, by the names of their frames in natural order (frame2 before frame10).
+    """Find the clouds or depth images (PNG) of a folder.
 
-    There have to be those of `expected_names`, and no others; files `ignored_files` them are no clouds. ValueError: a file that is no
-    cloud, two files of one name, no files, or other names than `expected_names`.
+    Args:
+        folder: Folder with one file per frame.
+        expected_names: Names of all frames; None accepts any names.
+        ignored_files: Names of files that are no clouds, such as a table of poses.
+        is_depth: True for depth images, False for clouds.
+
+    Returns:
+        Name of each frame and its file, in natural order (frame2 before frame10).
+
+    Raises:
+        FileNotFoundError: The folder does not exist.
+        ValueError: A file is no cloud, two files have the same frame name, or names differ from `expected_names`.
     """
     if not folder.is_dir():
-        raise FileNotFoundError(f"{folder}: no such folder; clouds are needed in it, one a frame")
-    clouds: dict[str, Path] = {}
+        raise FileNotFoundError(f"{folder}: no such folder; it has to hold one cloud per frame")
+    files: dict[str, Path] = {}
     with os.scandir(folder) as entries:
-        found = sorted((entry.name, entry.is_dir()) for entry in entries)
-    for file, is_folder in found:
-        if file in ignored_files or file.startswith("."):  # what file managers and version control leave behind
+        listing = sorted((entry.name, entry.is_dir()) for entry in entries)
+    for file_name, is_folder in listing:
+        if file_name in ignored_files or file_name.startswith("."):  # left by file managers and version control
             continue
-        name, suffix = split_name(file, (".png",)) if is_depth else split_name(file)
+        name, suffix = split_name(file_name, (".png",)) if is_depth else split_name(file_name)
         if not suffix or is_folder:
-            wanted = "a depth image; allowed are files ending in .png" if is_depth else CLOUDS
-            raise ValueError(f"{folder / file}: not {wanted}")
-        if name in clouds:
-            raise ValueError(f"{folder}: two files for the frame {name}: {clouds[name].name} and {file}")
-        clouds[name] = folder / file
+            kind, suffixes = ("depth image", ".png") if is_depth else ("cloud", ", ".join(READERS))
+            raise ValueError(f"{folder / file_name}: not a {kind}; allowed are files ending in {suffixes}")
+        if name in files:
+            raise ValueError(f"{folder}: two files for the frame {name}: {files[name].name} and {file_name}")
+        files[name] = folder / file_name
     if expected_names is not None:
-        check_same_names(folder.parent, {folder.name: clouds, "the others": dict.fromkeys(expected_names)})
-    numbers = all(map(str.isdecimal, clouds))  # which need not be taken apart
-    return {name: clouds[name] for name in sorted(clouds, key=_number if numbers else make_natural_sort_key)}
+        check_same_names(folder.parent, {folder.name: files, "the others": dict.fromkeys(expected_names)})
+    # Natural keys are slow for many names, and plain numbers do not need them.
+    are_numbers = all(name.isdecimal() for name in files)
+    return {name: files[name] for name in sorted(files, key=_parse_number if are_numbers else make_natural_sort_key)}
 
 
 def check_same_names(folder: Path, files_by_folder: Mapping[str, Mapping[str, object]]) -> None:
-    """Whether all places have the same frames."""
-    places = " and ".join(f"{place}/" for place in files_by_folder)
-    anywhere = set[str]().union(*files_by_folder.values())
-    if not anywhere:
-        raise ValueError(f"{folder}: no frames; {places} are empty")
-    complaints = [
-        f"{len(gaps)} missing in {place}/ ({format_names(gaps)})"
-        for place, clouds in files_by_folder.items()
-        if (gaps := sorted(anywhere - clouds.keys(), key=make_natural_sort_key))
-    ]
+    """Check that all folders have the same frames.
+
+    Args:
+        folder: Recording, for messages.
+        files_by_folder: Name of each folder and its files by frame name.
+
+    Raises:
+        ValueError: There are no frames, or a folder lacks some of them.
+    """
+    folders = " and ".join(f"{name}/" for name in files_by_folder)
+    all_names = set[str]().union(*files_by_folder.values())
+    if not all_names:
+        raise ValueError(f"{folder}: no frames; {folders} are empty")
+    complaints = []
+    for name, files in files_by_folder.items():
+        missing = sorted(all_names - files.keys(), key=make_natural_sort_key)
+        if missing:
+            complaints.append(f"{len(missing)} missing in {name}/ ({format_names(missing)})")
     if complaints:
-        raise ValueError(f"{folder}: every frame needs a file in {places}; {' and '.join(complaints)}")
+        raise ValueError(f"{folder}: every frame needs a file in {folders}; {' and '.join(complaints)}")
 
 
 def find_frame_rows(table_frames: Sequence[str], frame_names: Sequence[str]) -> list[int]:
-    """Which row of a table belongs to each frame."""
-    there, wanted = set(table_frames), set(frame_names)
-    doubled = [frame for frame, count in Counter(table_frames).items() if count > 1]
-    missing, unknown = [name for name in frame_names if name not in there], sorted(there - wanted)
-    for what, which in (("missing", missing), ("doubled", doubled), ("unknown", unknown)):
-        if which:
-            raise ValueError(f"one row for every frame is needed; {len(which)} {what} ({format_names(which)})")
-    row_of = {frame: row for row, frame in enumerate(table_frames)}
-    return [row_of[name] for name in frame_names]
+    """Find the row of each frame in a table.
+
+    Args:
+        table_frames: Frame name of each row.
+        frame_names: Names of the frames of the recording.
+
+    Returns:
+        Row index of each frame.
+
+    Raises:
+        ValueError: Frames are missing, repeated or unknown.
+    """
+    rows = {frame: row for row, frame in enumerate(table_frames)}
+    faults = {
+        "missing": [name for name in frame_names if name not in rows],
+        "repeated": [frame for frame, count in Counter(table_frames).items() if count > 1],
+        "unknown": sorted(rows.keys() - set(frame_names)),
+    }
+    for fault, names in faults.items():
+        if names:
+            raise ValueError(f"each frame needs one row; {len(names)} are {fault} ({format_names(names)})")
+    return [rows[name] for name in frame_names]
 
 
 def make_natural_sort_key(name: str) -> tuple[list[str | int], str]:
-    """A key to sort names by, numbers in them by their values."""
-    # Text and number alternate, starting with text, so that two keys always compare; the name itself breaks a tie.
+    """Make a key that sorts names with the numbers in them by value.
+
+    Args:
+        name: Name of a frame or sensor.
+
+    Returns:
+        The parts of the name, and the name itself to break ties.
+    """
+    # Text and number alternate, starting with text, so that two keys are always comparable.
     parts = re.split(r"(\d+)", name)
     return [int(part) if position % 2 else part for position, part in enumerate(parts)], name
 
 
-def _number(name: str) -> tuple[int, str]:
+def _parse_number(name: str) -> tuple[int, str]:
     return int(name), name
 
 
-def format_names(names: Sequence[str]) -> str:
-    """The first of many names, for a message."""
-    return ", ".join([*names[:MAX_NAMES_SHOWN], *["..."] * (len(names) > MAX_NAMES_SHOWN)])
+def format_names(names: Sequence[str], max_names: int = 5) -> str:
+    """Format the first of many names for a message.
 
-
-PLACE, ROTATION = ("x_m", "y_m", "z_m"), ("qw", "qx", "qy", "qz")
-BOX = (*PLACE, "length_m", "width_m", "height_m", "yaw_rad")
-VELOCITY, DRAWN, BOTTOM = ("vx_mps", "vy_mps"), "drawn_points", "bottom_height_m"
-NAMES = ("id", "category")
+    Args:
+        names: Names.
+        max_names: Number of names to show; the others become an ellipsis.
+    """
+    return ", ".join(names) if len(names) <= max_names else ", ".join([*names[:max_names], "..."])
 
 
 class PoseTable:
-    """A pose for every frame, in their order, and where the table says so, its time.
+    """Table with the pose and optionally the time of every frame.
 
-    Its columns are `frame, x_m, y_m, z_m, qw, qx, qy, qz`, and `time_s` if it is `timed`; `instant` may be there too, a
-    whole number that frames share which are no news to each other (`Frame.block_index`).
+    Columns are `frame, x_m, y_m, z_m, qw, qx, qy, qz`, and with times `time_s`; `block_index` is optional: an integer
+    that frames share if they are not independent (`Frame.block_index`).
+
+    Args:
+        path: CSV file.
+        frame_names: Names of the frames, in the order of the result.
+        has_times: True if the table needs the column `time_s`.
+
+    Raises:
+        BadFileError: Columns or frames are missing, or a quaternion has not norm 1.
     """
 
     def __init__(self, path: Path, frame_names: Sequence[str], *, has_times: bool) -> None:
-        optional = ("instant",) if has_times else ()
-        table = read_csv(path, (*("time_s",) * has_times, *PLACE, *ROTATION), ("frame",), optional)
+        time_columns = ("time_s",) if has_times else ()
+        optional = ("block_index",) if has_times else ()
+        table = read_csv(path, (*time_columns, *POSITION_COLUMNS, *QUATERNION_COLUMNS), ("frame",), optional)
         with report_bad_file(path, "a table of poses"):
-            order = find_frame_rows(table.texts["frame"], frame_names)
+            order = find_frame_rows(table.words["frame"], frame_names)
             columns = {name: values[order] for name, values in table.numbers.items()}
-            self._place_m = np.column_stack([columns[name] for name in PLACE])
-            self._wxyz = np.column_stack([columns[name] for name in ROTATION])
+            self._positions_m = np.column_stack([columns[name] for name in POSITION_COLUMNS])
+            self._wxyz = np.column_stack([columns[name] for name in QUATERNION_COLUMNS])
             self._check_norms(frame_names)
-            self.block_indices = _whole_numbers("instant", columns["instant"]) if "instant" in columns else None
+            self.block_indices: list[int] | None = None
+            if "block_index" in columns:
+                self.block_indices = _to_integers("block_index", columns["block_index"])
         self.times_s: NDArray[np.float64] | None = columns.get("time_s")
 
     def __getitem__(self, index: int) -> Matrix:
-        """(4, 4) the pose of a frame."""
-        return build_transform(convert_quaternion_to_rotation(self._wxyz[index]), self._place_m[index])
+        """Return the (4, 4) pose of a frame."""
+        return build_transform(convert_quaternion_to_rotation(self._wxyz[index]), self._positions_m[index])
 
     def _check_norms(self, names: Sequence[str]) -> None:
         norms = np.linalg.norm(self._wxyz, axis=1)
         bad = np.flatnonzero(~(np.abs(norms - 1) <= RIGID_TOLERANCE))
         if len(bad):
             raise ValueError(
-                f"frame {names[bad[0]]}: qw, qx, qy, qz: the norm of a rotation's quaternion is 1; got "
-                f"{norms[bad[0]]:.6g}, and so in {len(bad)} of {len(names)} frames"
+                f"frame {names[bad[0]]}: qw, qx, qy, qz: the quaternion of a rotation has norm 1; got "
+                f"{norms[bad[0]]:.6g}; {len(bad)} of {len(names)} frames have such quaternions"
             )
 
 
 def read_boxes(path: Path) -> Boxes:
     """Read the objects of a frame.
 
-    The columns are `x_m, y_m, z_m, length_m, width_m, height_m, yaw_rad, id, category`: the centre, half-way up, in the
-    vehicle frame; `id` and `category` may be empty. `vx_mps, vy_mps` may be there too, the velocity over ground along
-    the vehicle's x and y, and `drawn_points` and `bottom_height_m`, see `Boxes`.
+    Columns are `x_m, y_m, z_m, length_m, width_m, height_m, yaw_rad, id, category`, with the center of the box in the
+    vehicle frame; `id` and `category` may be empty. Optional are `vx_mps, vy_mps`, the velocity over ground along x
+    and y of the vehicle, `sampled_points` and `bottom_height_m`, see `Boxes`.
+
+    Args:
+        path: CSV file.
+
+    Returns:
+        The boxes in the vehicle frame.
+
+    Raises:
+        BadFileError: Columns are missing, values are invalid, or two objects share an id.
     """
-    table = read_csv(path, BOX, NAMES, (*VELOCITY, DRAWN, BOTTOM))
-    numbers, ids = table.numbers, table.texts["id"]
+    table = read_csv(path, BOX_COLUMNS, ("id", "category"), (*VELOCITY_COLUMNS, "sampled_points", "bottom_height_m"))
+    numbers, ids = table.numbers, table.words["id"]
     with report_bad_file(path, "a table of boxes"):
-        doubled = [name for name, count in Counter(ids).items() if name and count > 1]
-        if doubled:
-            raise ValueError(f"id: every object has its own; {format_names(doubled)}: there twice")
-        known: dict[str, object] = {"ids": tuple(ids), "categories": tuple(table.texts["category"])}
-        if set(VELOCITY) & numbers.keys():
+        repeated = [name for name, count in Counter(ids).items() if name and count > 1]
+        if repeated:
+            raise ValueError(f"id: every object needs its own; {format_names(repeated)} appears more than once")
+        fields: dict[str, object] = {"ids": tuple(ids), "categories": tuple(table.words["category"])}
+        if set(VELOCITY_COLUMNS) & numbers.keys():
             unknown = np.full(len(ids), np.nan)
-            velocity_mps = np.column_stack([numbers.get(name, unknown) for name in VELOCITY])
-            known["velocity_mps"] = torch.from_numpy(velocity_mps).float()
-        if DRAWN in numbers:
-            known["drawn_points"] = torch.tensor(_whole_numbers(DRAWN, numbers[DRAWN]), device="cpu")
-        if BOTTOM in numbers:
-            known["bottom_heights_m"] = torch.from_numpy(numbers[BOTTOM]).float()
-        return Boxes.from_rows(torch.from_numpy(np.column_stack([numbers[name] for name in BOX])).float(), **known)
+            velocity_mps = np.column_stack([numbers.get(name, unknown) for name in VELOCITY_COLUMNS])
+            fields["velocity_mps"] = torch.from_numpy(velocity_mps).float()
+        if "sampled_points" in numbers:
+            counts = _to_integers("sampled_points", numbers["sampled_points"])
+            fields["sampled_points"] = torch.tensor(counts, device="cpu")
+        if "bottom_height_m" in numbers:
+            fields["bottom_heights_m"] = torch.from_numpy(numbers["bottom_height_m"]).float()
+        rows = np.column_stack([numbers[name] for name in BOX_COLUMNS])
+        return Boxes.from_rows(torch.from_numpy(rows).float(), **fields)
 
 
 def write_boxes(path: Path, boxes: Boxes) -> None:
-    """Write the objects of a frame as `read_boxes` reads them; velocities, if that of each is known."""
-    columns = dict(zip(BOX, boxes.rows.T.tolist(), strict=True))
+    """Write the objects of a frame in the format of `read_boxes`.
+
+    Args:
+        path: CSV file.
+        boxes: Boxes in the vehicle frame; velocities and bottom heights are written if all of them are known.
+    """
+    columns = dict(zip(BOX_COLUMNS, boxes.rows.T.tolist(), strict=True))
     if boxes.velocity_mps.isfinite().all():
-        columns |= dict(zip(VELOCITY, boxes.velocity_mps.T.tolist(), strict=True))
+        columns |= dict(zip(VELOCITY_COLUMNS, boxes.velocity_mps.T.tolist(), strict=True))
     if boxes.bottom_heights_m.isfinite().all():
-        columns[BOTTOM] = boxes.bottom_heights_m.tolist()
-    columns |= {DRAWN: boxes.sampled_points.tolist(), "id": boxes.ids, "category": boxes.categories}
+        columns["bottom_height_m"] = boxes.bottom_heights_m.tolist()
+    columns |= {"sampled_points": boxes.sampled_points.tolist(), "id": boxes.ids, "category": boxes.categories}
     path.write_text(format_csv([list(columns), *zip(*columns.values(), strict=True)]), encoding="utf-8")
 
 
-def _whole_numbers(name: str, values: NDArray[np.float64]) -> list[int]:
+def _to_integers(name: str, values: NDArray[np.float64]) -> list[int]:
     if not np.array_equal(values, np.round(values)):
         raise ValueError(f"{name}: whole numbers are needed; got {values[values != np.round(values)][0]:g}")
-    numbers: list[int] = values.astype(np.int64).tolist()
-    return numbers
+    integers: list[int] = values.astype(np.int64).tolist()
+    return integers
