@@ -109,7 +109,7 @@ WKT2 = (
 )
 def test_las_files_in_feet_are_converted_with_a_warning(tmp_path, las, meters):
     suffix = ".laz" if las[104] & 0x80 else ".las"
-    with pytest.warns(UserWarning, match=r"converted to meters, as the file says: .* give no recording.units"):
+    with pytest.warns(UserWarning, match=r"converted to meters, as the file says: .* leave out recording.units"):
         cloud = read_cloud(store(tmp_path, suffix, las))
     np.testing.assert_allclose(cloud, CLOUD * meters, rtol=1e-12)
 
@@ -404,7 +404,7 @@ def mislabelled_member():
         (
             ".laz",
             las_bytes(CLOUD, compressed=True)[:-20],
-            r"of chunks is said to be at byte 395; the file has 38",
+            r"of chunks is claimed at byte 395; the file has 38",
         ),
         (".laz", las_bytes(CLOUD, compressed=True)[:399] + b"\xff" * 9, r"3 points, the table of chunks 4294967295 "),
         (".npz", npz_bytes(), r"got 0 arrays: none$"),

@@ -121,7 +121,7 @@ ROWS = "\nf2,0,0,0,0,1,0,0,0\nf10,1,0,0,0,1,0,0,0"
         (HEADER + ROWS.replace("f10,1,0", "f10,1,east"), r"line 3: x_m: a finite number is needed; got 'east'"),
         (
             HEADER + ROWS.replace("f10,1,0,0,0,1", "f10,1,0,0,0,2"),
-            r"frame f10: qw, .* norm .* is 1; got 2, and ",
+            r"frame f10: qw, .* has norm 1; got 2; 1 of ",
         ),
         (HEADER + ROWS.replace("f10,1", "f10,0"), r"times have to ascend; 1 do not, the first after frame 0"),
         (HEADER + '\n"f2', r"line 2: not CSV \(unexpected end of data\)"),

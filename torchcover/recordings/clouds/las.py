@@ -1,4 +1,4 @@
-"""Surveys: LAS, versions 1.0 to 1.4, and LAZ, which is LAS compressed and read by laspy; scales and units."""
+"""Survey clouds: LAS 1.0 to 1.4 with scales and units, and LAZ (compressed LAS), which laspy decompresses."""
 
 import os
 import re
@@ -14,28 +14,13 @@ from numpy.typing import NDArray
 from torchcover.files import check_memory
 from torchcover.recordings.isolated_readers import read_laz_points
 
-HEADER_BYTES, HEADER_BYTES_1_4 = 227, 375
-COMPRESSED = 0x80  # of the point format
-# Of what stands before and behind the points, at least.
-RECORD_HEADER_BYTES, LATER_RECORD_HEADER_BYTES = 54, 60
-# Of x, y and z as float64, while they are made of whole numbers.
-COORDINATE_BYTES = 72
-# Records about the coordinate system.
-PROJECTION = b"LASF_Projection"
-WKT_RECORD, GEO_KEYS_RECORD = 2112, 34735
-# GeoTIFF keys, and values of the first one.
-MODEL_KEY, CRS_KEY, HORIZONTAL_UNIT_KEY, VERTICAL_UNIT_KEY = 1024, 3072, 3076, 4099
-GEOGRAPHIC = 2
-# EPSG code of a unit -> its name and meters.
+# Header sizes of LAS 1.0 to 1.3 and of LAS 1.4.
+HEADER_BYTES = 227
+HEADER_BYTES_1_4 = 375
+# GeoTIFF key of the unit of z.
+VERTICAL_UNIT_KEY = 4099
+# EPSG code of a unit with its name and length in meters.
 EPSG_UNITS = {9001: ("meter", 1.0), 9002: ("foot", 0.3048), 9003: ("US survey foot", 1200 / 3937)}
-# EPSG codes of UTM zones of WGS84, ETRS89 and NAD83, which are in meters.
-UTM_CODES = (range(32601, 32761), range(25828, 25839), range(26901, 26924))
-# A record of text or of keys is smaller.
-MAX_RECORD_BYTES = 1 << 16
-# Keywords of coordinate systems in WKT.
-PROJECTED_SYSTEMS = frozenset({"PROJCS", "PROJCRS", "PROJECTEDCRS", "GEOCCS"})
-VERTICAL_SYSTEMS = frozenset({"VERT_CS", "VERTCRS", "VERTICALCRS"})
-GEOGRAPHIC_SYSTEMS = frozenset({"GEOGCS", "GEOGCRS", "GEOGRAPHICCRS", "BASEGEOGCRS", "BASEGEODCRS", "GEODCRS"})
 REPROJECT = "reproject the file into a coordinate system in meters (pdal translate, las2las)"
 
 
@@ -46,6 +31,7 @@ class _Unit(NamedTuple):
 
 def _read_projection(file: BinaryIO, first_byte: int, count: int, header: struct.Struct) -> dict[int, bytes]:
     """Read the variable length records about the coordinate system, by their identifiers."""
+    max_record_bytes = 1 << 16  # a record of text or keys is smaller
     contents: dict[int, bytes] = {}
     end_byte = file.seek(0, os.SEEK_END)
     for _ in range(count):
@@ -53,62 +39,65 @@ def _read_projection(file: BinaryIO, first_byte: int, count: int, header: struct
             break
         file.seek(first_byte)
         _, user, identifier, length, _ = header.unpack(file.read(header.size))
-        if user.rstrip(b"\0") == PROJECTION and length <= MAX_RECORD_BYTES:
+        if user.rstrip(b"\0") == b"LASF_Projection" and length <= max_record_bytes:
             contents[identifier] = file.read(length)
         first_byte += header.size + length
     return contents
 
 
 def _choose_scale(contents: Mapping[int, bytes]) -> NDArray[np.float64]:
-    """Return how many meters a unit of x, y and z is, by the records about the coordinate system.
+    """Choose the length of a unit of x, y and z from the records about the coordinate system.
 
     Args:
-        contents: Records by their identifiers, of which WKT wins over GeoKeys.
+        contents: Records by their identifiers; WKT takes precedence over GeoKeys.
 
     Returns:
-        (3,) factors: 1 where nothing is said.
+        (3,) meters per unit; 1 without a statement.
 
     Raises:
-        ValueError: Degrees, or an unknown unit.
+        ValueError: Coordinates are degrees, or their unit is unknown.
 
     Warns:
-        UserWarning: Coordinates are converted, or only a code is given that does not say the unit.
+        UserWarning: Coordinates are converted, or only a code without a unit is given.
     """
-    keys = _read_keys(contents.get(GEO_KEYS_RECORD, b""))
-    units = _units_of_wkt(contents.get(WKT_RECORD, b"")) or _units_of_keys(keys)
+    wkt_record, geo_keys_record = contents.get(2112, b""), contents.get(34735, b"")  # identifiers of the LAS format
+    keys = _parse_geo_keys(geo_keys_record)
+    units = _find_wkt_units(wkt_record) or _find_geo_key_units(keys)
     if units is None:
         return np.ones(3)
     horizontal, vertical = units
     if vertical is None:
-        vertical = _unit_of_code(keys[VERTICAL_UNIT_KEY]) if VERTICAL_UNIT_KEY in keys else horizontal
+        vertical = _find_epsg_unit(keys[VERTICAL_UNIT_KEY]) if VERTICAL_UNIT_KEY in keys else horizontal
     if (horizontal.meters, vertical.meters) != (1.0, 1.0):
         warnings.warn(
             f"LAS coordinates are converted to meters, as the file says: x and y are in {horizontal.name}, z in "
-            f"{vertical.name}; give no recording.units",
+            f"{vertical.name}; leave out recording.units",
             stacklevel=2,
         )
     return np.array([horizontal.meters, horizontal.meters, vertical.meters])
 
 
-def _read_keys(data: bytes) -> dict[int, int]:
-    """Read the GeoKeys whose values are in the record itself."""
+def _parse_geo_keys(data: bytes) -> dict[int, int]:
+    """Parse the GeoKeys whose values are in the record itself."""
     numbers = np.frombuffer(data[: len(data) // 8 * 8], "<u2").reshape(-1, 4)[1:].tolist()
     return {key: value for key, location, _, value in numbers if location == 0}
 
 
-def _units_of_keys(keys: Mapping[int, int]) -> tuple[_Unit, _Unit | None] | None:
-    """Return the unit of x and y, and None for z, by GeoKeys; None where they say none."""
-    if keys.get(MODEL_KEY) == GEOGRAPHIC:
+def _find_geo_key_units(keys: Mapping[int, int]) -> tuple[_Unit, _Unit | None] | None:
+    """Find the unit of x and y, with None for z, in GeoKeys; None without a statement."""
+    model_key, geographic_model, crs_key, horizontal_unit_key = 1024, 2, 3072, 3076  # numbers of GeoTIFF
+    if keys.get(model_key) == geographic_model:
         raise ValueError(f"x and y are degrees (GTModelTypeGeoKey 2); {REPROJECT}")
-    code = keys.get(CRS_KEY)
-    if HORIZONTAL_UNIT_KEY in keys:
-        horizontal = _unit_of_code(keys[HORIZONTAL_UNIT_KEY])
+    code = keys.get(crs_key)
+    if horizontal_unit_key in keys:
+        horizontal = _find_epsg_unit(keys[horizontal_unit_key])
     elif code is None:
         return None
     else:
-        if not any(code in zones for zones in UTM_CODES):
+        # UTM zones of WGS84, ETRS89 and NAD83 are in meters.
+        if not (32601 <= code <= 32760 or 25828 <= code <= 25838 or 26901 <= code <= 26923):
             warnings.warn(
-                f"LAS coordinates of EPSG:{code} without a unit (ProjLinearUnitsGeoKey) are taken for meters; if they "
+                f"LAS coordinates of EPSG:{code} without a unit (ProjLinearUnitsGeoKey) are read as meters; if they "
                 "are feet: --set recording.units=ft",
                 stacklevel=3,
             )
@@ -116,24 +105,27 @@ def _units_of_keys(keys: Mapping[int, int]) -> tuple[_Unit, _Unit | None] | None
     return horizontal, None
 
 
-def _unit_of_code(code: int) -> _Unit:
+def _find_epsg_unit(code: int) -> _Unit:
     if code not in EPSG_UNITS:
-        known = ", ".join(f"{code} ({name})" for code, (name, _) in EPSG_UNITS.items())
+        known = ", ".join(f"{known_code} ({name})" for known_code, (name, _) in EPSG_UNITS.items())
         raise ValueError(f"unit EPSG:{code} of its GeoKeys is unknown; known are {known}; {REPROJECT}")
     return _Unit(*EPSG_UNITS[code])
 
 
-def _units_of_wkt(data: bytes) -> tuple[_Unit, _Unit | None] | None:
-    """Return the units of x and y, and of z if it is stated, by WKT of version 1 or 2; None without any."""
+def _find_wkt_units(data: bytes) -> tuple[_Unit, _Unit | None] | None:
+    """Find the units of x and y, and of z if stated, in WKT of version 1 or 2; None without units."""
+    projected_systems = {"PROJCS", "PROJCRS", "PROJECTEDCRS", "GEOCCS"}
+    vertical_systems = {"VERT_CS", "VERTCRS", "VERTICALCRS"}
+    geographic_systems = {"GEOGCS", "GEOGCRS", "GEOGRAPHICCRS", "BASEGEOGCRS", "BASEGEODCRS", "GEODCRS"}
     text = data.rstrip(b"\0").decode("utf-8", "replace")
     horizontal = vertical = None
     is_geographic = False
     for systems, unit in _list_units(text):
         if unit is None:
-            is_geographic |= bool(GEOGRAPHIC_SYSTEMS & systems)
-        elif VERTICAL_SYSTEMS & systems:
+            is_geographic |= bool(geographic_systems & systems)
+        elif vertical_systems & systems:
             vertical = unit
-        elif PROJECTED_SYSTEMS & systems and not (GEOGRAPHIC_SYSTEMS | {"CONVERSION"}) & systems:
+        elif projected_systems & systems and not (geographic_systems | {"CONVERSION"}) & systems:
             horizontal = unit
     if horizontal is not None:
         return horizontal, vertical
@@ -143,55 +135,77 @@ def _units_of_wkt(data: bytes) -> tuple[_Unit, _Unit | None] | None:
 
 
 def _list_units(text: str) -> Iterator[tuple[set[str], _Unit | None]]:
-    """Yield the length units of WKT with the keywords that they are inside of, and None for an angular unit."""
-    inside: list[str] = []
+    """Yield each unit of WKT with the keywords that enclose it; None stands for an angular unit."""
+    enclosing: list[str] = []
     for token in re.finditer(r'"[^"]*"|([A-Za-z_]\w*)\s*[\[(]|[\])]', text):
         keyword = (token[1] or "").upper()
         if keyword:
             value = re.compile(r'\s*"([^"]*)"\s*,\s*([0-9.eE+-]+)').match(text, token.end())
             if keyword in ("UNIT", "LENGTHUNIT", "ANGLEUNIT") and value is not None:
                 is_angle = keyword == "ANGLEUNIT" or value[1].lower() in ("degree", "radian", "grad")
-                yield set(inside), None if is_angle else _Unit(value[1], float(value[2]))
-            inside.append(keyword)
-        elif token[0] in "])" and inside:
-            inside.pop()
+                yield set(enclosing), None if is_angle else _Unit(value[1], float(value[2]))
+            enclosing.append(keyword)
+        elif token[0] in "])" and enclosing:
+            enclosing.pop()
 
 
 class _Header(NamedTuple):
     first_byte: int
     record_bytes: int
     points: int
-    compressed: bool
+    is_compressed: bool
     scale: NDArray[np.float64]
     offset: NDArray[np.float64]
-    # Of records before and behind the points: first byte, count.
+    # First byte and number of the records before and after the points.
     records: tuple[int, int]
-    later_records: tuple[int, int]
+    extended_records: tuple[int, int]
 
 
 def read_las_scale(path: Path) -> NDArray[np.float64]:
-    """Read how many meters a unit of x, y and z is, as a LAS or LAZ file says: (3,), 1 where it says nothing."""
+    """Read the length of a unit of x, y and z that a LAS or LAZ file states.
+
+    Args:
+        path: File.
+
+    Returns:
+        (3,) meters per unit; 1 without a statement.
+
+    Raises:
+        ValueError: The header is invalid, coordinates are degrees, or their unit is unknown.
+    """
     with path.open("rb") as file:
-        return _read_scale(file, _header(file.read(HEADER_BYTES_1_4), path.stat().st_size))
+        return _read_meters_per_unit(file, _parse_header(file.read(HEADER_BYTES_1_4), path.stat().st_size))
 
 
-def _read_scale(file: BinaryIO, header: _Header) -> NDArray[np.float64]:
+def _read_meters_per_unit(file: BinaryIO, header: _Header) -> NDArray[np.float64]:
     contents = _read_projection(file, *header.records, struct.Struct("<H16sHH32s"))
-    contents |= _read_projection(file, *header.later_records, struct.Struct("<H16sHQ32s"))
+    contents |= _read_projection(file, *header.extended_records, struct.Struct("<H16sHQ32s"))
     return _choose_scale(contents)
 
 
 def read_las(path: Path) -> NDArray[np.float64]:
-    """Read x y z of a LAS or LAZ file in meters, its scales, offsets and units applied."""
+    """Read x y z of a LAS or LAZ file in meters and apply its scales, offsets and units.
+
+    Args:
+        path: File.
+
+    Returns:
+        (N, 3) points in meters.
+
+    Raises:
+        ValueError: The header is invalid, the file is truncated, or coordinates are degrees or cut off.
+        ImportError: laspy is not installed and the file is a `.laz`.
+    """
     size_bytes = path.stat().st_size
     with path.open("rb") as file:
-        header = _header(file.read(HEADER_BYTES_1_4), size_bytes)
-        meters = _read_scale(file, header)
-        check_memory(header.points * (header.record_bytes + COORDINATE_BYTES))
-        if header.compressed:
+        header = _parse_header(file.read(HEADER_BYTES_1_4), size_bytes)
+        meters_per_unit = _read_meters_per_unit(file, header)
+        coordinate_bytes = 72  # float64 copies during the conversion
+        check_memory(header.points * (header.record_bytes + coordinate_bytes))
+        if header.is_compressed:
             _check_chunks(file, header, size_bytes)
-    scale, offset_m = header.scale * meters, header.offset * meters
-    if header.compressed:
+    scale, offset_m = header.scale * meters_per_unit, header.offset * meters_per_unit
+    if header.is_compressed:
         return _to_meters(read_laz_points(path, header.points)["xyz"], scale, offset_m)
     claimed_bytes = header.points * header.record_bytes
     if header.first_byte + claimed_bytes > size_bytes:
@@ -207,7 +221,7 @@ def read_las(path: Path) -> NDArray[np.float64]:
 def _to_meters(
     stored: NDArray[np.int32], scale: NDArray[np.float64], offset_m: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Convert (N, 3) stored whole numbers; ValueError if a program cut off coordinates that do not fit into them."""
+    """Convert (N, 3) stored integers to meters; coordinates that a program cut off to 32 bits raise a ValueError."""
     bounds = np.iinfo(np.int32)
     cut_off = int(((stored == bounds.min) | (stored == bounds.max)).any(axis=1).sum())
     if cut_off:
@@ -219,23 +233,24 @@ def _to_meters(
     return np.asarray(stored * scale + offset_m)
 
 
-def _header(data: bytes, size_bytes: int) -> _Header:
+def _parse_header(data: bytes, size_bytes: int) -> _Header:
     if not data.startswith(b"LASF"):
         raise ValueError(f"not a LAS file: it starts with {data[:4]!r}, not with b'LASF'")
     if len(data) < HEADER_BYTES:
         raise ValueError(f"a header of {HEADER_BYTES} bytes is needed; the file has {len(data)}")
-    header_bytes, first_byte, records, kind, record_bytes, points = struct.unpack_from("<HIIBHI", data, 94)
+    header_bytes, first_byte, records, point_format, record_bytes, points = struct.unpack_from("<HIIBHI", data, 94)
     numbers = np.frombuffer(data, "<f8", 6, offset=131)
-    later_byte = later_records = 0
+    record_header_bytes, extended_header_bytes = 54, 60  # of records before and after the points
+    extended_byte = extended_records = 0
     if (data[24], data[25]) >= (1, 4):
         if len(data) < HEADER_BYTES_1_4:
             raise ValueError(f"a header of {HEADER_BYTES_1_4} bytes is needed; the file has {len(data)}")
-        later_byte, later_records, points = struct.unpack_from("<QIQ", data, 235)
-        if later_records and later_byte + LATER_RECORD_HEADER_BYTES * later_records > size_bytes:
+        extended_byte, extended_records, points = struct.unpack_from("<QIQ", data, 235)
+        if extended_records and extended_byte + extended_header_bytes * extended_records > size_bytes:
             raise ValueError(
-                f"{later_records} records from byte {later_byte} on are claimed; there is no room for them"
+                f"{extended_records} records from byte {extended_byte} on are claimed; there is no room for them"
             )
-    if header_bytes + RECORD_HEADER_BYTES * records > first_byte or first_byte > size_bytes:
+    if header_bytes + record_header_bytes * records > first_byte or first_byte > size_bytes:
         raise ValueError(f"{records} records before the points, which start at byte {first_byte}, are impossible")
     if record_bytes < 20:
         raise ValueError(f"records of 20 bytes or more are needed; got {record_bytes}")
@@ -245,23 +260,23 @@ def _header(data: bytes, size_bytes: int) -> _Header:
         first_byte,
         record_bytes,
         points,
-        bool(kind & COMPRESSED),
+        bool(point_format & 0x80),
         numbers[:3],
         numbers[3:],
         (header_bytes, records),
-        (later_byte, later_records),
+        (extended_byte, extended_records),
     )
 
 
 def _check_chunks(file: BinaryIO, header: _Header, size_bytes: int) -> None:
-    """The decompressor reserves memory for whatever number of chunks is claimed, and where there is none, it aborts."""
+    """Check the table of chunks, since the decompressor trusts its size and aborts without a table."""
     file.seek(header.first_byte)
     (table_byte,) = struct.unpack("<q", file.read(8).ljust(8, b"\0"))
-    if table_byte == -1:  # who could not go back to write it down left it at the end
+    if table_byte == -1:  # a program that writes to a stream stores the offset at the end
         file.seek(max(0, size_bytes - 8))
         (table_byte,) = struct.unpack("<q", file.read(8).ljust(8, b"\0"))
     if not header.first_byte <= table_byte <= size_bytes - 8:
-        raise ValueError(f"the table of chunks is said to be at byte {table_byte}; the file has {size_bytes} bytes")
+        raise ValueError(f"the table of chunks is claimed at byte {table_byte}; the file has {size_bytes} bytes")
     file.seek(table_byte)
     _, chunks = struct.unpack("<II", file.read(8))
     if chunks > header.points + 1:

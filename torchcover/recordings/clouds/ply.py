@@ -1,7 +1,7 @@
-"""Clouds in Stanford's `.ply`: the vertices, ascii or binary.
+"""Clouds in Stanford's `.ply`: the vertices, ASCII or binary.
 
-NumPy reads them, not trimesh, which reads meshes: it returns a truncated ascii file without a word, refuses a
-binary one with triangles beside quads although its vertices are sound, and rounds ascii coordinates to float32.
+NumPy parses them instead of trimesh, which accepts truncated ASCII files without a warning, rejects binary files with
+triangles and quads although their vertices are valid, and rounds ASCII coordinates to float32.
 """
 
 from dataclasses import dataclass, field
@@ -14,11 +14,8 @@ from torchcover.files import check_memory
 from torchcover.recordings.clouds.arrays import Points, check_trailing_bytes
 from torchcover.recordings.clouds.text import AXES, parse_rows, read_lines
 
-# Bounds the search for end_header in a file that is no PLY.
-MAX_HEADER_BYTES = 65536
-MAX_DIGITS = 18
 BYTE_ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
-# The names of the first specification and the ones with a size in them (CARLA writes float32).
+# Type names of the first specification, and names with a size (CARLA writes float32).
 TYPES = {
     **dict.fromkeys(("char", "int8"), "i1"),
     **dict.fromkeys(("uchar", "uint8"), "u1"),
@@ -33,6 +30,8 @@ TYPES = {
 
 @dataclass
 class _Element:
+    """Element of a PLY file with the types of its properties."""
+
     name: str
     rows: int
     types: dict[str, str] = field(default_factory=dict)
@@ -40,12 +39,22 @@ class _Element:
 
     @property
     def row_bytes(self) -> int:
-        """Bytes of one row; of a list only its length, so a lower bound where there is one."""
-        return sum(np.dtype(kind).itemsize for kind in self.types.values())
+        """Bytes of one row; a lower bound with a list, of which only the length counts."""
+        return sum(np.dtype(type_code).itemsize for type_code in self.types.values())
 
 
 def read_ply(path: Path) -> Points:
-    """Read x y z of the element `vertex` of a PLY file."""
+    """Read x y z of the element `vertex` of a PLY file.
+
+    Args:
+        path: File.
+
+    Returns:
+        (N, 3) points, float32 or float64 as stored, float64 from ASCII.
+
+    Raises:
+        ValueError: The header is invalid, coordinates are missing, or the file is shorter than its header claims.
+    """
     check_memory(4 * path.stat().st_size)
     encoding, elements, body = _parse_header(path.read_bytes())
     names = [element.name for element in elements]
@@ -57,10 +66,11 @@ def read_ply(path: Path) -> Points:
         return _parse_ascii(elements, before, vertex, body)
     if any(element.has_list for element in before):
         raise ValueError("a binary element with a list stands before the vertices; store the vertices first")
-    _check_size(elements, sum(element.rows * element.row_bytes for element in elements), len(body), "bytes")
+    claimed_bytes = sum(element.rows * element.row_bytes for element in elements)
+    _check_size(elements, claimed_bytes, len(body), "bytes")
     if not any(element.has_list for element in elements):
-        check_trailing_bytes(body[sum(element.rows * element.row_bytes for element in elements) :])
-    dtype = np.dtype([(name, BYTE_ORDERS[encoding] + kind) for name, kind in vertex.types.items()])
+        check_trailing_bytes(body[claimed_bytes:])
+    dtype = np.dtype([(name, BYTE_ORDERS[encoding] + type_code) for name, type_code in vertex.types.items()])
     offset_bytes = sum(element.rows * element.row_bytes for element in before)
     table = np.frombuffer(body, dtype, vertex.rows, offset_bytes)
     return np.column_stack([table[axis] for axis in AXES])
@@ -84,9 +94,11 @@ def _parse_header(data: bytes) -> tuple[str, list[_Element], bytes]:
         raise ValueError(f"not a PLY file: it starts with {data[:12]!r}, not with a line ply")
     encoding = ""
     elements: list[_Element] = []
+    max_header_bytes = 65536  # bounds the search for end_header in other files
+    max_digits = 18  # fits into int64
     end = data.find(b"\n") + 1
     while True:
-        start, end = end, data.find(b"\n", end, MAX_HEADER_BYTES) + 1
+        start, end = end, data.find(b"\n", end, max_header_bytes) + 1
         if end == 0:
             raise ValueError("the PLY header has no end: a line end_header is missing")
         words = data[start:end].decode("ascii", "replace").split()
@@ -97,7 +109,7 @@ def _parse_header(data: bytes) -> tuple[str, list[_Element], bytes]:
                 pass
             case ["format", encoding, _]:
                 pass
-            case ["element", name, rows] if rows.isascii() and rows.isdigit() and len(rows) <= MAX_DIGITS:
+            case ["element", name, rows] if rows.isascii() and rows.isdigit() and len(rows) <= max_digits:
                 elements.append(_Element(name, int(rows)))
             case ["property", *declaration] if elements:
                 _add_property(elements[-1], declaration)
@@ -110,11 +122,11 @@ def _parse_header(data: bytes) -> tuple[str, list[_Element], bytes]:
 
 def _add_property(element: _Element, declaration: list[str]) -> None:
     match declaration:
-        case ["list", length_kind, kind, name] if length_kind in TYPES and kind in TYPES:
-            element.types[name] = TYPES[length_kind]
+        case ["list", length_type, item_type, name] if length_type in TYPES and item_type in TYPES:
+            element.types[name] = TYPES[length_type]
             element.has_list = True
-        case [kind, name] if kind in TYPES and name not in element.types:
-            element.types[name] = TYPES[kind]
+        case [type_name, name] if type_name in TYPES and name not in element.types:
+            element.types[name] = TYPES[type_name]
         case _:
             raise ValueError(
                 f"element {element.name}: property {' '.join(declaration)[:80]!r} is repeated or of no known type; "
@@ -128,9 +140,9 @@ def _check_vertex(vertex: _Element) -> None:
         raise ValueError(f"the vertices have no {', '.join(missing)}; got {', '.join(vertex.types) or 'nothing'}")
     if vertex.has_list:
         raise ValueError("the vertices have a list property; only single values are read")
-    kinds = {vertex.types[axis] for axis in AXES}
-    if not kinds <= {"f4", "f8"}:
-        raise ValueError(f"x y z have to be float or double; got {', '.join(sorted(kinds))}")
+    type_codes = {vertex.types[axis] for axis in AXES}
+    if not type_codes <= {"f4", "f8"}:
+        raise ValueError(f"x y z have to be float or double; got {', '.join(sorted(type_codes))}")
 
 
 def _check_size(elements: list[_Element], claimed: int, available: int, unit: str) -> None:

@@ -163,7 +163,7 @@ class PoseTable:
         optional = ("block_index",) if has_times else ()
         table = read_csv(path, (*time_columns, *POSITION_COLUMNS, *QUATERNION_COLUMNS), ("frame",), optional)
         with report_bad_file(path, "a table of poses"):
-            order = find_frame_rows(table.words["frame"], frame_names)
+            order = find_frame_rows(table.texts["frame"], frame_names)
             columns = {name: values[order] for name, values in table.numbers.items()}
             self._positions_m = np.column_stack([columns[name] for name in POSITION_COLUMNS])
             self._wxyz = np.column_stack([columns[name] for name in QUATERNION_COLUMNS])
@@ -204,12 +204,12 @@ def read_boxes(path: Path) -> Boxes:
         BadFileError: Columns are missing, values are invalid, or two objects share an id.
     """
     table = read_csv(path, BOX_COLUMNS, ("id", "category"), (*VELOCITY_COLUMNS, "sampled_points", "bottom_height_m"))
-    numbers, ids = table.numbers, table.words["id"]
+    numbers, ids = table.numbers, table.texts["id"]
     with report_bad_file(path, "a table of boxes"):
         repeated = [name for name, count in Counter(ids).items() if name and count > 1]
         if repeated:
             raise ValueError(f"id: every object needs its own; {format_names(repeated)} appears more than once")
-        fields: dict[str, object] = {"ids": tuple(ids), "categories": tuple(table.words["category"])}
+        fields: dict[str, object] = {"ids": tuple(ids), "categories": tuple(table.texts["category"])}
         if set(VELOCITY_COLUMNS) & numbers.keys():
             unknown = np.full(len(ids), np.nan)
             velocity_mps = np.column_stack([numbers.get(name, unknown) for name in VELOCITY_COLUMNS])
