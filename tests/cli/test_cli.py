@@ -291,7 +291,7 @@ def test_too_few_steps_for_errors_are_told_and_a_recording_has_no_reference_sens
             ["evaluate", "--frames", "recording", "--num-rays", "9"],
             "reference, rays and frame_interval_s are for simulations",
         ),
-        (["evaluate", "--frames", "recording", "--reference", "paper"], "for a recording `recorded` or `accumulated`"),
+        (["evaluate", "--frames", "recording", "--reference", "paper"], "a recording has `recorded` or `accumulated`"),
         (["evaluate", "--frames", "recording", "--reference", "accumulated"], "does not say when its scans were made"),
         (["evaluate", "--frames", "recording", "--sensors", "roof"], "which has sensor, reference; got roof"),
         (

@@ -243,4 +243,4 @@ def test_with_ground_bands_are_over_it():
     frames = RecordedFrames(Road(steps=4), reference=AccumulatedReference(0.5))
     result = torchcover.evaluate(frames=frames, cell_m=8.0)
     assert result.coverage.band_frame == "ground"
-    assert "Ground: a height field through what all sensors saw of it" in " ".join(result.table.notes)
+    assert "Ground: height field through the ground points of all sensors" in " ".join(result.table.notes)

@@ -172,7 +172,7 @@ def test_units_of_clouds(unit):
     assert f"(--set recording.units={unit})" in doubt
     mended = RecordedFrames(correct_recording(frames.recording, RecordingSettings(units=unit)))
     assert mended.check() == []
-    assert f"Read as asked: --set recording.units={unit}." in mended.reference_record["notes"]
+    assert f"Corrections of the recording: --set recording.units={unit}." in mended.reference_record["notes"]
     assert mended.content != frames.content
 
 
