@@ -164,7 +164,7 @@ def test_where_the_vehicle_stands_is_no_reference():
     beside = (frame.reference[:, :2].abs() >= 30.0).any(dim=1)
     assert (frame.reference[~beside, 2] >= 1.0).all()
     assert 0 < beside.sum() < len(beside)
-    assert frame.counts["reference_ego_vehicle"] > 0 < frame.counts["sensor_own_vehicle"]
+    assert frame.counts["reference_ego_vehicle"] > 0 < frame.counts["sensor_ego_vehicle"]
     nothing = Drive(ego_box=BoundingBox((-90.0, -90.0, -9.0), (90.0, 90.0, 9.0)))
     with pytest.raises(ValueError, match=r"no reference point remains of the scans within 5 s of this frame"):
         RecordedFrames(nothing, reference=AccumulatedReference(10.0))[2]

@@ -134,10 +134,10 @@ def test_each_mistake_is_named(mistake, says):
 
 def test_a_window_that_holds_one_instant():
     (doubt,) = doubts(Street(step_s=100.0), reference=AccumulatedReference(2.0))
-    assert "instants are 100 s apart, and a window of 2 s" in doubt
+    assert "frames are 100 s apart, and a window of 2 s" in doubt
 
 
-@pytest.mark.parametrize(("steps", "lasts"), [(1, "0 s, 1 instants"), (2, "0.1 s, 2 instants")])
+@pytest.mark.parametrize(("steps", "lasts"), [(1, "0 s, 1 frames"), (2, "0.1 s, 2 frames")])
 def test_a_drive_far_shorter_than_the_window(steps, lasts):
     (doubt,) = doubts(Drive(steps=steps), reference=AccumulatedReference(2.0))
     assert f"it lasts {lasts}, and its reference is accumulated over 2 s" in doubt
@@ -240,4 +240,4 @@ def test_a_vehicle_that_stands_still_has_no_reference_of_its_own():
     value, standing, told = measure(drive)
     assert abs(value - right) < 0.03
     assert 20 <= standing < 30  # some windows reach into the drive
-    assert f"in {standing} of 60 frames, which count nowhere" in told[0]
+    assert f"in {standing} of 60 frames, which do not count" in told[0]

@@ -203,7 +203,7 @@ def test_poses_that_jump_are_told_and_no_scans_are_compared_across(jump_m, turn_
                 @ build_transform(convert_euler_to_rotation(turn_deg, 0.0, 0.0), np.zeros(3))
             )
 
-    assert "poses jump 1 times in 12 instants that were looked at, first at f6" in jumped(Jumping())
+    assert "poses jump 1 times in 12 frames that were checked, first at f6" in jumped(Jumping())
     assert not doubts(Jumping())
     assert jumped(Yard(pose_noise=0.05)) is None
     assert jumped(Yard(speed_mps=0.0)) is None
