@@ -248,7 +248,7 @@ def drive(options):
     """The sweeps of both LiDARs."""
     scenario, noise_m = Scenario.load(options.scenario), NOISE_M if options.ground else 0.0
     if options.hills_m is not None:
-        hilly = scenario.traffic.model_copy(update={"hills_m": options.hills_m})
+        hilly = scenario.traffic.model_copy(update={"hill_height_std_m": options.hills_m})
         scenario = scenario.model_copy(update={"traffic": hilly})
     lidars = (named(sensor, name, range_noise_m=noise_m) for sensor, name in ((JUDGED, "judged"), (OTHER, "other")))
     return SimulatedFrames(

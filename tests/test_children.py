@@ -125,7 +125,7 @@ def test_what_makes_traffic_ends(alive, tmp_path, monkeypatch):
     (tmp_path / "bin" / "sumo").write_text(f"#!/bin/sh\n{script(alive, LIVES_S)}\n")
     (tmp_path / "bin" / "sumo").chmod(0o755)
     monkeypatch.setattr(simulating, "home", lambda: tmp_path)
-    is_killed(lambda: simulating.run("sumo"), alive)
+    is_killed(lambda: simulating.run_program("sumo"), alive)
     assert alive.has_ended(within_s=LIVES_S / 3)
 
 
@@ -180,7 +180,7 @@ def test_a_stopped_sumo_is_reported(stopped, tmp_path, monkeypatch):
     (tmp_path / "bin" / "sumo").write_text("#!/bin/sh\nkill -STOP $$\necho more\n")
     (tmp_path / "bin" / "sumo").chmod(0o755)
     monkeypatch.setattr(simulating, "home", lambda: tmp_path)
-    assert list(simulating.output_of("sumo")) == [b"more\n"]
+    assert list(simulating.stream_output("sumo")) == [b"more\n"]
     assert [message.split(" (process ")[0] for message in stopped] == ["SUMO's sumo"]
 
 

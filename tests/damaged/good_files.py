@@ -39,12 +39,12 @@ from torchcover.recordings.formats.ros import RosBag
 from torchcover.recordings.formats.tracks import read_trajectory
 from torchcover.recordings.isolated_readers import read_feather
 from torchcover.simulation import Rig, Scenario
-from torchcover.simulation.recorded.bodies import read_boxes
+from torchcover.simulation.recorded.bodies import read_box_actors
 from torchcover.simulation.shapes import MeshFile
-from torchcover.simulation.sumo.crowd import read_types
-from torchcover.simulation.sumo.floating import TimeWindow, read_floating
+from torchcover.simulation.sumo.crowd import read_vehicle_types
+from torchcover.simulation.sumo.floating import TimeWindow, read_floating_car_data
 from torchcover.simulation.sumo.network import read_network
-from torchcover.simulation.sumo.simulating import from_opendrive
+from torchcover.simulation.sumo.simulating import convert_opendrive
 
 
 @dataclass(frozen=True)
@@ -210,7 +210,7 @@ def scene_files():
     ball = trimesh.creation.icosphere(subdivisions=1)
     yield Kind("trajectory.csv", TRAJECTORY, read_trajectory)
     yield Kind("trajectory.npz", stored(lambda stream: np.savez(stream, **poses)), read_trajectory)
-    yield Kind("boxes.csv", BOXES, read_boxes)
+    yield Kind("boxes.csv", BOXES, read_box_actors)
     for suffix in ("ply", "obj", "stl", "glb", "off"):
         data = ball.export(file_type=suffix)
         yield Kind(f"mesh.{suffix}", data if isinstance(data, bytes) else data.encode(), mesh)
@@ -233,9 +233,9 @@ def track_files(folder):
         yield Kind(f"tracks_{path.name}", path.read_bytes(), read_objects)
     yield Kind("town.net.xml", write_net(Path(folder) / "a.net.xml", street()).read_bytes(), read_network)
     driven = fcd(together(drive(until=2.0), drive("b", start=90.0, until=2.0))).encode()
-    yield Kind("fcd.xml", driven, lambda path: read_floating(path, TimeWindow(0.0, 1.0)))
-    yield Kind("town.rou.xml", ROUTES, read_types)
-    yield Kind("road.xodr", XODR.encode(), lambda path: from_opendrive(path, Path(folder), leave_out_links=False))
+    yield Kind("fcd.xml", driven, lambda path: read_floating_car_data(path, TimeWindow(0.0, 1.0)))
+    yield Kind("town.rou.xml", ROUTES, read_vehicle_types)
+    yield Kind("road.xodr", XODR.encode(), lambda path: convert_opendrive(path, Path(folder), leave_out_links=False))
 
 
 def in_folder(path):

@@ -10,8 +10,15 @@ import yaml
 from matplotlib.text import Text
 
 from tests.targets.worlds import EGO, FLOOR, lidar, on_target
-from torchcover.encounters import Criterion, Encounter, EncounterSet, Staged, sight_encounter
-from torchcover.encounters.sighting import NEVER, Looks, MountedRig, channels, first_run, look_steps
+from torchcover.encounters import Criterion, Encounter, EncounterSet, StagedEncounter, detect_encounter
+from torchcover.encounters.sighting import (
+    NEVER,
+    EncounterPointCounter,
+    MountedRig,
+    compute_scan_frames,
+    find_first_run,
+    group_sensors,
+)
 from torchcover.evaluation import build_flat_ground, evaluate_encounters, plot_encounter_animation
 from torchcover.geometry import convert_rotation_to_euler, find_overlaps
 from torchcover.simulation import PaperReference, Rig, Scenario, Simulator, set_ego
@@ -43,7 +50,7 @@ def mounted(*sensors):
 
 
 def sighted(mounted_rig, case, criterion, **keys):
-    return sight_encounter(mounted_rig, Staged(case, mounted_rig.ego), criterion, **keys)
+    return detect_encounter(mounted_rig, StagedEncounter(case, mounted_rig.ego), criterion, **keys)
 
 
 def ahead(name="ahead", **keys):
@@ -64,7 +71,10 @@ def test_the_sight_opens_when_the_line_past_the_corner_of_a_wall_meets_the_walke
     walls = [{"body": WALL, "beside_m": 0.6, "gap_m": 1.0}]
     walker = {"body": WALKER, "from_m": 2.1}
     one = sighted(
-        mounted(scanner), crossing(speed_kmh, walker, obstacles=walls), Criterion(points=1, looks=1), phases=1
+        mounted(scanner),
+        crossing(speed_kmh, walker, obstacles=walls),
+        Criterion(points=1, consecutive_scans=1),
+        phases=1,
     )
     # Seconds before the ego's front is at the walker's way, which the line past (-1.01, -1.6) meets at y = ..
     before_s = np.linspace(0.3, 1.39, 100_001)
@@ -79,54 +89,60 @@ def test_what_braking_needs_is_what_a_braking_vehicle_needs(kmh):
     ego, other = kmh
     case = crossing(float(ego), {"yaw_deg": 0 if other < 0 else 180, "speed_kmh": abs(other) * math.copysign(1.0, ego)})
     criterion = Criterion(deceleration_mps2=6.0, latency_s=0.4)
-    speed_mps, towards_mps = abs(ego) / 3.6, case.towards_mps
+    speed_mps, towards_mps = abs(ego) / 3.6, case.approach_speed_mps
     assert towards_mps == pytest.approx(other / 3.6)
     # The least gap from which none is lost until the ego stands, or is no faster than who drives ahead.
     times_s = np.linspace(0.0, 0.4 + speed_mps / 6, 100_001)
     own_mps = np.maximum(speed_mps - 6 * np.maximum(times_s - 0.4, 0.0), 0.0)
     lost_m = np.cumsum(own_mps + towards_mps) * times_s[1]
     expected_s = lost_m.max() / (speed_mps + towards_mps)
-    assert criterion.needed_s(speed_mps, towards_mps) == pytest.approx(expected_s, abs=1e-4)
+    assert criterion.compute_braking_time_s(speed_mps, towards_mps) == pytest.approx(expected_s, abs=1e-4)
 
 
 def test_outlines_touch_when_the_front_has_come_to_the_side():
-    assert Staged(crossing(36.0, {"body": BOX}), SOLID).contact_s == pytest.approx(1.0 - 0.5 / 10, abs=2e-6)
+    assert StagedEncounter(crossing(36.0, {"body": BOX}), SOLID).contact_time_s == pytest.approx(
+        1.0 - 0.5 / 10, abs=2e-6
+    )
     oncoming = {"body": BOX, "yaw_deg": 180, "speed_kmh": 18, "from_m": 5}
-    assert Staged(crossing(36.0, oncoming), SOLID).contact_s == pytest.approx(1.0 - 1.0 / 15, abs=2e-6)
-    behind = Staged(crossing(-36.0, {"body": BOX}), SOLID)
-    assert behind.contact_s == pytest.approx(1.0 - 0.5 / 10, abs=2e-6)
-    assert behind.vehicle_T_other(np.array([1.0]))[0, :2, 3] == pytest.approx([-2.0, 0.0])
+    assert StagedEncounter(crossing(36.0, oncoming), SOLID).contact_time_s == pytest.approx(1.0 - 1.0 / 15, abs=2e-6)
+    behind = StagedEncounter(crossing(-36.0, {"body": BOX}), SOLID)
+    assert behind.contact_time_s == pytest.approx(1.0 - 0.5 / 10, abs=2e-6)
+    assert behind.compute_vehicle_T_road_user(np.array([1.0]))[0, :2, 3] == pytest.approx([-2.0, 0.0])
     standing = crossing(0.0, {"body": BOX, "from_m": 3})
-    assert Staged(standing, SOLID).contact_s == pytest.approx(2.0 - (1.0 + 1.0) / 1.5, abs=2e-6)
+    assert StagedEncounter(standing, SOLID).contact_time_s == pytest.approx(2.0 - (1.0 + 1.0) / 1.5, abs=2e-6)
 
 
 def grazing(overlap_m, **ego):
     """The end of the other passes the ego's corner, which goes straight, so far inside."""
     box = {"type": "box", "size_m": [2.0, 1.009, 0.5]}
-    other = {"body": box, "speed_kmh": 36, "from_m": 15, "at_width": (1 - overlap_m + 0.5045 + 1 + 1) / 2}
+    other = {"body": box, "speed_kmh": 36, "from_m": 15, "impact_location": (1 - overlap_m + 0.5045 + 1 + 1) / 2}
     return Encounter.model_validate({"name": "g", "ego": {"speed_kmh": 36} | ego, "other": other})
 
 
 def test_a_touch_of_less_than_a_millisecond_is_one():
-    staged = Staged(grazing(0.004), SOLID)
-    assert staged.contact_s == pytest.approx(1.5 - 0.05045, abs=1e-9)
+    staged = StagedEncounter(grazing(0.004), SOLID)
+    assert staged.contact_time_s == pytest.approx(1.5 - 0.05045, abs=1e-9)
     whole_s = np.arange(2000) / 1000
     assert not find_overlaps(
-        staged.other.bounding_box, staged.vehicle_T_other(whole_s), SOLID.bounding_box.corners_m
+        staged.road_user_solid.bounding_box, staged.compute_vehicle_T_road_user(whole_s), SOLID.bounding_box.corners_m
     ).any()
-    bent = Staged(grazing(0.4, radius_m=8), SOLID)
-    finely_s = np.linspace(bent.contact_s - 1e-3, bent.contact_s + 1e-3, 20_001)
-    touching = find_overlaps(bent.other.bounding_box, bent.vehicle_T_other(finely_s), SOLID.bounding_box.corners_m)
-    assert finely_s[touching.argmax()] == pytest.approx(bent.contact_s, abs=2e-7)
+    bent = StagedEncounter(grazing(0.4, radius_m=8), SOLID)
+    finely_s = np.linspace(bent.contact_time_s - 1e-3, bent.contact_time_s + 1e-3, 20_001)
+    touching = find_overlaps(
+        bent.road_user_solid.bounding_box, bent.compute_vehicle_T_road_user(finely_s), SOLID.bounding_box.corners_m
+    )
+    assert finely_s[touching.argmax()] == pytest.approx(bent.contact_time_s, abs=2e-7)
 
 
 @pytest.mark.parametrize("speed_kmh", [36.0, -36.0])
 def test_rows_of_obstacles_lie_where_the_ego_comes_from_or_beyond(speed_kmh):
     rows = [{"body": BOX, "gap_m": 0.5}, {"body": WALL, "beside_m": 2.0, "gap_m": 0.4}]
     beyond = {"body": BOX, "side": "left", "where": "beyond", "yaw_deg": 90, "gap_m": 0.3, "beside_m": 0.7}
-    staged = Staged(crossing(speed_kmh, {"body": BOX}, obstacles=[*rows, beyond]), SOLID)
+    staged = StagedEncounter(crossing(speed_kmh, {"body": BOX}, obstacles=[*rows, beyond]), SOLID)
     back = -math.copysign(1.0, speed_kmh)
-    placed = {get_shape_name(one.body) + one.side + str(one.gap_m): pose[:2, 3] for one, pose in staged.obstacles}
+    placed = {
+        get_shape_name(one.body) + one.side + str(one.longitudinal_gap_m): pose[:2, 3] for one, pose in staged.obstacles
+    }
     # The other is 1 m wide along x, the ego 2 m along y.
     assert placed["boxright0.5"] == pytest.approx([back * (0.5 + 0.5 + 1.0), -1.0 - 1.0 - 0.5])
     assert placed["boxright0.4"] == pytest.approx([back * (0.5 + 0.5 + 2.0 + 0.4 + 1.5), -1.0 - 2.0 - 0.25])
@@ -137,7 +153,7 @@ def test_rows_of_obstacles_lie_where_the_ego_comes_from_or_beyond(speed_kmh):
 @pytest.mark.parametrize("yaw_deg", [0.0, 17.0])
 def test_bodies_may_touch(speed_kmh, yaw_deg):
     row = [{"body": body, "gap_m": 0.0, "beside_m": 0.0, "yaw_deg": yaw_deg} for body in ("van", "suv", WALL, BOX)]
-    assert len(Staged(crossing(speed_kmh, {"from_m": 0.7}, obstacles=row), SOLID).obstacles) == 4
+    assert len(StagedEncounter(crossing(speed_kmh, {"from_m": 0.7}, obstacles=row), SOLID).obstacles) == 4
 
 
 def test_a_bend_ends_at_the_meeting_and_is_as_long_as_its_angle():
@@ -145,9 +161,9 @@ def test_a_bend_ends_at_the_meeting_and_is_as_long_as_its_angle():
         {"name": "t", "ego": {"speed_kmh": 18, "radius_m": 8, "turn_deg": 90}, "seconds": 4,
          "other": {"body": "child_120cm", "speed_kmh": 5, "from_m": 4}}
     )  # fmt: skip
-    staged = Staged(turning, SOLID)
+    staged = StagedEncounter(turning, SOLID)
     bend_s = 8 * math.pi / 2 / 5
-    poses = staged.world_T_ego(turning.before_s - np.array([0.0, bend_s, bend_s + 0.1]))
+    poses = staged.compute_world_T_ego(turning.lead_time_s - np.array([0.0, bend_s, bend_s + 0.1]))
     yaw_deg = [convert_rotation_to_euler(pose[:3, :3])[0] for pose in poses]
     assert yaw_deg == pytest.approx([0.0, -90.0, -90.0], abs=1e-6)
     assert poses[:, :2, 3] == pytest.approx(np.array([[-2.0, 0.0], [-10.0, 8.0], [-10.0, 8.5]]))
@@ -170,10 +186,10 @@ def test_the_first_run_is_that_of_all_looks_with_few_of_them(looks):
         for phase in range(7):
             ends = [j for j in range(looks - 1, 40) if enough[phase, j - looks + 1 : j + 1].all()]
             expected.append(steps[phase, ends[0]] if ends and steps[phase, ends[0]] < NEVER else NEVER)
-        assert first_run(is_enough, steps, looks).tolist() == expected
+        assert find_first_run(is_enough, steps, looks).tolist() == expected
         assert len(asked) == len(set(asked))
     dark = []
-    first_run(lambda some: dark.extend(some) or np.zeros(len(some), dtype=bool), steps, looks)
+    find_first_run(lambda some: dark.extend(some) or np.zeros(len(some), dtype=bool), steps, looks)
     assert len(dark) <= 7 * (40 // looks)
 
 
@@ -191,13 +207,13 @@ HIDDEN = [{"body": WALL, "beside_m": 0.4, "gap_m": 0.5}, {"body": BOX, "side": "
 def test_points_are_those_of_a_simulation_with_the_other_in_the_world():
     case = crossing(obstacles=HIDDEN)
     small = mounted(ahead(), CAMERA, RADAR)
-    staged = Staged(case, small.ego)
-    looks, child = Looks(small, staged, 0), Target.load("child")
-    child = Target("child", staged.other.mesh)
+    staged = StagedEncounter(case, small.ego_solid)
+    looks, child = EncounterPointCounter(small, staged, 0), Target.load("child")
+    child = Target("child", staged.road_user_solid.mesh)
     seen = np.zeros(3)
     for step in (200, 500, 620, 800, 930):
-        vehicle_T_other = staged.vehicle_T_other(np.array([step / 1000]))[0]
-        vehicle_T_world = np.linalg.inv(staged.world_T_ego(np.array([step / 1000]))[0])
+        vehicle_T_other = staged.compute_vehicle_T_road_user(np.array([step / 1000]))[0]
+        vehicle_T_world = np.linalg.inv(staged.compute_world_T_ego(np.array([step / 1000]))[0])
         shapes = [("wall", WALL), ("box", BOX)]
         poses = {"left": BOX, "right": WALL}
         bodies = [FLOOR]
@@ -212,7 +228,7 @@ def test_points_are_those_of_a_simulation_with_the_other_in_the_world():
         world = Scenario.model_validate({"name": "s", "ego": EGO, "bodies": bodies, "actors": [actor]})
         scans = Simulator(world, {"r": small.rig}, PaperReference(rows=2, columns=2)).simulate_frame(0).scans["r"]
         for k, (sensor, scan) in enumerate(zip(small.rig.sensors, scans, strict=True)):
-            points = int(looks.points([k], np.array([step]))[0])
+            points = int(looks.count_points([k], np.array([step]))[0])
             assert points == sensor.pixels_per_sample * on_target(scan.points, child, x_m, y_m, math.radians(yaw_deg))
             seen[k] += points
     assert (seen > 0).all()
@@ -222,32 +238,32 @@ def test_the_answer_is_that_of_looking_all_the_time():
     case, criterion = crossing(obstacles=HIDDEN), Criterion(points=12, pixels=150)
     small = mounted(ahead(dropout=0.3), ahead("noisy", rate_hz=20, range_noise_m=0.3), CAMERA)
     found = sighted(small, case, criterion, phases=4, seed=3)
-    staged = Staged(case, small.ego)
-    looks, sensors = Looks(small, staged, 3), small.rig.sensors
+    staged = StagedEncounter(case, small.ego_solid)
+    looks, sensors = EncounterPointCounter(small, staged, 3), small.rig.sensors
     for k, sensor in enumerate(sensors):
-        steps = look_steps(sensor.rate_hz, 4, staged.contact_s)
+        steps = compute_scan_frames(sensor.rate_hz, 4, staged.contact_time_s)
         need = criterion.pixels if sensor.name == "cam" else criterion.points
         for phase, of_phase in enumerate(steps):
             known = of_phase[of_phase < NEVER]
-            enough = looks.points([k], known) >= need
+            enough = looks.count_points([k], known) >= need
             runs = enough[:-2] & enough[1:-1] & enough[2:]
-            expected = staged.contact_s - known[2:][runs][0] / 1000 if runs.any() else 0.0
+            expected = staged.contact_time_s - known[2:][runs][0] / 1000 if runs.any() else 0.0
             assert found.sensor_ttc_s[k, phase] == pytest.approx(expected)
     assert (found.sensor_ttc_s > 0).any(axis=1).all()
-    again, another = (Looks(small, staged, seed).points([1], known) for seed in (3, 4))
-    assert (again == looks.points([1], known)).all()
+    again, another = (EncounterPointCounter(small, staged, seed).count_points([1], known) for seed in (3, 4))
+    assert (again == looks.count_points([1], known)).all()
     assert (another != again).any()
     assert (found.ttc_s == found.sensor_ttc_s.max(axis=0)).all()  # none counts with another
-    assert (found.without_ttc_s[0] == found.sensor_ttc_s[1:].max(axis=0)).all()
+    assert (found.ttc_without_sensor_s[0] == found.sensor_ttc_s[1:].max(axis=0)).all()
 
 
 def test_lidars_count_together_at_the_looks_of_the_slower_and_a_loss_is_never_a_gain():
-    assert channels([0.1, None, 0.05, 0.1, None, 0.2], range(6)) == [(1,), (4,), (0, 3, 2), (2,), (5, 0, 3, 2)]
-    assert channels([2, None, 1], [2]) == [(2,)]
+    assert group_sensors([0.1, None, 0.05, 0.1, None, 0.2], range(6)) == [(1,), (4,), (0, 3, 2), (2,), (5, 0, 3, 2)]
+    assert group_sensors([2, None, 1], [2]) == [(2,)]
     few = lidar("few", columns=180, channels=8, vertical_fov_deg=[-20, 0])
     found = sighted(mounted(few, few | {"name": "same"}), crossing(), Criterion(points=6), phases=3)
-    assert (found.without_ttc_s <= found.ttc_s).all()
-    assert (found.without_ttc_s == found.sensor_ttc_s[::-1]).all()
+    assert (found.ttc_without_sensor_s <= found.ttc_s).all()
+    assert (found.ttc_without_sensor_s == found.sensor_ttc_s[::-1]).all()
     assert (found.ttc_s > found.sensor_ttc_s[0]).any()
     for rate_hz in (10.001, 13, 20):
         faster = sighted(
@@ -260,12 +276,12 @@ def test_a_sensor_that_is_slower_than_the_encounter_is_too_late():
     with pytest.warns(UserWarning, match=r"3 looks of sensor 'top' take 3 s, .* ends after 0.98"):
         found = sighted(mounted(lidar(rate_hz=1)), crossing(), Criterion(), phases=2)
     assert not found.ttc_s.any()
-    assert found.ttc_s.max() < found.open_s
+    assert found.ttc_s.max() < found.censoring_ttc_s
     unseen = crossing(20.0, {"from_m": None, "speed_kmh": 0}, seconds=2)
     with pytest.warns(UserWarning, match="too late, whatever it sees"):
         found = sighted(mounted(lidar(rate_hz=1)), unseen, Criterion(), phases=2)
     assert not found.ttc_s.any()
-    assert found.ttc_s.max() < found.open_s
+    assert found.ttc_s.max() < found.censoring_ttc_s
 
 
 def test_fog_hides_what_is_beyond_and_it_is_said_what_was_there_from_the_beginning():
@@ -273,15 +289,15 @@ def test_fog_hides_what_is_beyond_and_it_is_said_what_was_there_from_the_beginni
     sensor = lidar(channels=60, vertical_fov_deg=[-4, 0], columns=7200, max_range_m=80)
     found = [sighted(mounted(sensor), case, Criterion(points=1), phases=2) for case in (
         far, far.model_copy(update={"weather": crossing(weather="fog_50m").weather}))]  # fmt: skip
-    assert found[0].ttc_s.min() >= found[0].open_s
+    assert found[0].ttc_s.min() >= found[0].censoring_ttc_s
     assert found[0].ttc_s.min() > 2.5
-    assert found[1].ttc_s.max() < found[1].open_s
+    assert found[1].ttc_s.max() < found[1].censoring_ttc_s
     assert found[1].ttc_s.max() < 2.5
 
 
 FAMILY = {
     "name": "f", "ego": {"speed_kmh": [20, 40]}, "other": {"body": "child_120cm", "speed_kmh": {"from": 3, "to": 7},
-    "at_width": {"from": 0.2, "to": 0.8}, "from_m": 1.5}, "obstacles": [{"body": ["hatchback", "van"]}],
+    "impact_location": {"from": 0.2, "to": 0.8}, "from_m": 1.5}, "obstacles": [{"body": ["hatchback", "van"]}],
 }  # fmt: skip
 
 
@@ -291,9 +307,9 @@ def test_lists_are_combined_and_ranges_drawn_evenly_for_each_combination():
     assert [one.name for one in these[::8]] == ["f: hatchback", "f: van"] * 2
     assert [one.ego.speed_kmh for one in these[::8]] == [20, 20, 40, 40]
     for first in range(0, 32, 8):
-        share = np.array([one.other.at_width for one in these[first : first + 8]])
+        share = np.array([one.road_user.impact_location for one in these[first : first + 8]])
         assert sorted(np.floor((share - 0.2) / 0.6 * 8).tolist()) == list(range(8))
-        assert share.tolist() == [one.other.at_width for one in these[:8]]
+        assert share.tolist() == [one.road_user.impact_location for one in these[:8]]
 
 
 def test_rows_are_of_speeds_with_intervals_over_draws():
@@ -301,23 +317,23 @@ def test_rows_are_of_speeds_with_intervals_over_draws():
     two = rig(high("ahead"), high("top", columns=40))
     found = evaluate_encounters([two], these, Criterion(points=3), num_start_offsets=3, vehicle="suv")
     rows = found.rows
-    assert [(row.speed_kmh, row.draws, row.first) for row in rows] == [(20, 8, "ahead"), (40, 8, "ahead")]
+    assert [(row.speed_kmh, row.sample_count, row.first_sensor) for row in rows] == [(20, 8, "ahead"), (40, 8, "ahead")]
     for row in rows:
-        of_draws_s = [one.ttc_s.mean() for one in found.sightings if one.encounter.ego.speed_kmh == row.speed_kmh]
+        of_draws_s = [one.ttc_s.mean() for one in found.detections if one.encounter.ego.speed_kmh == row.speed_kmh]
         margin_s = 2.36462 * np.std(of_draws_s, ddof=1) / math.sqrt(8)
         assert (row.ttc_s, row.interval_high) == pytest.approx((np.mean(of_draws_s), row.ttc_s + margin_s), rel=1e-5)
-        assert row.ttc_s_low <= row.ttc_s <= row.ttc_s_high
-        assert row.needed_s == pytest.approx(row.speed_kmh / 3.6 / 18 + 0.5)
-        assert row.worst == "ahead"
-        of_speed = [one for one in found.sightings if one.encounter.speed_kmh == row.speed_kmh]
-        assert row.without_worst_s == min(one.without_ttc_s[0].min() for one in of_speed)
-    slow = [one.ttc_s for one in found.sightings if one.encounter.ego.speed_kmh == 20]
-    assert rows[0].in_time == np.mean(np.stack(slow) >= rows[0].needed_s)
-    ((name, of_rigs, needed),) = found.bands()
+        assert row.min_ttc_s <= row.ttc_s <= row.max_ttc_s
+        assert row.braking_time_s == pytest.approx(row.speed_kmh / 3.6 / 18 + 0.5)
+        assert row.most_critical_sensor == "ahead"
+        of_speed = [one for one in found.detections if one.encounter.speed_kmh == row.speed_kmh]
+        assert row.ttc_without_most_critical_s == min(one.ttc_without_sensor_s[0].min() for one in of_speed)
+    slow = [one.ttc_s for one in found.detections if one.encounter.ego.speed_kmh == 20]
+    assert rows[0].in_time_share == np.mean(np.stack(slow) >= rows[0].braking_time_s)
+    ((name, of_rigs, needed),) = found.compute_plot_bands()
     bands = of_rigs["small"]
     assert (name, [band[0] for band in bands]) == ("f", [20, 40])
-    assert [at for _, at in needed] == [row.needed_s for row in rows]
-    assert bands[0][1:] == (rows[0].ttc_s_low, rows[0].ttc_s_high)
+    assert [at for _, at in needed] == [row.braking_time_s for row in rows]
+    assert bands[0][1:] == (rows[0].min_ttc_s, rows[0].max_ttc_s)
 
 
 def test_in_time_up_to_a_speed_is_in_time_at_all_that_are_slower():
@@ -326,21 +342,21 @@ def test_in_time_up_to_a_speed_is_in_time_at_all_that_are_slower():
          {"body": "child_120cm", "speed_kmh": 5, "from_m": 1.5}}]}
     )  # fmt: skip
     partly = evaluate_encounters(rig(high("ahead")), these, num_start_offsets=5)
-    ttc_s = np.sort(partly.sightings[0].ttc_s)
+    ttc_s = np.sort(partly.detections[0].ttc_s)
     between = Criterion(deceleration_mps2=50 / 3.6 / 2 / (ttc_s[2] - 0.1), latency_s=0.1)
     found = evaluate_encounters(rig(high("ahead")), these, between, num_start_offsets=5)
-    assert [row.in_time for row in found.rows][-1] == 0.6
-    assert list(found.up_to_kmh().values()) == [30.0]
+    assert [row.in_time_share for row in found.rows][-1] == 0.6
+    assert list(found.find_max_speeds_kmh().values()) == [30.0]
     for brakes, expected, words in ((1e6, 50.0, "50"), (1.0, math.nan, "none")):
         found = evaluate_encounters(
             rig(high("ahead")), these, Criterion(deceleration_mps2=brakes, latency_s=0.1), num_start_offsets=5
         )
-        assert list(found.up_to_kmh().values()) == pytest.approx([expected], nan_ok=True)
-        assert found.tables()[0].rows[0][1].text == words
+        assert list(found.find_max_speeds_kmh().values()) == pytest.approx([expected], nan_ok=True)
+        assert found.build_tables()[0].rows[0][1].text == words
     standing = [crossing(float(kmh), {"from_m": 3}) for kmh in (-50, 0, -20)]
     both = EncounterSet(name="s", encounters=tuple(standing))
     found = evaluate_encounters(rig(high("ahead")), both, Criterion(deceleration_mps2=1.0), num_start_offsets=2)
-    assert (list(found.up_to_kmh().values()), found.tables()[0].rows[0][1].text) == ([0.0], "0")
+    assert (list(found.find_max_speeds_kmh().values()), found.build_tables()[0].rows[0][1].text) == ([0.0], "0")
     assert [row.speed_kmh for row in found.rows] == [0, -20, -50]
 
 
@@ -421,7 +437,7 @@ def test_families_of_one_name_are_told():
 @pytest.mark.parametrize(
     ("case", "told"),
     [
-        (crossing(36, {"at_width": 3.0, "yaw_deg": 0, "from_m": 4}), "never touch"),
+        (crossing(36, {"impact_location": 3.0, "yaw_deg": 0, "from_m": 4}), "never touch"),
         (crossing(5.4, {"yaw_deg": 0}), "overlap from the beginning|never touch"),
         (crossing(36, {"body": BOX, "yaw_deg": 0, "speed_kmh": 36}), "overlap from the beginning"),
         (crossing(36, obstacles=[{"body": WALL, "beside_m": -1.0}]), "'box' is in the way of the ego"),
@@ -434,11 +450,11 @@ def test_families_of_one_name_are_told():
 )
 def test_ways_that_never_meet_or_are_blocked_are_mistakes(case, told):
     with pytest.raises(ValueError, match=told):
-        Staged(case, SOLID)
+        StagedEncounter(case, SOLID)
 
 
 def test_mistakes_of_the_last_encounter_are_told_before_the_first_look(monkeypatch):
     monkeypatch.setattr(MountedRig, "mounted", None)
-    both = crossing(), crossing(36, {"at_width": 3.0, "yaw_deg": 0, "from_m": 4})
+    both = crossing(), crossing(36, {"impact_location": 3.0, "yaw_deg": 0, "from_m": 4})
     with pytest.raises(ValueError, match="never touch"):
         evaluate_encounters(rig(), EncounterSet(name="s", encounters=both))

@@ -12,9 +12,16 @@ from tests.recordings.layouts import LAYOUTS
 from tests.targets.worlds import FLOOR, drive, lidar, rig, world
 from torchcover.data import SimulatedFrames
 from torchcover.detection import Boxes
-from torchcover.encounters import Criterion, Sightings
+from torchcover.encounters import Criterion, EncounterResults
 from torchcover.encounters.sighting import NEVER
-from torchcover.encounters.traffic import Approach, Drive, Eyes, Watch, approaches, sight_approach
+from torchcover.encounters.traffic import (
+    Approach,
+    ApproachPointCounter,
+    Drive,
+    DriveSensors,
+    detect_approach,
+    find_approaches,
+)
 from torchcover.evaluation import evaluate_recorded_encounters, evaluate_traffic_encounters
 from torchcover.geometry import BoundingBox, build_transform
 from torchcover.geometry.trajectory import Trajectory
@@ -63,22 +70,26 @@ TOP = lidar(**AHEAD)
 @pytest.fixture(scope="module")
 def driven(scenario):
     simulator = Simulator(scenario, {"small": rig(*SENSORS)}, PaperReference(rows=2, columns=2), seed=3)
-    return simulator, Drive.of_world("w", simulator.get_scene_geometry(0)[0].scene)
+    return simulator, Drive.from_scene("w", simulator.get_scene_geometry(0)[0].scene)
 
 
 def test_who_is_met_and_how_near_in_time_is_geometry(driven):
-    child, faster = approaches(driven[1], Criterion())
+    child, faster = find_approaches(driven[1], Criterion())
     # The child's side is 1.8 - 0.2 m from that of the ego's way 2 s after 1.6 s; the front has 42 - 0.2 m to go.
-    times_s = STEP_S * np.arange(child.step, child.step + len(child.ttc_s))
+    times_s = STEP_S * np.arange(child.frame_index, child.frame_index + len(child.ttc_s))
     ahead_s, aside_s = (44 - 0.2 - 2 - 10 * times_s) / 10, (5.4 - 1.5 * times_s - 1.0 - 0.2) / 1.5
     assert child.ttc_s == pytest.approx(np.maximum(ahead_s, aside_s), abs=1e-9)
     assert (child.name, child.track.name) == ("on foot", "child")
-    assert child.needed_s == pytest.approx(10 / 18 + 0.5)
-    assert (faster.name, faster.step, faster.needed_s.tolist()) == ("from behind", 12, [0.0] * 19)
+    assert child.braking_times_s == pytest.approx(10 / 18 + 0.5)
+    assert (faster.name, faster.frame_index, faster.braking_times_s.tolist()) == ("from behind", 12, [0.0] * 19)
     assert faster.ttc_s == pytest.approx((30 - 4 - 5 * STEP_S * np.arange(12, 31)) / 5)
     # Nobody knows how late it is with who was near from the beginning.
     assert "tailing" in [track.name for track in driven[1].tracks]
-    assert [one.track.name for one in approaches(driven[1], Criterion(within_s=2.5))] == ["child", "faster", "tailing"]
+    assert [one.track.name for one in find_approaches(driven[1], Criterion(max_ttc_s=2.5))] == [
+        "child",
+        "faster",
+        "tailing",
+    ]
 
 
 def test_points_are_those_of_frames(scenario, driven):
@@ -91,29 +102,31 @@ def test_points_are_those_of_frames(scenario, driven):
         boxes=True,
         reference_sensor=PaperReference(rows=2, columns=2),
     )
-    eyes, counted = Eyes.of_world(simulator, 0, Criterion()), 0
+    eyes, counted = DriveSensors.from_simulator(simulator, 0, Criterion()), 0
     for track in there.tracks:
-        watch = Watch(there, track, eyes)
+        watch = ApproachPointCounter(there, track, eyes)
         for step in (0, 9, 21, 30):
             boxes = frames[step].boxes
             expected = int(boxes.points_in_box["small"][boxes.ids.index(track.name)])
-            assert watch.points(range(3), np.array([step])) == [expected]
+            assert watch.count_points(range(3), np.array([step])) == [expected]
             counted += expected
     assert counted > 1000
 
 
 def test_lidars_count_together_by_steps_and_who_looks_more_often_loses_nothing(driven):
     simulator, there = driven
-    eyes = Eyes.of_world(simulator, 0, Criterion())
-    assert (eyes.periods, eyes.every) == ([1, 2, None], [1, 2, 1])
-    child, _ = approaches(there, Criterion())
+    eyes = DriveSensors.from_simulator(simulator, 0, Criterion())
+    assert (eyes.scan_periods, eyes.frame_strides) == ([1, 2, None], [1, 2, 1])
+    child, _ = find_approaches(there, Criterion())
     middle_m = [
         there.tracks[0].trajectory.at(STEP_S * step)[:3, 3] - [10 * STEP_S * step, 0, -0.5] for step in range(31)
     ]
 
     def detected_s(*steps):
-        few = Eyes(steps, [5, 5], [1, 1], steps, lambda step, _: [np.tile(middle_m[step], (3, 1)) * (step >= 20)] * 2)
-        return sight_approach("r", there, child, few, Criterion()).ttc_s[0]
+        few = DriveSensors(
+            steps, [5, 5], [1, 1], steps, lambda step, _: [np.tile(middle_m[step], (3, 1)) * (step >= 20)] * 2
+        )
+        return detect_approach("r", there, child, few, Criterion()).ttc_s[0]
 
     assert detected_s(1, 1) > detected_s(2, 1) == detected_s(1, 2) == detected_s(2, 2) > 0
 
@@ -121,49 +134,55 @@ def test_lidars_count_together_by_steps_and_who_looks_more_often_loses_nothing(d
 def test_the_answer_is_that_of_looking_all_the_time(driven):
     simulator, there = driven
     some = {"before": 0, "later": 0, "never": 0}
-    for criterion in (Criterion(points=4, pixels=60), Criterion(points=1, pixels=4, looks=2, within_s=2.0)):
-        eyes = Eyes.of_world(simulator, 0, criterion)
-        for one in approaches(there, criterion):
-            found, watch = sight_approach("small", there, one, eyes, criterion), Watch(there, one.track, eyes)
-            first = max(one.step - round(criterion.within_s / STEP_S), 0)
+    for criterion in (
+        Criterion(points=4, pixels=60),
+        Criterion(points=1, pixels=4, consecutive_scans=2, max_ttc_s=2.0),
+    ):
+        eyes = DriveSensors.from_simulator(simulator, 0, criterion)
+        for one in find_approaches(there, criterion):
+            found, watch = (
+                detect_approach("small", there, one, eyes, criterion),
+                ApproachPointCounter(there, one.track, eyes),
+            )
+            first = max(one.frame_index - round(criterion.max_ttc_s / STEP_S), 0)
             detected = []
             for k, need in enumerate((criterion.points, criterion.points, criterion.pixels)):
-                steps = [s for s in range(first, one.step + len(one.ttc_s)) if s % eyes.every[k] == 0]
-                enough = watch.points([k], np.array(steps)) >= need
-                ends = [steps[j] for j in range(criterion.looks - 1, len(steps))
-                        if enough[j - criterion.looks + 1 : j + 1].all()]  # fmt: skip
-                detected.append(max(ends[0], one.step) if ends else NEVER)
+                steps = [s for s in range(first, one.frame_index + len(one.ttc_s)) if s % eyes.frame_strides[k] == 0]
+                enough = watch.count_points([k], np.array(steps)) >= need
+                ends = [steps[j] for j in range(criterion.consecutive_scans - 1, len(steps))
+                        if enough[j - criterion.consecutive_scans + 1 : j + 1].all()]  # fmt: skip
+                detected.append(max(ends[0], one.frame_index) if ends else NEVER)
 
-            def ttc_s(step, one=one, within_s=criterion.within_s):
-                past = step - one.step
+            def ttc_s(step, one=one, within_s=criterion.max_ttc_s):
+                past = step - one.frame_index
                 return within_s if past == 0 else 0.0 if step == NEVER else one.ttc_s[: past + 1].min()
 
             assert found.sensor_ttc_s[:, 0].tolist() == [ttc_s(step) for step in detected]
             assert found.ttc_s[0] == ttc_s(min(detected))  # of three rates or kinds: none counts with another
-            assert found.without_ttc_s[1, 0] == ttc_s(min(detected[0], detected[2]))
-            assert (found.ttc_s[0] >= found.open_s) == (min(detected) == one.step)
-            until = min(min(detected) - one.step + 1, len(one.ttc_s)) if min(detected) > one.step else 0
-            needed = one.ttc_s < one.needed_s
+            assert found.ttc_without_sensor_s[1, 0] == ttc_s(min(detected[0], detected[2]))
+            assert (found.ttc_s[0] >= found.censoring_ttc_s) == (min(detected) == one.frame_index)
+            until = min(min(detected) - one.frame_index + 1, len(one.ttc_s)) if min(detected) > one.frame_index else 0
+            needed = one.ttc_s < one.braking_times_s
             assert (found.in_time[0] == (not needed[:until].any())) if needed.any() else np.isnan(found.in_time[0])
             for step in detected:
-                some["before" if step == one.step else "never" if step == NEVER else "later"] += 1
+                some["before" if step == one.frame_index else "never" if step == NEVER else "later"] += 1
     assert all(some.values())
 
 
 def test_who_is_in_time_is_open_where_braking_was_never_needed(driven):
     _, there = driven
-    blind = Eyes([1], [1], [1], [1], lambda step, _: [np.empty((0, 3))])
+    blind = DriveSensors([1], [1], [1], [1], lambda step, _: [np.empty((0, 3))])
     soft = Criterion(deceleration_mps2=1.5)
-    rows = {one.track.name: sight_approach("r", there, one, blind, soft) for one in approaches(there, soft)}
+    rows = {one.track.name: detect_approach("r", there, one, blind, soft) for one in find_approaches(there, soft)}
     assert [one.ttc_s[0] for one in rows.values()] == [0.0, 0.0]
     assert rows["child"].in_time[0] == 0
     assert math.isnan(rows["faster"].in_time[0])
     sightings = list(rows.values())
-    found = Sightings("t", soft, 1, 0, {"r": ("s",)}, sightings, {"w": 1.0})
+    found = EncounterResults("t", soft, 1, 0, {"r": ("s",)}, sightings, {"w": 1.0})
     (every,) = [row for row in found.rows if row.encounter == "all"]
-    assert (every.in_time, every.to_brake, every.draws) == (0.0, 1, len(sightings))
-    assert {one["name"]: one["in_time"] for one in found.record()["met"]} == {"child": False, "faster": None}
-    table, *_ = found.tables()
+    assert (every.in_time_share, every.braking_count, every.sample_count) == (0.0, 1, len(sightings))
+    assert {one["name"]: one["in_time"] for one in found.to_record()["met"]} == {"child": False, "faster": None}
+    table, *_ = found.build_tables()
     assert "1 of 1 too late" in table.rows[-1][3].text
     assert "Braking was needed for 1 of them" in table.notes[1]
 
@@ -173,10 +192,10 @@ def test_who_looks_rarely_has_seen_him_before():
     there = Drive("w", STEP_S * np.arange(70), np.tile(np.eye(4), (70, 1, 1)), None, [track])
     one = Approach(track, 45, np.array([2.0] * 20), np.array([0.5] * 20), "cars and vans", 0.0)
     for seen_from, ttc_s in ((0, 2.5), (20, 2.0), (40, 0.0)):
-        eyes = Eyes(
+        eyes = DriveSensors(
             [20], [1], [1], [20], lambda step, _, since=seen_from: [np.tile([9.0, 0.0, 1.0], (int(step >= since), 1))]
         )
-        assert sight_approach("r", there, one, eyes, Criterion(within_s=2.5)).ttc_s[0] == ttc_s
+        assert detect_approach("r", there, one, eyes, Criterion(max_ttc_s=2.5)).ttc_s[0] == ttc_s
 
 
 def test_a_lorry_and_its_trailer_are_one_road_user():
@@ -189,7 +208,7 @@ def test_a_lorry_and_its_trailer_are_one_road_user():
              Track("rear of truck 1", "trailer", None, (12.0, 2.5, 4.0), way[30.0])]  # fmt: skip
     there = Drive("w", times_s, ego, BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5)), parts)
     for tracks in (parts, parts[::-1]):
-        (one,) = approaches(there._replace(tracks=tracks), Criterion())
+        (one,) = find_approaches(there._replace(tracks=tracks), Criterion())
         assert (one.track, one.name) == (parts[1], "lorries and buses")
         assert 3.88 < one.ttc_s[0] <= 4.0
 
@@ -211,8 +230,8 @@ def test_braking_is_needed_where_it_helps(ego_mps, other_mps, from_m, needed_s):
     way_m = np.pad(np.array(from_m) + np.outer(times_s, other_mps), ((0, 0), (0, 1)))
     track = Track("t", "car", "passenger", (4.0, 2.0, 1.5), Trajectory.from_arrays(times_s, way_m, np.zeros((60, 3))))
     there = Drive("w", times_s, ego, BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5)), [track])
-    (one,) = approaches(there, Criterion(within_s=20.0, looks=1))
-    assert one.needed_s[0] == pytest.approx(needed_s)
+    (one,) = find_approaches(there, Criterion(max_ttc_s=20.0, consecutive_scans=1))
+    assert one.braking_times_s[0] == pytest.approx(needed_s)
 
 
 @pytest.mark.parametrize(
@@ -224,13 +243,17 @@ def test_the_nearest_time_until_detection_counts_though_it_grew_again(seen_from,
     there = Drive("w", STEP_S * np.arange(9), np.tile(np.eye(4), (9, 1, 1)), None, [track])
     one = Approach(track, 5, np.array([3.0, 2.0, 1.0, 3.5]), np.array([0.5, 0.5, 1.1, 0.5]), "cars and vans", 0.0, 0.0)
     on_it, about_it = [[9.0, 0.0, 1.0]], [[9.0, 0.0, 1.52], [9.0, 0.0, 0.0], [12.02, 0.0, 1.0], [9.0, -1.02, 1.0]]
-    eyes = Eyes([1], [1], [1], [1], lambda step, _: [np.array(about_it + on_it * (step >= seen_from))])
-    found = sight_approach("r", there, one, eyes, Criterion(points=1, looks=1))
-    assert (found.ttc_s[0], found.in_time[0], (found.ttc_s[0] >= found.open_s)) == (ttc_s, in_time, seen_from == 0)
-    assert found.without_ttc_s[0, 0] == 0
+    eyes = DriveSensors([1], [1], [1], [1], lambda step, _: [np.array(about_it + on_it * (step >= seen_from))])
+    found = detect_approach("r", there, one, eyes, Criterion(points=1, consecutive_scans=1))
+    assert (found.ttc_s[0], found.in_time[0], (found.ttc_s[0] >= found.censoring_ttc_s)) == (
+        ttc_s,
+        in_time,
+        seen_from == 0,
+    )
+    assert found.ttc_without_sensor_s[0, 0] == 0
     # Whoever needs more than was asked about may have been too late before.
     early = one._replace(needed_s=np.full(4, 4.1))
-    found = sight_approach("r", there, early, eyes, Criterion(points=1, looks=1))
+    found = detect_approach("r", there, early, eyes, Criterion(points=1, consecutive_scans=1))
     assert math.isnan(found.in_time[0]) if seen_from == 0 else found.in_time[0] == 0
 
 
@@ -243,13 +266,13 @@ def test_who_is_hidden_until_braking_is_needed_is_too_late(scenario):
     )
     child = {name: next(row for row in found.rows if row.encounter == "on foot") for name, found in
              (("soft", soft), ("hard", hard))}  # fmt: skip
-    assert child["soft"].in_time == 0.0
-    assert child["hard"].in_time == 1.0
-    assert 1.8 < child["hard"].ttc_s == child["hard"].ttc_s_low < 2.6
-    assert [(row.encounter, row.draws) for row in hard.rows] == [("on foot", 1), ("from behind", 1), ("all", 2)]
-    assert child["hard"].per_hour == pytest.approx(3600 / 3.1)
+    assert child["soft"].in_time_share == 0.0
+    assert child["hard"].in_time_share == 1.0
+    assert 1.8 < child["hard"].ttc_s == child["hard"].min_ttc_s < 2.6
+    assert [(row.encounter, row.sample_count) for row in hard.rows] == [("on foot", 1), ("from behind", 1), ("all", 2)]
+    assert child["hard"].encounters_per_hour == pytest.approx(3600 / 3.1)
     assert math.isnan(child["hard"].interval_low)  # a world that repeats is one world
-    (table,) = soft.tables()
+    (table,) = soft.build_tables()
     assert table.rows[0][3].text.endswith("too late")
 
 
@@ -262,13 +285,13 @@ def test_a_recording_of_a_world_says_the_same(scenario, tmp_path):
         evaluate_recorded_encounters(tmp_path / "drive"),
         evaluate_traffic_encounters([rig(TOP)], scenario),
     )
-    assert [one.encounter.track.name for one in found.sightings] == ["child", "faster"]
-    for one, other in zip(found.sightings, expected.sightings, strict=True):
+    assert [one.encounter.track.name for one in found.detections] == ["child", "faster"]
+    for one, other in zip(found.detections, expected.detections, strict=True):
         assert one.encounter.ttc_s == pytest.approx(other.encounter.ttc_s, abs=1e-5)
         assert one.ttc_s == pytest.approx(other.ttc_s, abs=1e-5)
         assert np.array_equal(one.in_time, other.in_time, equal_nan=True)
-        assert (one.ttc_s[0] >= one.open_s) == (other.ttc_s[0] >= other.open_s)
-    assert 0 < found.sightings[0].ttc_s[0] < 4
+        assert (one.ttc_s[0] >= one.censoring_ttc_s) == (other.ttc_s[0] >= other.censoring_ttc_s)
+    assert 0 < found.detections[0].ttc_s[0] < 4
 
 
 class Closing(SyntheticDrive):
@@ -294,12 +317,12 @@ class Closing(SyntheticDrive):
 @pytest.mark.parametrize("layout", ["kitti_raw", "nuscenes", "argoverse2"])
 def test_real_road_users_are_first_hit_as_their_layout_says(layout, tmp_path):
     recording = open_recording(LAYOUTS[layout](Closing(steps=15), tmp_path))
-    (one,) = evaluate_recorded_encounters(recording).sightings
+    (one,) = evaluate_recorded_encounters(recording).detections
     gap_m = 50.0 - CAR_SIZE_M[0] / 2 - recording.ego_box.upper_m[0]
     assert one.encounter.name == "cars and vans"
-    assert one.encounter.ttc_s[0] == pytest.approx((gap_m - one.encounter.step) / 10, abs=0.02)
+    assert one.encounter.ttc_s[0] == pytest.approx((gap_m - one.encounter.frame_index) / 10, abs=0.02)
     assert one.ttc_s[0] == pytest.approx((gap_m - 10) / 10, abs=0.02)
-    assert one.needed_s == pytest.approx(10 / 18 + 0.5, abs=0.01)
+    assert one.braking_time_s == pytest.approx(10 / 18 + 0.5, abs=0.01)
 
 
 @pytest.mark.parametrize(("category", "met"), [("car", 0), ("pedestrian", 1)])
@@ -313,7 +336,7 @@ def test_parked_vehicles_are_not_met_and_people_who_stand_are(category, met):
             return Boxes.from_rows(box.rows, ids=box.ids, categories=(category,))
 
     found = evaluate_recorded_encounters(Standing(steps=15, body=BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5))))
-    assert len(found.sightings) == met
+    assert len(found.detections) == met
 
 
 def test_what_cannot_be_asked_is_told(tmp_path):
@@ -328,7 +351,7 @@ def test_what_cannot_be_asked_is_told(tmp_path):
     way = drive(tmp_path, (0, 0, 0, 0), (1, 9, 0, 0))
     alone = world(ego={"shape": CAR, "trajectory": str(way)}, duration_s=1.0)
     far = evaluate_traffic_encounters([rig(TOP)], alone)
-    assert [(row.encounter, row.draws, row.ttc_s_high) for row in far.rows] == [("all", 0, 0.0)]
-    (table,) = far.tables()
+    assert [(row.encounter, row.sample_count, row.max_ttc_s) for row in far.rows] == [("all", 0, 0.0)]
+    (table,) = far.build_tables()
     assert table.rows[0][3].text == "-"
     assert "Nobody was met" in table.notes[-1]

@@ -430,7 +430,7 @@ def test_a_source_that_lacks_something_is_told_what():
 def test_hills_do_not_change_what_is_seen_of_far_obstacles():
     """The same cities with and without hills; by z of a vehicle that pitches the road is an obstacle there."""
     urban = Scenario.load("urban")
-    flat = urban.model_copy(update={"traffic": urban.traffic.model_copy(update={"hills_m": 0.0})})
+    flat = urban.model_copy(update={"traffic": urban.traffic.model_copy(update={"hill_height_std_m": 0.0})})
     settings = {"num_frames": 8, "cell_m": 1.0, "num_rays": 2048, "seed": 1}
     hilly, level = (torchcover.evaluate("front_roof_128", each, **settings) for each in (urban, flat))
     assert (hilly.record["band_frame"], hilly.coverage.band_frame) == ("ground", "ground")

@@ -13,7 +13,7 @@ from torchcover.data import SimulatedFrames
 from torchcover.evaluation.observers import CoverageObserver
 from torchcover.placement import CommonFrames, Objective
 from torchcover.simulation import Rig, SurfaceReference
-from torchcover.targets import Raster, Target, survey
+from torchcover.targets import Raster, Target, measure_target_visibility
 
 AREA = Region("20m", (2.0, 22.0), (-6.0, 6.0))
 GRID = BevGrid(
@@ -152,8 +152,10 @@ def test_no_imperfection_lets_a_search_prefer_a_rig(number):
 )
 def test_a_target_gets_no_more_points_from_a_sensor_that_errs(kind, chain):
     raster = Raster((4.0, 12.0), (-2.0, 2.0), 4.0)
-    found = [survey(rig(kind, "r", **keys), WORLD, Target.load("adult"), raster) for keys in CHAINS[chain]]
+    found = [
+        measure_target_visibility(rig(kind, "r", **keys), WORLD, Target.load("adult"), raster) for keys in CHAINS[chain]
+    ]
     for exact, erring in pairwise(found):
         assert (erring.points <= exact.points).all()
-        assert not (erring.share > exact.share).any()
+        assert not (erring.surface_share > exact.surface_share).any()
     assert found[-1].points.sum() < found[0].points.sum()

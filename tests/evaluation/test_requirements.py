@@ -19,7 +19,7 @@ from torchcover.placement.space import SearchSpace
 from torchcover.simulation import RegionsOfInterest, Rig, Scenario, documents, list_builtin_names
 from torchcover.simulation.bodies import Vehicle
 from torchcover.simulation.documents import format_validation_error
-from torchcover.targets import SIDES, Raster, Target, survey
+from torchcover.targets import SIDES, Raster, Target, measure_target_visibility
 
 CAR = BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5))
 NEAR = {"region": "20m", "height": "ground"}
@@ -199,7 +199,7 @@ def test_what_is_judged_is_what_a_survey_sees():
     """Of all, of each sensor, without one that hangs there still, at the same places."""
     raster, child = Raster((3.5, 6.5), (-1.0, 1.0), 1.0), Target.load("child")
     at = {"points_m": raster.positions_m.tolist()}
-    seen = survey(THREE, world(), child, raster, hits=1)
+    seen = measure_target_visibility(THREE, world(), child, raster, detection_points=1)
     one = {
         "target": "child",
         "at": at,
@@ -218,9 +218,9 @@ def test_what_is_judged_is_what_a_survey_sees():
     found = check(THREE, requirements, world()).verdicts["small"]
     all_of, lidars, top = found[:5], found[5:9], found[9:]
     worst = {v.bound.key: v.value for v in all_of}
-    assert worst["points"] == seen.least_points.min() > 0
-    assert worst["sensors"] == seen.least_sensors.min()
-    assert worst["share"] == seen.share.min()
+    assert worst["points"] == seen.min_points.min() > 0
+    assert worst["sensors"] == seen.min_sensors.min()
+    assert worst["share"] == seen.surface_share.min()
     assert worst["pixels"] == seen.sensor_points[2].min()  # one step: least and mean are one
     away_m = np.hypot(*(raster.positions_m - (1.8, 0.0)).T)  # none is nearer than the camera
     angle = np.rad2deg(np.arctan(1.3 / away_m) - np.arctan((1.3 - child.solid.bounding_box.size_m[2]) / away_m))
@@ -313,8 +313,8 @@ def test_times_to_collision_are_the_latest_of_all_phases(box):
     ttc, spare = check(THREE, requirements, vehicle=box).verdicts["small"]
     seen = evaluate_encounters(
         THREE, requirements.requirements[0].encounters, Criterion(**looks), vehicle=box
-    ).sightings
-    latest_s = [min(one.ttc_s.min(), one.without_ttc_s[1].min()) for one in seen]
+    ).detections
+    latest_s = [min(one.ttc_s.min(), one.ttc_without_sensor_s[1].min()) for one in seen]
     needed_s = [abs(one.encounter.ego.speed_mps) / 8 + 1.0 for one in seen]
     assert (ttc.value, ttc.total_count) == (min(latest_s), 4)
     assert 0.0 < ttc.value < min(one.ttc_s.max() for one in seen)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from torchcover.geometry import BoundingBox, find_overlaps
-from torchcover.targets.placing import poses
+from torchcover.targets.placing import build_poses
 
 
 def test_a_box_around_points_touches_them():
@@ -35,12 +35,12 @@ def test_a_box_in_other_than_three_dimensions_is_refused(lower, upper):
 
 def test_boxes_that_touch_share_no_space_and_those_that_are_turned_may():
     car = BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5))
-    there = poses(
+    there = build_poses(
         np.array([[4.0, 0.0], [3.99, 0.0], [0.0, -2.0], [2.9, 1.9], [2.9, 1.9]]), np.deg2rad([0, 0, 0, 0, 45])
     )
     assert find_overlaps(car, there, car.corners_m).tolist() == [False, True, False, True, True]
     above = np.eye(4)[None].copy()
     above[:, 2, 3] = 1.5
     assert not find_overlaps(car, above, car.corners_m).any()
-    away = poses(np.array([[3.6, 2.4]]), np.deg2rad([135]))  # their shadows along x and y overlap
+    away = build_poses(np.array([[3.6, 2.4]]), np.deg2rad([135]))  # their shadows along x and y overlap
     assert not find_overlaps(car, away, car.corners_m).any()

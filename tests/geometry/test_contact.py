@@ -5,7 +5,7 @@ import pytest
 import shapely
 
 from torchcover.geometry import BoundingBox, compute_contact_time_s, transform_outline
-from torchcover.targets.placing import poses
+from torchcover.targets.placing import build_poses
 
 
 def by_differences(a_m, b_m, velocity_mps):
@@ -22,7 +22,7 @@ def pairs():
     count = 300
     a_m, b_m = (
         transform_outline(BoundingBox((-length, -width, 0.0), (length, width, 1.0)).outline_m,
-                    poses(generator.uniform(-far_m, far_m, (count, 2)), generator.uniform(-4, 4, count)))
+                    build_poses(generator.uniform(-far_m, far_m, (count, 2)), generator.uniform(-4, 4, count)))
         for length, width, far_m in ((2.0, 1.0, 1.0), (0.4, 0.3, 20.0))
     )  # fmt: skip
     towards_m = a_m.mean(axis=1) - b_m.mean(axis=1) + generator.normal(0.0, 2.0, (count, 2))

@@ -10,7 +10,7 @@ from torchcover.evaluation.checking import check
 from torchcover.evaluation.requirements import Requirements
 from torchcover.evaluation.target_survey import build_flat_ground
 from torchcover.placement import Objective, PlacementSearch, SearchPlan, SearchSpace, run_search
-from torchcover.targets import Target, survey_places
+from torchcover.targets import Target, measure_visibility_at_positions
 
 # Ahead of an ego that is 4 m long; the last is within it, so that it has no room and is not checked.
 PLACES = [[4.5, 0.0], [6.5, 0.0], [9.0, 0.0], [0.0, 0.0]]
@@ -57,7 +57,7 @@ def test_the_number_is_the_share_of_the_places_that_are_seen_well_enough_and_has
     empty, shares = build_flat_ground().model_copy(update={"ego": some._host_scenarios[0].ego}), []
     for each in (LEVEL, DOWN):
         estimate = some.score(each).estimate
-        points = survey_places(each, empty, Target.load("child"), np.array(PLACES)).least_points
+        points = measure_visibility_at_positions(each, empty, Target.load("child"), np.array(PLACES)).min_points
         assert np.isnan(points[3])
         assert estimate.value[1] == np.mean(points >= 1)
         assert (estimate.jackknife_values[:, 1] == estimate.value[1]).all()

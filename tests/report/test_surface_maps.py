@@ -149,7 +149,7 @@ def test_infinity_stays_in_its_square():
     assert torch.equal(found.isinf()[0], torch.tensor([[True, True, False, False]] * 2 + [[False] * 4] * 2))
 
 
-@pytest.mark.parametrize(("cell", "drawn_m"), [(0.25, 0.25), (0.15, 0.15), (0.125, 0.25), (0.05, 0.2)])
+@pytest.mark.parametrize(("cell", "trailing_distance_m"), [(0.25, 0.25), (0.15, 0.15), (0.125, 0.25), (0.05, 0.2)])
 def test_small_cells_are_drawn_in_squares_with_the_same_numbers(cell, drawn_m):
     """Neither side of the grid is a whole number of squares; a region's ratio is that of its squares."""
     grid = BevGrid(

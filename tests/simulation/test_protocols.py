@@ -27,7 +27,7 @@ from torchcover.simulation import (
     split_into_tiles,
 )
 from torchcover.simulation.sensor import RangeSensor
-from torchcover.targets import Raster, Target, survey
+from torchcover.targets import Raster, Target, measure_target_visibility
 
 EGO = BoundingBox((-2.4, -1.0, 0.0), (2.4, 1.0, 1.6))
 ASKED = RegionsOfInterest(regions={"20m": {"x_m": (0.0, 20.0), "y_m": (-5.0, 5.0)}}).build_query_plan()
@@ -229,7 +229,9 @@ def test_how_far_a_sensor_reaches_is_decided_by_the_scenario(sensor, monkeypatch
 
     def targets():
         raster = Raster((4.0, 12.0), (-1.0, 7.0), 1.0)
-        return np.nansum(survey(rig, Scenario.load("courtyard"), Target.load("adult"), raster).points)
+        return np.nansum(
+            measure_target_visibility(rig, Scenario.load("courtyard"), Target.load("adult"), raster).points
+        )
 
     (whole, away_m), of_targets = seen(), targets()
     reach_m = float(away_m.min() + away_m.max()) / 2 - 0.01

@@ -13,7 +13,7 @@ from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation import PaperReference, Rig, Scenario, Simulator, scene_cache
 from torchcover.simulation.scene_cache import SceneCache, encode_scene, read_scene
 from torchcover.simulation.shapes import Box
-from torchcover.simulation.traffic import Highway, Parking, Urban
+from torchcover.simulation.traffic import HighwayTraffic, ParkingTraffic, UrbanTraffic
 from torchcover.simulation.traffic.fleet import load_bodies
 from torchcover.simulation.world import Actor, Scene
 
@@ -58,7 +58,11 @@ def same(one, other):
 
 @pytest.mark.parametrize(
     "traffic",
-    [Urban(duration_s=2.0, traffic_per_km=5.0, people_per_km=4.0), Highway(duration_s=2.0), Parking(duration_s=2.0)],
+    [
+        UrbanTraffic(duration_s=2.0, traffic_per_km=5.0, people_per_km=4.0),
+        HighwayTraffic(duration_s=2.0),
+        ParkingTraffic(duration_s=2.0),
+    ],
     ids=lambda traffic: traffic.type,
 )
 def test_a_world_from_disk_is_the_one_that_was_built_and_shares_its_bodies(disk, traffic):
@@ -338,7 +342,7 @@ def test_a_world_with_doubts_is_not_kept_but_doubted_each_time(disk, monkeypatch
 
 
 def test_traffic_from_elsewhere_is_not_kept(disk):
-    class Elsewhere(Parking):
+    class Elsewhere(ParkingTraffic):
         """Whose code nobody hashes."""
 
     world_of(lot().model_copy(update={"traffic": Elsewhere(**LOT)}))

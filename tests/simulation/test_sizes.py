@@ -17,7 +17,7 @@ from torchcover.simulation import (
 from torchcover.simulation.memory import check_memory_fits, find_memory_limit_bytes
 from torchcover.simulation.scene import SceneGeometry
 from torchcover.simulation.shapes import Box
-from torchcover.simulation.traffic import Highway, Urban
+from torchcover.simulation.traffic import HighwayTraffic, UrbanTraffic
 from torchcover.simulation.world import Actor, Scene, count_time_steps
 
 SPACED = {"vertical_fov_deg": (-10, 10), "horizontal_fov_deg": 360, "max_range_m": 50}
@@ -55,8 +55,8 @@ def test_the_limit_of_a_container_counts(tmp_path, monkeypatch):
         (lambda: Lidar(name="a", channels=9, columns=10**9, **SPACED), "columns\n.*less than or equal to 1000000"),
         (lambda: CameraSensor(name="a", width=10**9, height=9, fov_deg=90, max_range_m=9), "width\n.*to 200000"),
         (lambda: Pose(x_m=1e300), "x_m\n.*less than or equal to 1000000000"),
-        (lambda: Urban(people_per_km=1e6), "people_per_km\n.*less than or equal to 1000"),
-        (lambda: Highway(duration_s=1e9), "duration_s\n.*less than or equal to 3600"),
+        (lambda: UrbanTraffic(people_per_km=1e6), "people_per_km\n.*less than or equal to 1000"),
+        (lambda: HighwayTraffic(duration_s=1e9), "duration_s\n.*less than or equal to 3600"),
         (lambda: count_time_steps(1e9, 0.1), r"1e\+10 time steps of 0.1 s, over 1,000,000; shorten it"),
         (lambda: count_time_steps(1.0, 1e-320), "inf time steps"),
     ],
@@ -91,7 +91,9 @@ def test_more_steps_and_bodies_than_there_is_memory_for_are_refused(small):
         SceneGeometry(Scene((), ego, cars, time_step_s=0.1, duration_s=50_000.0))
 
 
-@pytest.mark.parametrize("traffic", [Urban(duration_s=600.0, traffic_per_km=100), Highway(duration_s=3600.0)])
+@pytest.mark.parametrize(
+    "traffic", [UrbanTraffic(duration_s=600.0, traffic_per_km=100), HighwayTraffic(duration_s=3600.0)]
+)
 def test_more_traffic_than_there_is_memory_for_is_refused_before_anybody_is_made(small, traffic):
     with pytest.raises(ValueError, match=r"traffic of about [\d,]+ for [\d,]+ time steps: .* shorten the duration"):
         traffic.world(0)
@@ -121,4 +123,4 @@ def test_an_actor_that_will_get_into_the_ego_is_known_before_the_run(tmp_path):
 
 
 def test_traffic_has_two_instants_however_short_it_is():
-    assert len(Highway(duration_s=1e-320).build_scene(0).ego.trajectory.times_s) == 2
+    assert len(HighwayTraffic(duration_s=1e-320).build_scene(0).ego.trajectory.times_s) == 2

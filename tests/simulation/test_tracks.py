@@ -11,7 +11,7 @@ from torchcover.geometry import convert_euler_to_rotation
 from torchcover.recordings.formats.tracks import read_trajectory
 from torchcover.simulation import Pose
 from torchcover.simulation.rays import compute_unit_directions, split_into_tiles
-from torchcover.simulation.recorded.bodies import read_boxes
+from torchcover.simulation.recorded.bodies import read_box_actors
 from torchcover.simulation.scene import SceneGeometry
 
 HEADER = "t,x,y,z,roll,pitch,yaw\n"
@@ -43,8 +43,8 @@ def test_headings_that_look_like_radians_are_reported(tmp_path, unit):
         parked = f"0,a,car,5,5,0,4,2,1.5,{1.5708 if unit == 'rad' else 90}"
         for read, text, told in (
             (read_trajectory, HEADER + "\n".join(rows), "yaw: up to .* along the way as radians only"),
-            (read_boxes, BOXES + "\n".join(boxes), "yaw: up to .* along the way as radians only"),
-            (read_boxes, BOXES + parked, "yaw: 1.5708 looks like 90 degrees in radians"),
+            (read_box_actors, BOXES + "\n".join(boxes), "yaw: up to .* along the way as radians only"),
+            (read_box_actors, BOXES + parked, "yaw: 1.5708 looks like 90 degrees in radians"),
         ):
             with pytest.warns(UserWarning, match=told) if unit == "rad" else nullcontext():
                 read(write(tmp_path, text))
@@ -156,12 +156,12 @@ def test_missing_files_and_other_formats_are_named(tmp_path):
     with pytest.raises(ValueError, match=r"a trajectory is a \.csv or \.npz file; got \.txt"):
         read_trajectory(write(tmp_path, HEADER).rename(tmp_path / "t.txt"))
     with pytest.raises(FileNotFoundError, match="no such file; a file of boxes is needed"):
-        read_boxes(tmp_path / "none.csv")
+        read_box_actors(tmp_path / "none.csv")
 
 
 def test_recorded_boxes_become_actors_that_come_and_go(tmp_path):
     rows = [f"{t},a,car,{5 + t},0,0,4,2,1.5,0" for t in (1, 2, 3)] + ["1,b,truck,0,9,0,8,2.5,3,90"]
-    a, b = read_boxes(write(tmp_path, BOXES + "\n".join(rows)))
+    a, b = read_box_actors(write(tmp_path, BOXES + "\n".join(rows)))
     assert (a.name, a.category, b.name, b.category) == ("a", "car", "b", "truck")
     np.testing.assert_allclose(np.ptp(a.mesh.vertices_m, axis=0), [4, 2, 1.5])
     np.testing.assert_allclose(a.trajectory.interpolate(1.5)[:3, 3], [6.5, 0, 0])
@@ -179,7 +179,7 @@ def test_recorded_boxes_become_actors_that_come_and_go(tmp_path):
 )
 def test_bad_boxes_name_their_id(tmp_path, row, message):
     with pytest.raises(ValueError, match=message):
-        read_boxes(write(tmp_path, BOXES + row))
+        read_box_actors(write(tmp_path, BOXES + row))
 
 
 SCENARIO = """

@@ -6,15 +6,15 @@ import mpmath
 import numpy as np
 
 from tests.targets.worlds import EGO, FLOOR, lidar
-from torchcover.encounters import Criterion, Encounter, Staged, sight_encounter
-from torchcover.encounters.encounter import Way
+from torchcover.encounters import Criterion, Encounter, StagedEncounter, detect_encounter
+from torchcover.encounters.encounter import EncounterPath
 from torchcover.encounters.sighting import MountedRig
 from torchcover.encounters.staging import _along
 from torchcover.simulation import Rig, Scenario
 from torchcover.simulation.moving import BodyGeometry
 from torchcover.simulation.shapes import Box
-from torchcover.simulation.traffic.fleet import tractrix
-from torchcover.simulation.traffic.idm import Driver, acceleration_in, advance, tightness
+from torchcover.simulation.traffic.fleet import compute_tractrix_yaw_rad
+from torchcover.simulation.traffic.idm import Driver, compute_acceleration_mps2, compute_gap_ratio, integrate_motion
 
 from .case import Case, most
 
@@ -26,7 +26,7 @@ FASTEST_KMH = 300.0
 
 def drawn_along(way_m, yaw):
     """(T,) headings of one rod along a (T, 2) way."""
-    return tractrix(np.asarray(way_m)[:, None], np.array([ROD_M]), np.array([yaw]))[:, 0]
+    return compute_tractrix_yaw_rad(np.asarray(way_m)[:, None], np.array([ROD_M]), np.array([yaw]))[:, 0]
 
 
 def by_steps(way_m, yaw):
@@ -101,7 +101,7 @@ def of_bends(places):
 
 
 def along_bend(radius_m):
-    way = Way(speed_kmh=3.6, radius_m=radius_m, turn_deg=180.0)
+    way = EncounterPath(speed_kmh=3.6, radius_m=radius_m, turn_deg=180.0)
     return _along(way, np.array([100.0]), (0.0, 0.0), 0.0)[0, :2, 3]
 
 
@@ -118,14 +118,14 @@ def contacts():
     for ego_kmh in SPEEDS_KMH:
         for other_kmh in (0.0, *SPEEDS_KMH):
             other = {"body": {"type": "box", "size_m": OTHER_M}, "speed_kmh": other_kmh}
-            staged = Staged(
+            staged = StagedEncounter(
                 Encounter.model_validate({"name": "e", "ego": {"speed_kmh": ego_kmh}, "other": other, "seconds": 2.0}),
                 ego,
             )
             # The other heads along y: its width is before the ego's front, its length beside its sides.
             ahead_s = OTHER_M[1] / 2 / (ego_kmh / 3.6)
             aside_s = (EGO_M[1] + OTHER_M[0]) / 2 / (other_kmh / 3.6) if other_kmh else np.inf
-            found.append((staged.contact_s, 2.0 - min(ahead_s, aside_s)))
+            found.append((staged.contact_time_s, 2.0 - min(ahead_s, aside_s)))
     return np.array(found).T
 
 
@@ -151,8 +151,11 @@ def sights():
     walls = [{"body": {"type": "box", "size_m": [3.0, 0.5, 3.0]}, "beside_m": 0.6, "gap_m": 1.0}]
     other = {"body": {"type": "box", "size_m": [0.02, 0.02, 2.0]}, "speed_kmh": 5.4, "from_m": 2.1}
     one = {"name": "e", "ego": {"speed_kmh": FASTEST_KMH}, "other": other, "obstacles": walls}
-    sighting = sight_encounter(
-        one_rig, Staged(Encounter.model_validate(one), one_rig.ego), Criterion(points=1, looks=1), phases=1
+    sighting = detect_encounter(
+        one_rig,
+        StagedEncounter(Encounter.model_validate(one), one_rig.ego_solid),
+        Criterion(points=1, consecutive_scans=1),
+        num_start_offsets=1,
     )
     before_s = np.linspace(0.0, 1.39, 1_000_001)
     sensor_m = -0.5 - FASTEST_KMH / 3.6 * before_s
@@ -182,8 +185,8 @@ def run_into(step):
         for _ in range(200):
             ahead_m, ahead_mps = np.append(0.0, place_m[:-1]), np.append(0.0, speed_mps[:-1])
             gap_m = ahead_m - place_m
-            tight = tightness(driver, speed_mps, gap_m, speed_mps - ahead_mps)
-            wanted_mps2 = acceleration_in(driver, speed_mps, tight, driver.desired_speed_mps)
+            tight = compute_gap_ratio(driver, speed_mps, gap_m, speed_mps - ahead_mps)
+            wanted_mps2 = compute_acceleration_mps2(driver, speed_mps, tight, driver.desired_speed_mps)
             way_m, speed_mps = step(speed_mps, wanted_mps2, gap_m, step_s)
             place_m = place_m + way_m
         hit += int((np.append(0.0, place_m[:-1]) < place_m - 1e-9).sum())
@@ -214,5 +217,5 @@ CASES = [
     Case("a walker of 2 cm past the corner of a wall, at 300 km/h", "closed form", "s", 5e-3, sight_error,
          "looks at 10 Hz", sight_at_10_hz),
     Case("drivers much too close and fast, by steps of 0.05 to 3 s", "nobody runs into another", "of 600", 0,
-         partial(run_into, advance), "speed times step", partial(run_into, without_room)),
+         partial(run_into, integrate_motion), "speed times step", partial(run_into, without_room)),
 ]  # fmt: skip

@@ -35,23 +35,23 @@ def seen_where(points, *, raster=None, state=None, share=None, hits=5, least=Non
         target_bottom_m=0.0,
         heading="narrow",
         raster=raster,
-        vehicle=CAR,
+        vehicle_box=CAR,
         vehicle_outline_m=OUTLINE,
         sensor_model="ideal",
         sensor_names=("a", "b"),
-        sensors_m=np.zeros((2, 2)),
-        hits=hits,
+        sensor_positions_m=np.zeros((2, 2)),
+        detection_points=hits,
         threshold_m=0.4,
         seed=0,
-        step_count=1,
+        num_frames=1,
         state=state,
-        steps=(state == 0).astype(np.int64),
+        free_frames=(state == 0).astype(np.int64),
         sensor_points=np.stack([number / 2, number / 2]),
-        sensors=np.where(number / 2 >= hits, 2.0, 0.0),
-        seen=(number >= hits) * 1.0,
-        least_points=number if least is None else np.where(state == 0, least, np.nan),
-        least_sensors=np.where(number / 2 >= hits, 2.0, 0.0),
-        share=np.where(state == 0, 1.0, np.nan) if share is None else share,
+        detecting_sensors=np.where(number / 2 >= hits, 2.0, 0.0),
+        detected_share=(number >= hits) * 1.0,
+        min_points=number if least is None else np.where(state == 0, least, np.nan),
+        min_sensors=np.where(number / 2 >= hits, 2.0, 0.0),
+        surface_share=np.where(state == 0, 1.0, np.nan) if share is None else share,
         visible_m2=number * 0 + 1.0,
     )
 
@@ -59,7 +59,7 @@ def seen_where(points, *, raster=None, state=None, share=None, hits=5, least=Non
 def test_the_border_lies_between_each_place_that_is_seen_and_its_neighbours_that_are_not():
     """Seen from 3.5 m ahead of the middle on; to the left from 2 m on, less a gap that comes later."""
     seen = seen_where(lambda x, y: np.where((x > 3.5) | ((y > 2) & ~((y > 3) & (y < 4))), 9, 0))
-    edges = seen.border_m().reshape(-1, 3, 2)
+    edges = seen.compute_detection_border_m().reshape(-1, 3, 2)
     assert np.isnan(edges[:, 2]).all()
     rows, columns = seen.raster.shape
     expected = set()
@@ -68,52 +68,54 @@ def test_the_border_lies_between_each_place_that_is_seen_and_its_neighbours_that
             inside = other[0] < rows and other[1] < columns
             if (
                 inside
-                and seen.free[row, column]
-                and seen.free[other]
-                and seen.enough[row, column] != seen.enough[other]
+                and seen.free_mask[row, column]
+                and seen.free_mask[other]
+                and seen.detected_mask[row, column] != seen.detected_mask[other]
             ):
                 x = (seen.x_m[column] + seen.x_m[other[1]]) / 2
                 y = (seen.y_m[row] + seen.y_m[other[0]]) / 2
                 expected.add((round(x, 6), round(y, 6)))
     assert {tuple(middle) for middle in edges[:, :2].mean(axis=1).round(6) + 0.0} == expected
-    assert np.allclose(np.linalg.norm(edges[:, 0] - edges[:, 1], axis=1), seen.raster.step_m)
+    assert np.allclose(np.linalg.norm(edges[:, 0] - edges[:, 1], axis=1), seen.raster.cell_m)
     assert len(edges) == len(expected)
-    assert not len(seen_where(lambda x, y: 9).border_m())
+    assert not len(seen_where(lambda x, y: 9).compute_detection_border_m())
 
 
 def test_sides_part_the_places_at_corners_of_45_degrees():
     seen = seen_where(lambda x, y: np.where(x > 0, 9, 4))
     assert (np.bincount(seen.side.ravel() + 1) == [32, 104, 104, 120, 120]).all()
-    by_side = {(row.side, row.within_m): row for row in seen.sides()}
-    assert by_side["front", 1.0].seen == 1.0
-    assert by_side["rear", 3.0].seen == 0.0
-    assert by_side["left", 2.0].seen == by_side["right", 2.0].seen == 0.5
-    assert by_side["left", 1.0].cells == 16 + 2
-    assert seen.unseen_to_m() == {
+    by_side = {(row.side, row.max_distance_m): row for row in seen.summarize_sides()}
+    assert by_side["front", 1.0].detected_share == 1.0
+    assert by_side["rear", 3.0].detected_share == 0.0
+    assert by_side["left", 2.0].detected_share == by_side["right", 2.0].detected_share == 0.5
+    assert by_side["left", 1.0].free_cells == 16 + 2
+    assert seen.find_max_undetected_ranges_m() == {
         "front": 0.0, "rear": pytest.approx(np.hypot(3.75, 3.75)),
         "left": pytest.approx(np.hypot(3.25, 3.75)), "right": pytest.approx(np.hypot(3.25, 3.75)),
     }  # fmt: skip
     closed = replace(seen, state=np.ones_like(seen.state))
-    assert all(row.cells == 0 and np.isnan(row.seen) for row in closed.sides())
-    assert np.isnan(list(closed.unseen_to_m().values())).all()
-    half = replace(seen, seen=np.where(seen.free, 0.5, np.nan))
-    assert {row.seen for row in half.sides()} == {0.5}  # in every other step, however many points the others have
+    assert all(row.free_cells == 0 and np.isnan(row.detected_share) for row in closed.summarize_sides())
+    assert np.isnan(list(closed.find_max_undetected_ranges_m().values())).all()
+    half = replace(seen, seen=np.where(seen.free_mask, 0.5, np.nan))
+    assert {row.detected_share for row in half.summarize_sides()} == {
+        0.5
+    }  # in every other step, however many points the others have
 
 
 def test_what_is_seen_in_some_steps_only_is_not_seen():
     """Eighty points in one of sixteen steps are five in the mean."""
     seen = seen_where(lambda x, y: 80 / 16, least=0)
-    assert not seen.enough.any()
+    assert not seen.detected_mask.any()
 
 
 def test_the_worst_places_have_the_fewest_points_and_keep_apart():
     seen = seen_where(lambda x, y: np.abs(x) + np.abs(y))
-    worst = seen.worst(3)
+    worst = seen.find_worst_positions(3)
     assert [place.points for place in worst] == sorted(place.points for place in worst)
     assert worst[0].points == np.nanmin(seen.points) == 1.5
     places = np.array([[place.x_m, place.y_m] for place in worst])
     assert np.linalg.norm(places[:, None] - places, axis=2)[~np.eye(3, dtype=bool)].min() >= 1.0
-    assert len(seen.worst(10_000, apart_m=0.1)) == seen.counts["free"]
+    assert len(seen.find_worst_positions(10_000, min_spacing_m=0.1)) == seen.counts["free"]
 
 
 def test_the_files_hold_what_the_map_holds(tmp_path):
@@ -122,7 +124,7 @@ def test_the_files_hold_what_the_map_holds(tmp_path):
     assert names == ["targets.csv", "targets.npz", "report.html", "targets.png", "summary.json"]
     with np.load(tmp_path / "targets.npz") as arrays:
         np.testing.assert_array_equal(arrays["points"], seen.points)
-        np.testing.assert_array_equal(arrays["border_m"], seen.border_m())
+        np.testing.assert_array_equal(arrays["compute_detection_border_m"], seen.compute_detection_border_m())
         assert json.loads(str(arrays["settings"]))["raster"] == {"x": [-3, 3], "y": [-2, 2], "step_m": 1}
         assert arrays["x_m"].tolist() == [-2.5, -1.5, -0.5, 0.5, 1.5, 2.5]
     rows = list(csv.DictReader((tmp_path / "targets.csv").read_text().splitlines()))

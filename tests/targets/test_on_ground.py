@@ -7,10 +7,10 @@ import pytest
 
 from torchcover.simulation import Rig, Scenario
 from torchcover.simulation.scene import SceneGeometry
-from torchcover.targets.placing import Raster, ground_under
+from torchcover.targets.placing import Raster, compute_ground_heights_m
 from torchcover.targets.result import FREE, OUTSIDE
 from torchcover.targets.surface import Target
-from torchcover.targets.survey import survey
+from torchcover.targets.survey import measure_target_visibility
 
 EGO = {"shape": {"type": "box", "size_m": [4, 2, 1.5]}}
 FLOOR = {"name": "floor", "shape": {"type": "plane", "size_m": [60, 60]}, "ground": True}
@@ -31,11 +31,11 @@ def test_the_ground_under_a_place_is_that_of_a_tilted_plane(pitch_deg, roll_deg)
     normal = SceneGeometry(scenario(tilted).build_scene()).scene.static_meshes[0].vertices_m
     across = np.cross(normal[1] - normal[0], normal[2] - normal[0])
     np.testing.assert_allclose(
-        ground_under(instant(scenario(tilted)), places), -(places @ across[:2]) / across[2], atol=1e-3
+        compute_ground_heights_m(instant(scenario(tilted)), places), -(places @ across[:2]) / across[2], atol=1e-3
     )
     # The same from a vehicle that leans while the plane is level.
     leaning = instant(scenario(FLOOR, pitch_deg=pitch_deg, roll_deg=roll_deg))
-    on_plane = np.column_stack([places, ground_under(leaning, places)])
+    on_plane = np.column_stack([places, compute_ground_heights_m(leaning, places)])
     in_world = on_plane @ leaning.world_T_vehicle[:3, :3].T
     np.testing.assert_allclose(in_world[:, 2], 0, atol=2e-3)
 
@@ -44,25 +44,25 @@ def test_a_deck_above_is_no_place_to_stand_and_a_pavement_is():
     deck = {"name": "deck", "shape": {"type": "box", "size_m": [8, 8, 0.5]}, "poses": [{"x_m": 10, "z_m": 4}]}
     kerb = {"name": "kerb", "shape": {"type": "box", "size_m": [8, 8, 0.15]}, "poses": [{"x_m": -10}]}
     made = instant(scenario(FLOOR, {**deck, "ground": True}, {**kerb, "ground": True}))
-    found = ground_under(made, np.array([[10.0, 0], [-10, 0], [0, 20], [50, 0]]))
+    found = compute_ground_heights_m(made, np.array([[10.0, 0], [-10, 0], [0, 20], [50, 0]]))
     np.testing.assert_allclose(found, [0, 0.15, 0, np.nan], atol=1e-4)
 
 
 def test_a_slope_that_the_vehicle_stands_on_changes_nothing():
     rig, pole, raster = Rig.load("front_roof_32"), Target.load("pole"), Raster((4.0, 12.0), (-2.0, 2.0), 1.0)
-    flat = survey(rig, scenario(FLOOR), pole, raster, steps=2)
+    flat = measure_target_visibility(rig, scenario(FLOOR), pole, raster, num_frames=2)
     tilted = {**FLOOR, "poses": [{"pitch_deg": 5.0}]}
-    along = survey(rig, scenario(tilted, pitch_deg=5.0), pole, raster, steps=2)
+    along = measure_target_visibility(rig, scenario(tilted, pitch_deg=5.0), pole, raster, num_frames=2)
     np.testing.assert_allclose(along.points, flat.points, atol=1.0)
     assert (flat.points > 10).any()
     # The vehicle level above a floor that falls away: the pole is lower down, and other rays meet it.
-    below = survey(rig, scenario(tilted), pole, raster, steps=2)
+    below = measure_target_visibility(rig, scenario(tilted), pole, raster, num_frames=2)
     assert np.abs(below.points - flat.points).max() > 3
 
 
 def test_where_there_is_no_ground_there_is_no_target():
     rig, pole = Rig.load("front_roof_32"), Target.load("pole")
-    found = survey(rig, scenario(FLOOR), pole, Raster((26.0, 34.0), (-2.0, 2.0), 1.0))
+    found = measure_target_visibility(rig, scenario(FLOOR), pole, Raster((26.0, 34.0), (-2.0, 2.0), 1.0))
     beyond = found.raster.positions_m[:, 0].reshape(found.raster.shape) > 30
     assert (found.state[beyond] == OUTSIDE).all()
     assert (found.state[~beyond] == FREE).all()

@@ -12,8 +12,8 @@ from torchcover.data import SimulatedFrames
 from torchcover.geometry import build_transform
 from torchcover.simulation import PaperReference
 from torchcover.simulation.regions_of_interest import build_near_field
-from torchcover.targets import Probes, Raster, Target, counting, probing, survey
-from torchcover.targets.probing import Probe
+from torchcover.targets import NearFieldObserver, Raster, Target, counting, measure_target_visibility, probing
+from torchcover.targets.probing import NearFieldTarget
 
 from .worlds import WALL, drive, lidar, rig, world
 
@@ -31,7 +31,7 @@ def simulated(scenario, steps=8, rigs=TOP, seed=0):
 
 
 def probed(frames, indices=None, body="pole", **budget):
-    probes = Probes(frames.simulator, [Target.load(body)], blocks=8, **({"every": 1} | budget))
+    probes = NearFieldObserver(frames.simulator, [Target.load(body)], num_blocks=8, **({"every": 1} | budget))
     for index in range(len(frames)) if indices is None else indices:
         probes.update(frames[index])
     return probes
@@ -46,17 +46,19 @@ def numbers(probes, region, rig="small"):
 def test_the_numbers_are_those_of_targets_over_the_same_cells(name, bodies, monkeypatch):
     scenario, target = world(*bodies), Target.load(name)
     for module in (counting, probing):  # its surface is looked at from random places
-        monkeypatch.setattr(module, "pose_in_shell", lambda *_: build_transform(np.eye(3), np.array([0.3, 0.2, 1.3])))
-    found = survey(TOP, scenario, target, Raster.around(scenario.compute_ego_box(), 3.0))
+        monkeypatch.setattr(
+            module, "sample_reference_pose", lambda *_: build_transform(np.eye(3), np.array([0.3, 0.2, 1.3]))
+        )
+    found = measure_target_visibility(TOP, scenario, target, Raster.from_vehicle(scenario.compute_ego_box(), 3.0))
     probes = probed(simulated(scenario, steps=1), body=name, places=ALL)
     x, y = (torch.from_numpy(each) for each in found.raster.positions_m.T)
     for number, region in enumerate(probes.regions):
         cells = region.mask_points(x, y).numpy().reshape(found.raster.shape)
-        free = cells & found.free
+        free = cells & found.free_mask
         visible_m2 = found.visible_m2[free]
-        expected = [cells.sum(), free.sum(), found.seen[free].sum(), visible_m2.sum()]
+        expected = [cells.sum(), free.sum(), found.detected_share[free].sum(), visible_m2.sum()]
         assert probes.compute()[0, 0, number, :-1].tolist() == pytest.approx(expected)
-        share = np.nansum(found.share[free] * visible_m2) / visible_m2.sum()
+        share = np.nansum(found.surface_share[free] * visible_m2) / visible_m2.sum()
         assert numbers(probes, number)[1].value == pytest.approx(share)
     assert 0.1 < numbers(probes, LEFT)[0].value < 1
 
@@ -64,14 +66,15 @@ def test_the_numbers_are_those_of_targets_over_the_same_cells(name, bodies, monk
 def test_every_place_of_a_region_is_as_likely_as_any_other_and_so_the_budget_moves_no_number():
     vehicle = world().compute_ego_box()
     grid = BevGrid((-6.0, 6.0), (-5.0, 5.0), 1.0)
-    pole = Probe.of(Target.load("pole"), vehicle, build_near_field(vehicle.outline_m), grid)
+    pole = NearFieldTarget.from_target(Target.load("pole"), vehicle, build_near_field(vehicle.outline_m), grid)
     generator = np.random.default_rng(0)
     for places, draws in ((1, 1200), (3, 400)):
         counts = np.bincount(
-            np.concatenate([pole.some(places, generator) for _ in range(draws)]), minlength=len(pole.region)
+            np.concatenate([pole.sample_positions(places, generator) for _ in range(draws)]),
+            minlength=len(pole.region_indices),
         )
         for region in range(4):
-            own = counts[pole.region == region]
+            own = counts[pole.region_indices == region]
             assert own.sum() == draws * places
             # Pearson's chi-square of as many degrees of freedom, less one.
             excess = ((own - own.mean()) ** 2 / own.mean()).sum() / len(own)
@@ -101,17 +104,17 @@ def test_parts_and_other_processes_add_up_to_the_whole(tmp_path):
     first.merge_state(pickle.loads(pickle.dumps(parts[1])))
     assert all(torch.equal(one, first.metric_state[name]) for name, one in whole.metric_state.items())
     assert (int(whole.num_frames), int(whole.compute()[..., TRIED].sum())) == (5, 5 * 4 * 2)
-    again = Probes(frames.simulator, [Target.load("pole")], blocks=8)
+    again = NearFieldObserver(frames.simulator, [Target.load("pole")], num_blocks=8)
     again.load_state_dict(whole.state_dict())
     assert torch.equal(again.compute(), whole.compute())
-    other = Probes(frames.simulator, [Target.load("child")], blocks=8)
+    other = NearFieldObserver(frames.simulator, [Target.load("child")], num_blocks=8)
     with pytest.raises(ValueError, match="different bodies"):
         other.merge_state(whole)
 
 
 def test_where_nothing_is_free_the_number_is_unknown_with_a_count():
     probes = probed(simulated(world(BLOCK), steps=8), body="child", places=3)
-    left, right = probes.seen_by("small").summarize()[LEFT:]
+    left, right = probes.get_target_sums("small").summarize()[LEFT:]
     assert (left.num_cells, left.observed_cells, left.visible_m2) == (24, 0, pytest.approx(np.nan, nan_ok=True))
     assert all(np.isnan([one.value, one.error]).all() and one.count == 0 for one in left.numbers.values())
     assert 0 < right.observed_cells == next(iter(right.numbers.values())).count
@@ -122,7 +125,7 @@ def test_rays_that_were_cast_for_the_clouds_end_where_they_are_cast_again(tmp_pa
     ego = {"shape": {"type": "box", "size_m": [4, 2, 1]}, "trajectory": str(path)}
     frames = simulated(world(WALL, ego=ego), rigs=rig(lidar(mount={"z_m": 1.1})))
     frame = frames[3]
-    probes = Probes(frames.simulator, [Target.load("pole")], every=1)
+    probes = NearFieldObserver(frames.simulator, [Target.load("pole")], frame_stride=1)
     kept = probes.compute_sums(frame)
     stage, instant = frames.simulator.prepare_frame(3)
     (mounted,) = stage.sensors_by_rig["small"]

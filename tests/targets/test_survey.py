@@ -9,9 +9,9 @@ from torchcover.geometry import BoundingBox, build_transform
 from torchcover.simulation import PaperReference, Scenario, Simulator
 from torchcover.simulation.bodies import merge_meshes
 from torchcover.simulation.shapes import Box
-from torchcover.targets import STATES, Raster, Target, counting, survey
-from torchcover.targets.placing import yaws
-from torchcover.targets.surface import SAMPLES, Surface
+from torchcover.targets import STATES, Raster, Target, counting, measure_target_visibility
+from torchcover.targets.placing import compute_yaws_rad
+from torchcover.targets.surface import SAMPLES, TargetSurface
 
 from .worlds import EGO, RASTER, WALL, drive, lidar, on_target, rig, world
 
@@ -41,8 +41,10 @@ def with_target(scenario, name, x_m, y_m, yaw_rad):
 def test_points_are_those_of_a_simulation_with_the_target_in_the_world(name, heading):
     target, scenario = Target.load(name), world(WALL)
     sensors = rig(lidar(), lidar("corner", mount={"x_m": 2.1, "y_m": 1.1, "z_m": 0.6, "yaw_deg": 45}), CAMERA)
-    seen = survey(sensors, scenario, target, RASTER, heading=heading)
-    yaw = yaws(heading, target.solid.bounding_box, seen.vehicle, RASTER.positions_m).reshape(RASTER.shape)
+    seen = measure_target_visibility(sensors, scenario, target, RASTER, heading=heading)
+    yaw = compute_yaws_rad(heading, target.solid.bounding_box, seen.vehicle_box, RASTER.positions_m).reshape(
+        RASTER.shape
+    )
     compared = 0
     for row, column in [(0, 0), (4, 9), (4, 12), (6, 12), (5, 13), (8, 7), (2, 10), (5, 2)]:
         assert seen.state[row, column] == FREE
@@ -54,7 +56,7 @@ def test_points_are_those_of_a_simulation_with_the_target_in_the_world(name, hea
             for sensor, scan in zip(sensors.sensors, scans, strict=True)
         ]
         assert seen.sensor_points[:, row, column].tolist() == counts
-        assert seen.sensors[row, column] == sum(count >= 5 for count in counts)
+        assert seen.detecting_sensors[row, column] == sum(count >= 5 for count in counts)
         compared += sum(count > 0 for count in counts)
     assert compared > 8
 
@@ -65,8 +67,10 @@ def test_a_radars_points_are_those_of_its_cells_with_the_target_in_the_world(nam
     target, sensors = Target.load(name), rig(RADAR)
     behind = {"name": "w", "shape": {"type": "box", "size_m": [0.2, 8, 3]}, "poses": [{"x_m": 5.4}]}
     scenario = world(behind)
-    seen = survey(sensors, scenario, target, Raster((2.5, 5.5), (-2.0, 2.0), 0.5), heading=0.0)
-    rays = survey(rig({**RADAR, "azimuth_cell_deg": 1.0, "range_cell_m": 0.01}), scenario, target, seen.raster)
+    seen = measure_target_visibility(sensors, scenario, target, Raster((2.5, 5.5), (-2.0, 2.0), 0.5), heading=0.0)
+    rays = measure_target_visibility(
+        rig({**RADAR, "azimuth_cell_deg": 1.0, "range_cell_m": 0.01}), scenario, target, seen.raster
+    )
     counts = []
     for row, column in zip(*np.nonzero(seen.state == FREE), strict=True):
         place = seen.x_m[column], seen.y_m[row], 0.0
@@ -84,7 +88,10 @@ def test_a_radars_cell_gives_its_point_to_what_fills_it():
     wall = {"name": "w", "shape": {"type": "box", "size_m": [0.2, 8, 6]}, "poses": [{"x_m": 5.9}]}
     behind = {**wall, "poses": [{"x_m": 6.9}]}
     raster = Raster((5.0, 6.0), (-0.5, 0.5), 1.0)
-    merged, apart = (survey(rig({**RADAR, **cell}), world(one), Target.load("pole"), raster) for one in (wall, behind))
+    merged, apart = (
+        measure_target_visibility(rig({**RADAR, **cell}), world(one), Target.load("pole"), raster)
+        for one in (wall, behind)
+    )
     assert (merged.state[0, 0], apart.state[0, 0]) == (FREE, FREE)
     assert (merged.points[0, 0], apart.points[0, 0]) == (0, 1)
 
@@ -98,7 +105,7 @@ def test_points_are_the_mean_over_the_steps_of_a_world_that_moves(tmp_path):
     }  # fmt: skip
     scenario = world(WALL, ego=ego, actors=[passing], duration_s=1.0, time_step_s=0.5)
     target, sensors = Target.load("adult"), rig(lidar("low", mount={"x_m": 2.1, "z_m": 1.3}))
-    seen = survey(sensors, scenario, target, RASTER, steps=3, heading=0.0)
+    seen = measure_target_visibility(sensors, scenario, target, RASTER, num_frames=3, heading=0.0)
     # In the last of these places the other car stands at first.
     for row, column, free in [(6, 11, (0, 1, 2)), (7, 5, (0, 1, 2)), (2, 12, (0, 1, 2)), (8, 7, (1, 2))]:
         counts = []
@@ -107,46 +114,54 @@ def test_points_are_the_mean_over_the_steps_of_a_world_that_moves(tmp_path):
             step = Simulator(with_target(scenario, target.name, *pose), {"r": sensors}, REFERENCE).simulate_frame(index)
             counts.append(on_target(step.clouds["r"], target, seen.x_m[column], seen.y_m[row], 0.0))
         assert seen.points[row, column] == pytest.approx(np.mean(counts))
-        assert seen.seen[row, column] == pytest.approx(np.mean(np.array(counts) >= 5))
-        assert seen.least_points[row, column] == min(counts)
+        assert seen.detected_share[row, column] == pytest.approx(np.mean(np.array(counts) >= 5))
+        assert seen.min_points[row, column] == min(counts)
     # The car is at (0, 3.5), then at (2, 3.5) and (4, 3.5) as the ego sees it: each cell is taken once at most.
-    assert seen.steps[8].tolist() == [3, 3, 3, 3, 3, 3, 2, 2, 2, 2, 2, 2, 3, 3]
+    assert seen.free_frames[8].tolist() == [3, 3, 3, 3, 3, 3, 2, 2, 2, 2, 2, 2, 3, 3]
     assert (seen.state[8] == FREE).all()
 
 
 def test_a_place_does_not_depend_on_the_raster_the_chunks_or_the_threads(monkeypatch):
     target, sensors = Target.load("dog"), rig(lidar(dropout=0.2, range_noise_m=0.05))
-    whole = survey(sensors, world(WALL), target, RASTER, steps=2, seed=3)
-    part = survey(sensors, world(WALL), target, Raster((2.0, 7.0), (-2.0, 3.0), 1.0), steps=2, seed=3)
-    for name in ("sensor_points", "sensors", "seen", "least_points", "share", "state", "visible_m2"):
+    whole = measure_target_visibility(sensors, world(WALL), target, RASTER, num_frames=2, seed=3)
+    part = measure_target_visibility(
+        sensors, world(WALL), target, Raster((2.0, 7.0), (-2.0, 3.0), 1.0), num_frames=2, seed=3
+    )
+    for name in ("sensor_points", "sensors", "seen", "min_points", "share", "state", "visible_m2"):
         np.testing.assert_array_equal(getattr(whole, name)[..., 3:8, 9:], getattr(part, name))
     monkeypatch.setattr(counting, "CHUNK", 7)
     threads = torch.get_num_threads()
     torch.set_num_threads(2)
-    again = survey(sensors, world(WALL), target, RASTER, steps=2, seed=3)
+    again = measure_target_visibility(sensors, world(WALL), target, RASTER, num_frames=2, seed=3)
     torch.set_num_threads(threads)
     np.testing.assert_array_equal(again.points, whole.points)
-    np.testing.assert_array_equal(again.share, whole.share)
+    np.testing.assert_array_equal(again.surface_share, whole.surface_share)
 
 
 def test_rays_that_drop_out_are_missing_and_noise_moves_points_only():
     target, raster = Target.load("adult"), Raster((2.0, 6.0), (-2.0, 2.0), 1.0)
-    exact = survey(rig(), world(), target, raster).points.sum()
-    noisy = survey(rig(lidar(range_noise_m=0.02)), world(), target, raster, steps=2).points.sum()
+    exact = measure_target_visibility(rig(), world(), target, raster).points.sum()
+    noisy = measure_target_visibility(
+        rig(lidar(range_noise_m=0.02)), world(), target, raster, num_frames=2
+    ).points.sum()
     assert noisy == exact > 200
-    thinned = survey(rig(lidar(dropout=0.25)), world(), target, raster, steps=32).points.sum()
+    thinned = measure_target_visibility(rig(lidar(dropout=0.25)), world(), target, raster, num_frames=32).points.sum()
     # A standard error is 1 %.
     assert thinned == pytest.approx(0.75 * exact, rel=0.04)
-    cells = survey(rig(RADAR), world(), target, raster).points.sum()
-    thinned = survey(rig({**RADAR, "dropout": 0.25, "range_noise_m": 0.01}), world(), target, raster, steps=64).points
+    cells = measure_target_visibility(rig(RADAR), world(), target, raster).points.sum()
+    thinned = measure_target_visibility(
+        rig({**RADAR, "dropout": 0.25, "range_noise_m": 0.01}), world(), target, raster, num_frames=64
+    ).points
     assert thinned.sum() == pytest.approx(0.75 * cells, rel=0.06)
-    assert survey(rig(lidar(dropout=1.0)), world(), target, raster).share.max() == 0.0
+    assert measure_target_visibility(rig(lidar(dropout=1.0)), world(), target, raster).surface_share.max() == 0.0
 
 
 def test_the_narrow_side_gets_fewer_points_than_the_wide_one():
     target = Target.load("cyclist")
-    narrow, wide = (survey(rig(), world(), target, RASTER, heading=heading) for heading in ("narrow", "wide"))
-    both = narrow.free & wide.free & (narrow.distance_m > 2)
+    narrow, wide = (
+        measure_target_visibility(rig(), world(), target, RASTER, heading=heading) for heading in ("narrow", "wide")
+    )
+    both = narrow.free_mask & wide.free_mask & (narrow.distance_m > 2)
     assert narrow.points[both].sum() < 0.7 * wide.points[both].sum()
 
 
@@ -155,27 +170,27 @@ def test_a_side_is_turned_to_the_nearest_point_of_the_vehicle(heading, yaw_deg):
     """Of a body that is longer than wide; the vehicle is to its left, in front of it, and behind it."""
     car, dog = BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5)), BoundingBox((-0.5, -0.1, 0.0), (0.5, 0.1, 0.7))
     places = np.array([[1.5, -3.0], [-3.0, 0.5], [4.0, 0.0]])
-    turned = np.rad2deg(yaws(heading, dog, car, places))
+    turned = np.rad2deg(compute_yaws_rad(heading, dog, car, places))
     np.testing.assert_allclose(np.cos(np.deg2rad(turned - yaw_deg)), 1.0, atol=1e-12)
 
 
 def test_what_hides_a_target_hides_its_points_and_what_stands_there_takes_its_room():
     building = {"name": "b", "shape": {"type": "box", "size_m": [4, 4, 6]}, "poses": [{"x_m": 5.0, "y_m": 3.0}]}
-    seen = survey(rig(), world(building), Target.load("child"), RASTER)
+    seen = measure_target_visibility(rig(), world(building), Target.load("child"), RASTER)
     names = np.array(STATES)[seen.state]
     assert (names[3:7, 5:9] == "occupied").sum() == 8
     assert (names[4:6, 5:9] == "occupied").all()
     # Inside the building, and through its walls.
     assert (names[6:, 10:] == "outside").all()
     assert (names[:4] == "free").all()
-    for array in (seen.points, seen.sensors, seen.seen, seen.share, seen.visible_m2):
+    for array in (seen.points, seen.detecting_sensors, seen.detected_share, seen.surface_share, seen.visible_m2):
         np.testing.assert_array_equal(np.isnan(array), seen.state != FREE)
     assert seen.counts == {"free": 116, "occupied": 8, "outside": 16, "share_unknown": 0}
-    assert (seen.steps == (seen.state == FREE)).all()
+    assert (seen.free_frames == (seen.state == FREE)).all()
 
 
 def test_a_raster_within_the_vehicle_is_occupied_everywhere():
-    seen = survey(rig(), world(), Target.load("pole"), Raster((-1.0, 1.0), (-0.5, 0.5), 0.5))
+    seen = measure_target_visibility(rig(), world(), Target.load("pole"), Raster((-1.0, 1.0), (-0.5, 0.5), 0.5))
     assert (seen.state == OCCUPIED).all()
     assert np.isnan(seen.points).all()
 
@@ -183,9 +198,9 @@ def test_a_raster_within_the_vehicle_is_occupied_everywhere():
 def test_a_target_that_no_random_place_sees_has_an_unknown_share():
     """A child behind a high wall all along."""
     wall = {"name": "w", "shape": {"type": "box", "size_m": [0.2, 60, 9]}, "poses": [{"x_m": 4.0}]}
-    seen = survey(rig(), world(wall), Target.load("child"), Raster((2.5, 5.5), (0.0, 1.0), 1.0))
-    assert 0 < seen.share[0, 0] <= 1
-    assert np.isnan(seen.share[0, 2])
+    seen = measure_target_visibility(rig(), world(wall), Target.load("child"), Raster((2.5, 5.5), (0.0, 1.0), 1.0))
+    assert 0 < seen.surface_share[0, 0] <= 1
+    assert np.isnan(seen.surface_share[0, 2])
     assert (seen.points[0, 2], seen.visible_m2[0, 2]) == (0.0, 0.0)
     assert seen.counts["share_unknown"] == 1
 
@@ -196,22 +211,26 @@ def test_the_share_is_that_of_the_surface_which_is_near_a_measured_point():
     level = lidar(mount={"z_m": 1.0}, channels=1, vertical_fov_deg=[0, 0], columns=36000)
     ego = {"shape": {"type": "box", "size_m": [4.0, 2.0, 0.5]}}
     raster = Raster((4.0, 12.0), (-4.0, 4.0), 8.0)
-    seen = survey(rig(level), world(ego=ego), Target("wall", mesh), raster, threshold_m=0.3, heading="wide")
-    assert seen.share[0, 0] == pytest.approx(0.3, abs=2.5 / np.sqrt(SAMPLES) * 0.3)
+    seen = measure_target_visibility(
+        rig(level), world(ego=ego), Target("wall", mesh), raster, threshold_m=0.3, heading="wide"
+    )
+    assert seen.surface_share[0, 0] == pytest.approx(0.3, abs=2.5 / np.sqrt(SAMPLES) * 0.3)
     assert seen.visible_m2[0, 0] == pytest.approx(8.0, rel=0.15)  # the ego hides its foot from low places
-    all_of_it = survey(rig(level), world(ego=ego), Target("wall", mesh), raster, threshold_m=5.0, heading="wide")
-    assert all_of_it.share[0, 0] == 1.0
+    all_of_it = measure_target_visibility(
+        rig(level), world(ego=ego), Target("wall", mesh), raster, threshold_m=5.0, heading="wide"
+    )
+    assert all_of_it.surface_share[0, 0] == 1.0
 
 
 def test_the_surface_is_spread_by_area_and_leaves_out_what_is_inside():
     """A box with another one inside it has the surface of the outer one; near agrees with distances."""
     target = Target.load("adult")
-    surface = Surface.of(target)
+    surface = TargetSurface.from_target(target)
     corners = target.mesh.vertices_m[target.mesh.faces]
     whole = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
-    assert 0.6 * whole < surface.m2_each * SAMPLES < 0.97 * whole
+    assert 0.6 * whole < surface.sample_area_m2 * SAMPLES < 0.97 * whole
     hits = np.random.default_rng(0).normal(size=(500, 3))
-    near = np.unpackbits(surface.near(hits, 0.4), axis=1).astype(bool)
+    near = np.unpackbits(surface.find_nearby_samples(hits, 0.4), axis=1).astype(bool)
     distance = np.linalg.norm(hits[:, None] - surface.points_m, axis=2)
     np.testing.assert_array_equal(near, distance <= 0.4)
 
@@ -223,7 +242,9 @@ def test_a_target_hides_its_own_rear():
         for x in (0.1, -0.1)
     )
     raster = Raster((11.0, 13.0), (-1.0, 1.0), 2.0)
-    seen = survey(rig(), world(), Target("plates", merge_meshes([front, rear])), raster, heading="wide")
+    seen = measure_target_visibility(
+        rig(), world(), Target("plates", merge_meshes([front, rear])), raster, heading="wide"
+    )
     assert seen.visible_m2[0, 0] == pytest.approx(1.0, abs=0.35)
 
 
@@ -236,9 +257,9 @@ def test_a_target_keeps_the_height_of_its_file_and_what_reaches_below_the_ground
     (tmp_path / "bar.yaml").write_text(f"name: bar\nparts: [{{name: b, shape: {shape}, poses: [{pose}]}}]\n")
     scanner = lidar(mount={"x_m": 2.01, "z_m": 0.0925}, channels=1, vertical_fov_deg=[0, 0], columns=36_000)
     target, raster = Target.load(tmp_path / "bar.yaml"), Raster((3.5, 5.5), (-0.5, 0.5), 1.0)
-    seen = survey(rig(scanner), world(), target, raster, heading=0.0)
+    seen = measure_target_visibility(rig(scanner), world(), target, raster, heading=0.0)
     expected = 2 * np.rad2deg(np.arctan2(0.1, 5.0 - 0.01 - 2.01)) / 0.01 if hit else 0.0
     assert seen.points[0, 1] == pytest.approx(expected, abs=1.0)
     assert seen.target_bottom_m == target.bottom_m == pytest.approx(max(low_m, 0.0))
-    assert f"{max(low_m, 0):.2f} to {max(low_m, 0) + thick_m:.2f} m above the ground" in seen.target_words
+    assert f"{max(low_m, 0):.2f} to {max(low_m, 0) + thick_m:.2f} m above the ground" in seen.target_description
     assert (f", {low_m:.2f} m above the ground, is seen" in summarize_target_maps({"r": seen})[0]) == (low_m > 0)

@@ -418,7 +418,7 @@ def encounter(
     if animation is not None:
         told = {name: settings.get(name) for name in ("vehicle", "sensor_model")}
         write_animation(animation, plot_encounter_animation((rigs or [])[0], found, **told), frames_per_s=10)
-    print_page_tables(found.tables())
+    print_page_tables(found.build_tables())
     print_files(written, out, Terminal())
     print_verdict(summarize_encounters(found), Terminal())
 

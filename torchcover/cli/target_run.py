@@ -86,11 +86,11 @@ def parse_heading(text: str) -> Heading:
 def _print(seen: TargetMap) -> None:
     console = Terminal()
     console.print(
-        f"{seen.rig} sees {seen.target} ({seen.target_words}), in {seen.scenario}, sensor model {seen.sensor_model}",
+        f"{seen.rig} sees {seen.target} ({seen.target_description}), in {seen.scenario}, sensor model {seen.sensor_model}",
         markup=False,
         soft_wrap=True,
     )
-    worst = build_positions_table(seen.worst(), "The places with the fewest points, 1 m apart")
+    worst = build_positions_table(seen.find_worst_positions(), "The places with the fewest points, 1 m apart")
     print_page_tables([build_sides_table(seen), worst])
     if unknown := seen.counts["share_unknown"]:
         console.print(f"{unknown:,} places show no surface to any random place: their share is unknown.")

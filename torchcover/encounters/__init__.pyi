@@ -1,11 +1,11 @@
 from .criterion import Criterion as Criterion
 from .encounter import Encounter as Encounter
+from .encounter import EncounteredRoadUser as EncounteredRoadUser
+from .encounter import EncounterPath as EncounterPath
 from .encounter import EncounterSet as EncounterSet
 from .encounter import Obstacle as Obstacle
-from .encounter import Other as Other
-from .encounter import Way as Way
+from .result import EncounterResults as EncounterResults
 from .result import EncounterRow as EncounterRow
-from .result import Sightings as Sightings
-from .sighting import Sighting as Sighting
-from .sighting import sight_encounter as sight_encounter
-from .staging import Staged as Staged
+from .sighting import EncounterDetection as EncounterDetection
+from .sighting import detect_encounter as detect_encounter
+from .staging import StagedEncounter as StagedEncounter

@@ -18,10 +18,10 @@ class Criterion:
 
     points: Annotated[int, "Points that are enough, of all LiDARs together; of a radar one is."] = 5
     pixels: Annotated[int, "Pixels of the full image that are enough, of a camera alone."] = 200
-    looks: Annotated[int, "In so many looks in a row."] = 3
+    consecutive_scans: Annotated[int, "In so many looks in a row."] = 3
     deceleration_mps2: Annotated[float, "Of the brakes, in m/s2."] = 9.0
     latency_s: Annotated[float, "Seconds from the last of these looks to the brakes."] = 0.5
-    within_s: Annotated[float, "In traffic: who comes within this time to collision, in seconds, is met."] = 4.0
+    max_ttc_s: Annotated[float, "In traffic: who comes within this time to collision, in seconds, is met."] = 4.0
 
     def __post_init__(self) -> None:
         for name in ("points", "pixels", "looks"):
@@ -35,7 +35,7 @@ class Criterion:
                 f"latency_s: 0 to {MOST_LATENCY_S:g} seconds are needed; got {self.latency_s:g}, is that milliseconds?"
             )
 
-    def needed_s(self, speed_mps: float, towards_mps: float = 0.0) -> float:
+    def compute_braking_time_s(self, speed_mps: float, approach_speed_mps: float = 0.0) -> float:
         """The time to collision at which braking still prevents it; only the ego brakes, the other goes on.
 
         After the latency, an ego of speed v that brakes with a stands v / a later, v^2 / (2 a) farther on. Who comes
@@ -45,21 +45,21 @@ class Criterion:
 
         Args:
             speed_mps: Of the ego, along its way.
-            towards_mps: Of the other, along the same way towards the ego; negative if it drives ahead.
+            approach_speed_mps: Of the other, along the same way towards the ego; negative if it drives ahead.
 
         Example:
             >>> [round(Criterion().needed_s(50 / 3.6, towards_kmh / 3.6), 2) for towards_kmh in (0, 50, -20)]
             [1.27, 1.66, 0.96]
         """
-        closing_mps, towards = speed_mps + towards_mps, towards_mps > 0
-        mps = speed_mps * (speed_mps / 2 + towards_mps) / closing_mps if towards else max(closing_mps, 0.0) / 2
+        closing_mps, towards = speed_mps + approach_speed_mps, approach_speed_mps > 0
+        mps = speed_mps * (speed_mps / 2 + approach_speed_mps) / closing_mps if towards else max(closing_mps, 0.0) / 2
         return self.latency_s + mps / self.deceleration_mps2
 
     @property
-    def words(self) -> str:
+    def description(self) -> str:
         """It, for below a table."""
         return (
             f"Detected: {self.points} points of LiDARs, {self.pixels} pixels of a camera, or a point of a radar, in "
-            f"{self.looks} looks in a row. Needed: to stop with {self.deceleration_mps2:g} m/s2, {self.latency_s:g} s "
+            f"{self.consecutive_scans} looks in a row. Needed: to stop with {self.deceleration_mps2:g} m/s2, {self.latency_s:g} s "
             "after that."
         )

@@ -28,8 +28,8 @@ FASTEST_KMH = 500.0
 # The key that tables have a column for; values of others become part of the name.
 SPEED = ("ego", "speed_kmh")
 
-Place = tuple[str | int, ...]
-Speed = Annotated[float, Field(ge=-FASTEST_KMH, le=FASTEST_KMH)]
+KeyPath = tuple[str | int, ...]
+SpeedKmh = Annotated[float, Field(ge=-FASTEST_KMH, le=FASTEST_KMH)]
 
 
 def _body(content: Any) -> Any:  # noqa: ANN401  (whatever stood in the file)
@@ -50,10 +50,10 @@ def _known(shape: Shape) -> Shape:
     return shape
 
 
-AnyBody = Annotated[Shape, BeforeValidator(_body), AfterValidator(_known)]
+BodyShape = Annotated[Shape, BeforeValidator(_body), AfterValidator(_known)]
 
 
-class Way(Document):
+class EncounterPath(Document):
     """How somebody comes to the place of the meeting: straight, or around a bend and then straight.
 
     Args:
@@ -62,7 +62,7 @@ class Way(Document):
         turn_deg: How much of the bend lies before the meeting, and as much behind it; beyond it the way is straight.
     """
 
-    speed_kmh: Speed
+    speed_kmh: SpeedKmh
     radius_m: float | None = None
     turn_deg: Annotated[float, Field(gt=0.0, le=180.0)] = 90.0
 
@@ -78,20 +78,20 @@ class Way(Document):
         return self.speed_kmh / 3.6
 
 
-class Other(Way):
+class EncounteredRoadUser(EncounterPath):
     """Who is met.
 
     Args:
         body: A built-in vehicle, the YAML file of one, or a shape; people are built-in vehicles, too.
         yaw_deg: Where it heads at the meeting, from the ego's heading to the left: 90 crosses from the right.
-        from_m: How long its way to the meeting is; before, it is not there. From the beginning if not given.
-        at_width: Where its middle is at the meeting, as a share of the ego's width, from its right side.
+        approach_distance_m: How long its way to the meeting is; before, it is not there. From the beginning if not given.
+        impact_location: Where its middle is at the meeting, as a share of the ego's width, from its right side.
     """
 
-    body: AnyBody
+    body: BodyShape
     yaw_deg: float = 90.0
-    from_m: PositiveFloat | None = None
-    at_width: float = 0.5
+    approach_distance_m: PositiveFloat | None = None
+    impact_location: float = 0.5
 
 
 class Obstacle(Document):
@@ -100,17 +100,17 @@ class Obstacle(Document):
     Args:
         body: As of `Other`.
         side: Of the ego's way, straight on from the meeting.
-        where: Before the meeting, or beyond it.
-        beside_m: Between its side and that of the ego.
-        gap_m: Between its end and the outline of the other at the meeting, or the end of the one before on that side.
+        position: Before the meeting, or beyond it.
+        lateral_gap_m: Between its side and that of the ego.
+        longitudinal_gap_m: Between its end and the outline of the other at the meeting, or the end of the one before on that side.
         yaw_deg: Where it heads, from the ego's heading to the left.
     """
 
-    body: AnyBody
+    body: BodyShape
     side: Literal["left", "right"] = "right"
-    where: Literal["before", "beyond"] = "before"
-    beside_m: float = 1.0
-    gap_m: float = 1.0
+    position: Literal["before", "beyond"] = "before"
+    lateral_gap_m: float = 1.0
+    longitudinal_gap_m: float = 1.0
     yaw_deg: float = 0.0
 
 
@@ -120,24 +120,24 @@ class Encounter(Document):
     Args:
         name: What tables call it.
         ego: The vehicle that carries the rig.
-        other: Who is met.
+        road_user: Who is met.
         obstacles: What hides it.
         weather: Built in, or a YAML file; clear if not given.
-        seconds: How long before the meeting it begins, unless the other comes later.
-        speed_is_swept: Whether tables have a row for this speed of the ego; else it was drawn, among others.
+        max_lead_time_s: How long before the meeting it begins, unless the other comes later.
+        is_speed_swept: Whether tables have a row for this speed of the ego; else it was drawn, among others.
     """
 
     name: str
-    ego: Way
-    other: Other
+    ego: EncounterPath
+    road_user: EncounteredRoadUser
     obstacles: tuple[Obstacle, ...] = ()
     weather: Annotated[Weather, build_name_validator(Weather)] = CLEAR
-    seconds: Annotated[float, Field(gt=0.0, le=60.0)] = 6.0
-    speed_is_swept: bool = True
+    max_lead_time_s: Annotated[float, Field(gt=0.0, le=60.0)] = 6.0
+    is_speed_swept: bool = True
 
     @model_validator(mode="after")
     def _check_speeds(self) -> Self:
-        if self.ego.speed_kmh == 0 and self.other.speed_kmh == 0:
+        if self.ego.speed_kmh == 0 and self.road_user.speed_kmh == 0:
             raise ValueError("nobody moves: ego.speed_kmh and other.speed_kmh are 0")
         return self
 
@@ -147,12 +147,12 @@ class Encounter(Document):
         return self.ego.speed_kmh
 
     @property
-    def words(self) -> str:
+    def description(self) -> str:
         """Which one of its set."""
         return f"encounter {self.name!r} at {self.speed_kmh:g} km/h"
 
     @property
-    def towards_mps(self) -> float:
+    def approach_speed_mps(self) -> float:
         """How fast the other comes towards the ego, along the ego's way; negative if it drives ahead.
 
         Example:
@@ -160,26 +160,28 @@ class Encounter(Document):
             >>> round(Encounter.model_validate({"name": "oncoming", **ways}).towards_mps, 9)
             15.0
         """
-        along_mps = self.other.speed_mps * math.cos(math.radians(self.other.yaw_deg))
+        along_mps = self.road_user.speed_mps * math.cos(math.radians(self.road_user.yaw_deg))
         return -math.copysign(1.0, self.ego.speed_mps) * along_mps
 
     @property
-    def before_s(self) -> float:
+    def lead_time_s(self) -> float:
         """How long before the meeting it begins."""
-        speed_mps, from_m = abs(self.other.speed_mps), self.other.from_m
-        return self.seconds if from_m is None or speed_mps == 0 else min(self.seconds, from_m / speed_mps)
+        speed_mps, from_m = abs(self.road_user.speed_mps), self.road_user.approach_distance_m
+        return (
+            self.max_lead_time_s if from_m is None or speed_mps == 0 else min(self.max_lead_time_s, from_m / speed_mps)
+        )
 
 
 class EncounterSet(BuiltInDocument):
     """Encounters of some families. In a family any value may be swept, as a list, or drawn, as `{from: 1.0, to: 1.4}`.
 
-    All lists are combined with each other, and each combination with the same `draws` of what is drawn: evenly from
+    All lists are combined with each other, and each combination with the same `num_samples` of what is drawn: evenly from
     each range (a Latin hypercube).
 
     Args:
         name: What tables call it.
         description: What it is, and where its numbers come from.
-        draws: How many are drawn.
+        num_samples: How many are drawn.
         seed: Of what is drawn.
         encounters: The families; in Python all of their encounters.
 
@@ -194,7 +196,7 @@ class EncounterSet(BuiltInDocument):
 
     name: str
     description: str = ""
-    draws: PositiveInt = 16
+    num_samples: PositiveInt = 16
     seed: Annotated[int, Field(ge=0)] = 0
     encounters: tuple[Encounter, ...] = Field(min_length=1)
 
@@ -212,7 +214,7 @@ class EncounterSet(BuiltInDocument):
                 found.append(family)
                 continue
             try:
-                for one in expanded(family, draws, np.random.default_rng([seed, number])):
+                for one in expand_family(family, draws, np.random.default_rng([seed, number])):
                     found.append(Encounter.model_validate(one, context=info.context))
                     name = found[-1].name
                     if first.setdefault(name, number) < number:
@@ -230,20 +232,20 @@ class EncounterSet(BuiltInDocument):
         return self
 
 
-def expanded(family: dict[str, Any], draws: int, generator: np.random.Generator) -> Iterator[dict[str, Any]]:
+def expand_family(family: dict[str, Any], num_samples: int, generator: np.random.Generator) -> Iterator[dict[str, Any]]:
     """The encounters of a family, each with one value where the family has a list or a range.
 
     ValueError: a list of none, a range that is none, or too many.
     """
-    swept, drawn = dict[Place, Any](), dict[Place, Any]()
+    swept, drawn = dict[KeyPath, Any](), dict[KeyPath, Any]()
     for place, value in _leaves(family, ()):
         if isinstance(value, dict):
-            drawn[place] = _between(place, value, draws, generator)
+            drawn[place] = _between(place, value, num_samples, generator)
         else:
             if len(value) == 0:
                 raise ValueError(f"{'.'.join(map(str, place))}: a list of values is empty")
             swept[place] = value
-    count = math.prod(map(len, swept.values())) * (draws if drawn else 1)
+    count = math.prod(map(len, swept.values())) * (num_samples if drawn else 1)
     if count > MOST:
         raise ValueError(f"{count:,} encounters of a family, of at most {MOST:,}; sweep or draw less")
     for combination in product(*swept.values()):
@@ -253,17 +255,17 @@ def expanded(family: dict[str, Any], draws: int, generator: np.random.Generator)
             for place, value in of_swept.items()
             if place != SPEED
         ]
-        for draw in range(draws if drawn else 1):
+        for draw in range(num_samples if drawn else 1):
             values = of_swept | {place: each[draw] for place, each in drawn.items()}
             one = _with(family, values, ())
             if words and isinstance(family.get("name"), str):
                 one["name"] = f"{family['name']}: {', '.join(words)}"
             if SPEED in drawn:
-                one["speed_is_swept"] = False
+                one["is_speed_swept"] = False
             yield one
 
 
-def _leaves(value: Any, place: Place) -> Iterator[tuple[Place, Any]]:  # noqa: ANN401
+def _leaves(value: Any, place: KeyPath) -> Iterator[tuple[KeyPath, Any]]:  # noqa: ANN401
     """What is swept or drawn; a shape has lists of its own."""
     if isinstance(value, dict):
         if set(value) == {"from", "to"}:
@@ -279,7 +281,7 @@ def _leaves(value: Any, place: Place) -> Iterator[tuple[Place, Any]]:  # noqa: A
             yield place, value
 
 
-def _between(place: Place, ends: dict[str, Any], draws: int, generator: np.random.Generator) -> list[float]:
+def _between(place: KeyPath, ends: dict[str, Any], draws: int, generator: np.random.Generator) -> list[float]:
     low, high = ends["from"], ends["to"]
     for end in (low, high):
         if isinstance(end, bool) or not isinstance(end, int | float) or not math.isfinite(end):
@@ -290,7 +292,7 @@ def _between(place: Place, ends: dict[str, Any], draws: int, generator: np.rando
     return [float(value) for value in low + evenly * (high - low)]
 
 
-def _with(value: Any, values: dict[Place, Any], place: Place) -> Any:  # noqa: ANN401
+def _with(value: Any, values: dict[KeyPath, Any], place: KeyPath) -> Any:  # noqa: ANN401
     if place in values:
         return values[place]
     if isinstance(value, dict):

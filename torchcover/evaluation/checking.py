@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from torchcover import __version__
 from torchcover.coverage import AGGREGATIONS, Coverage
-from torchcover.encounters import Staged
+from torchcover.encounters import StagedEncounter
 from torchcover.evaluation.encountering import evaluate_encounters
 from torchcover.evaluation.measuring import measure_coverage as measured_coverage
 from torchcover.evaluation.requirements import (
@@ -42,7 +42,7 @@ from torchcover.report import PageTable, TextCell, to_json_record
 from torchcover.simulation import Rig, Scenario, set_ego
 from torchcover.simulation.camera_sensor import CameraSensor
 from torchcover.simulation.moving import BodyGeometry
-from torchcover.targets import Target, survey_places
+from torchcover.targets import Target, measure_visibility_at_positions
 from torchcover.targets.survey import THRESHOLD_M
 
 Float64 = NDArray[np.float64]
@@ -209,9 +209,9 @@ def check(
 def _check_lasts(one: EncounterRequirement, world: Scenario) -> None:
     ego = BodyGeometry(world.build_ego_mesh())
     for case in one.encounters.encounters:
-        if one.ttc_s and one.ttc_s > (lasts_s := Staged(case, ego).contact_s):
+        if one.ttc_s and one.ttc_s > (lasts_s := StagedEncounter(case, ego).contact_time_s):
             raise ValueError(
-                f"ttc_s: {one.ttc_s:g} s are required, and {case.words} of {one.encounters.name!r} lasts "
+                f"ttc_s: {one.ttc_s:g} s are required, and {case.description} of {one.encounters.name!r} lasts "
                 f"{lasts_s:.2f} s; require less, or let it begin earlier (seconds, other.from_m)"
             )
 
@@ -258,13 +258,14 @@ def _of_encounters(one: EncounterRequirement, rig: Rig, **given: Any) -> dict[st
         [sensor.name for sensor in rig.sensors],
     )
     times_s, where = [], []
-    for case, each in zip(one.encounters.encounters, found.sightings, strict=True):
+    for case, each in zip(one.encounters.encounters, found.detections, strict=True):
         lost = {
-            f", without {name}": each.without_ttc_s[names.index(name)].min() for name in one.find_failing_sensors(names)
+            f", without {name}": each.ttc_without_sensor_s[names.index(name)].min()
+            for name in one.find_failing_sensors(names)
         }
         for words, ttc_s in ({"": each.ttc_s.min()} | lost).items():
-            times_s.append((ttc_s, each.needed_s, np.inf if ttc_s >= each.open_s else ttc_s))
-            where.append(f"{case.words}{words}")
+            times_s.append((ttc_s, each.braking_time_s, np.inf if ttc_s >= each.censoring_ttc_s else ttc_s))
+            where.append(f"{case.description}{words}")
     ttc_s, needed_s, high_s = np.array(times_s).T
     readings = {"ttc_s": Readings(ttc_s, ttc_s, high_s, where)}
     return readings | {"spare_s": Readings(ttc_s - needed_s, ttc_s - needed_s, high_s - needed_s, where)}
@@ -283,21 +284,21 @@ def _of_target(
         "seed": seed,
         "detection_points": one.detection_points,
     }
-    survey = partial(survey_places, rig, world, target, at_m, **of_survey)
+    survey = partial(measure_visibility_at_positions, rig, world, target, at_m, **of_survey)
     values: dict[str, list[Float64]] = {bound.key: [] for bound in one.bounds}
     where: list[str] = []
     for words, group in groups.items():
-        seen = survey(counting=group)
+        seen = survey(counted_sensors=group)
         # A mean of the first two would hide a step in which nothing is seen.
-        numbers = {"points": seen.least_points, "sensors": seen.least_sensors, "share": seen.share}
+        numbers = {"points": seen.min_points, "sensors": seen.min_sensors, "share": seen.surface_share}
         there = (seen.state == 0) | (place.points_m is not None)
-        for (x, y), n in zip(at_m[there].tolist(), seen.steps[there].tolist(), strict=True):
+        for (x, y), n in zip(at_m[there].tolist(), seen.free_frames[there].tolist(), strict=True):
             room = f", room in {n} of {own_steps} steps" * (n < own_steps) if n else ", no room"
             where.append(f"x = {x:.2f}, y = {y:.2f} m{words}{room}")
         for key in ("pixels", "visual_angle_deg"):
             numbers[key] = np.where(seen.state == 0, 0.0, np.nan)
         for k in group if one.pixels or one.visual_angle_deg else ():  # of each sensor alone
-            points, sensor = survey(counting=[k]).least_points, rig.sensors[k]
+            points, sensor = survey(counted_sensors=[k]).min_points, rig.sensors[k]
             x_m, y_m, z_m = sensor.mount.to_matrix()[:3, 3]
             away_m = np.hypot(*(at_m - (x_m, y_m)).T)
             low_m, high_m = (

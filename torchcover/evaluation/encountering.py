@@ -10,11 +10,18 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from torchcover import __version__
-from torchcover.encounters import Criterion, Encounter, EncounterSet, Sightings, Staged, sight_encounter
+from torchcover.encounters import (
+    Criterion,
+    Encounter,
+    EncounterResults,
+    EncounterSet,
+    StagedEncounter,
+    detect_encounter,
+)
 from torchcover.encounters.result import ALL
-from torchcover.encounters.sighting import Looks, MountedRig
-from torchcover.encounters.staging import STEP_S, solid_of
-from torchcover.encounters.traffic import Drive, Eyes, approaches, sight_approach
+from torchcover.encounters.sighting import EncounterPointCounter, MountedRig
+from torchcover.encounters.staging import STEP_S, get_solid
+from torchcover.encounters.traffic import Drive, DriveSensors, detect_approach, find_approaches
 from torchcover.evaluation.progress import Progress, defer_signals
 from torchcover.evaluation.result_page import format_facts
 from torchcover.evaluation.settings import FILES, parse_file_kinds
@@ -41,7 +48,7 @@ def evaluate_encounters(
     num_start_offsets: int = 10,
     seed: int = 0,
     progress: bool = False,
-) -> Sightings:
+) -> EncounterResults:
     """When rigs detect whom their vehicle is about to collide with, and whether that is in time.
 
     Args:
@@ -72,13 +79,13 @@ def evaluate_encounters(
     these = encounters if isinstance(encounters, EncounterSet) else EncounterSet.load(encounters)
     mounted = [MountedRig(rig, set_ego(build_flat_ground(), {name: rig}, vehicle)) for name, rig in sensing.items()]
     # Their mistakes are told before the first look.
-    staged = [(rig, Staged(one, rig.ego)) for rig in mounted for one in these.encounters]
+    staged = [(rig, StagedEncounter(one, rig.ego_solid)) for rig in mounted for one in these.encounters]
     sightings = []
     with Progress(len(staged), "encounters", is_shown=progress) as bar:
         for rig, one in staged:
-            sightings.append(sight_encounter(rig, one, criterion, phases=num_start_offsets, seed=seed))
+            sightings.append(detect_encounter(rig, one, criterion, num_start_offsets=num_start_offsets, seed=seed))
             bar.advance(len(staged))
-    return Sightings(these.name, criterion, num_start_offsets, seed, _sensors(sensing), sightings)
+    return EncounterResults(these.name, criterion, num_start_offsets, seed, _sensors(sensing), sightings)
 
 
 def _sensing(rigs: AnyRig | Sequence[AnyRig], sensor_model: Literal["ideal", "real"] | None) -> dict[str, Rig]:
@@ -103,7 +110,7 @@ def evaluate_traffic_encounters(
     sensor_model: Literal["ideal", "real"] | None = None,
     seed: int = 0,
     progress: bool = False,
-) -> Sightings:
+) -> EncounterResults:
     """When rigs detected those whom they met in the traffic of worlds: `Criterion.within_s` before a collision.
 
     Args:
@@ -133,17 +140,19 @@ def evaluate_traffic_encounters(
     with Progress(num_scenes, "worlds", is_shown=progress) as bar:
         for number in range(num_scenes):
             first = number * world.num_time_steps
-            drive = Drive.of_world(f"{world.name} {number}", nobody.get_scene_geometry(first)[0].scene)
+            drive = Drive.from_scene(f"{world.name} {number}", nobody.get_scene_geometry(first)[0].scene)
             hours[drive.name] = world.num_time_steps * world.effective_time_step_s / 3600
-            met = approaches(drive, criterion)
+            met = find_approaches(drive, criterion)
             for name, simulator in alone.items():
-                eyes = Eyes.of_world(simulator, first, criterion)
-                sightings += [sight_approach(name, drive, one, eyes, criterion) for one in met]
+                eyes = DriveSensors.from_simulator(simulator, first, criterion)
+                sightings += [detect_approach(name, drive, one, eyes, criterion) for one in met]
             bar.advance(num_scenes)
-    return Sightings(world.name, criterion, 1, seed, _sensors(sensing), sightings, hours)
+    return EncounterResults(world.name, criterion, 1, seed, _sensors(sensing), sightings, hours)
 
 
-def evaluate_recorded_encounters(recording: Recording | str | Path, criterion: Criterion | None = None) -> Sightings:
+def evaluate_recorded_encounters(
+    recording: Recording | str | Path, criterion: Criterion | None = None
+) -> EncounterResults:
     """When the rigs of a recording first had enough points on those whom it met; as `evaluate_traffic_encounters`.
 
     Args:
@@ -156,17 +165,19 @@ def evaluate_recorded_encounters(recording: Recording | str | Path, criterion: C
     """
     criterion = Criterion() if criterion is None else criterion
     opened = open_recording(recording) if isinstance(recording, str | Path) else recording
-    drive, sightings = Drive.of_recording(opened), []
+    drive, sightings = Drive.from_recording(opened), []
     for name, sensors in opened.rigs.items():
-        eyes = Eyes.of_recording(opened, sensors, criterion)
-        sightings += [sight_approach(name, drive, one, eyes, criterion) for one in approaches(drive, criterion)]
+        eyes = DriveSensors.from_recording(opened, sensors, criterion)
+        sightings += [detect_approach(name, drive, one, eyes, criterion) for one in find_approaches(drive, criterion)]
     hours = {drive.name: float(np.ptp(drive.times_s)) / 3600}
-    return Sightings(drive.name, criterion, 1, 0, {n: tuple(of) for n, of in opened.rigs.items()}, sightings, hours)
+    return EncounterResults(
+        drive.name, criterion, 1, 0, {n: tuple(of) for n, of in opened.rigs.items()}, sightings, hours
+    )
 
 
 def plot_encounter_animation(
     rig: AnyRig,
-    encounter_results: Sightings,
+    encounter_results: EncounterResults,
     *,
     vehicle: str | Path | None = None,
     sensor_model: Literal["ideal", "real"] | None = None,
@@ -181,47 +192,53 @@ def plot_encounter_animation(
     """
     ((name, sensing),) = _sensing(rig, sensor_model).items()
     latest = min(
-        (one for one in encounter_results.sightings if one.rig == name), key=lambda one: one.ttc_s.min() - one.needed_s
+        (one for one in encounter_results.detections if one.rig == name),
+        key=lambda one: one.ttc_s.min() - one.braking_time_s,
     )
-    case, without_s = cast(Encounter, latest.encounter), latest.without_ttc_s.min(axis=1)
+    case, without_s = cast(Encounter, latest.encounter), latest.ttc_without_sensor_s.min(axis=1)
     mounted = MountedRig(sensing, set_ego(build_flat_ground(), {name: sensing}, vehicle))
-    staged = Staged(case, mounted.ego)
-    scene, looks = staged.scene(mounted.solids, whole=True), Looks(mounted, staged, encounter_results.seed)
-    sensors, names = mounted.mounted(case, scene), encounter_results.sensors[name]
-    first, worst = latest.sensor_ttc_s.mean(axis=1).argmax(), without_s.argmin()
-    told = f"{case.words}: detected {latest.ttc_s.min():.2f} s before, needed {latest.needed_s:.2f} s"
-    told += f"; first {names[first]}, without {names[worst]} {without_s[worst]:.2f} s" if len(names) > 1 else ""
-    if case.speed_is_swept:
-        kmh = encounter_results.up_to_kmh()[case.name, name]
-        told += "; in time at none of the speeds" if math.isnan(kmh) else f"; in time up to {kmh:g} km/h"
-    steps = np.arange(max(int((staged.contact_s - FILM_S) / STEP_S), 0), int(staged.contact_s / STEP_S), FILM_STEPS)
-    times_s = STEP_S * steps.astype(np.float64)
-    vehicle_T_world = invert(staged.world_T_ego(times_s))
-    bodies = [(one.body, vehicle_T_world @ pose) for one, pose in staged.obstacles]
-    bodies.append((case.other.body, staged.vehicle_T_other(times_s)))
-    outlines_m = np.stack(
-        [transform_outline(solid_of(body).bounding_box.outline_m, there) for body, there in bodies], axis=1
+    staged = StagedEncounter(case, mounted.ego_solid)
+    scene, looks = (
+        staged.build_scene(mounted.solids, includes_road_user=True),
+        EncounterPointCounter(mounted, staged, encounter_results.seed),
     )
-    ego_m = mounted.ego.bounding_box.outline_m
+    sensors, names = mounted.get_mounted_sensors(case, scene), encounter_results.sensor_names[name]
+    first, worst = latest.sensor_ttc_s.mean(axis=1).argmax(), without_s.argmin()
+    told = f"{case.description}: detected {latest.ttc_s.min():.2f} s before, needed {latest.braking_time_s:.2f} s"
+    told += f"; first {names[first]}, without {names[worst]} {without_s[worst]:.2f} s" if len(names) > 1 else ""
+    if case.is_speed_swept:
+        kmh = encounter_results.find_max_speeds_kmh()[case.name, name]
+        told += "; in time at none of the speeds" if math.isnan(kmh) else f"; in time up to {kmh:g} km/h"
+    steps = np.arange(
+        max(int((staged.contact_time_s - FILM_S) / STEP_S), 0), int(staged.contact_time_s / STEP_S), FILM_STEPS
+    )
+    times_s = STEP_S * steps.astype(np.float64)
+    vehicle_T_world = invert(staged.compute_world_T_ego(times_s))
+    bodies = [(one.body, vehicle_T_world @ pose) for one, pose in staged.obstacles]
+    bodies.append((case.road_user.body, staged.compute_vehicle_T_road_user(times_s)))
+    outlines_m = np.stack(
+        [transform_outline(get_solid(body).bounding_box.outline_m, there) for body, there in bodies], axis=1
+    )
+    ego_m = mounted.ego_solid.bounding_box.outline_m
     all_m = np.concatenate([outlines_m.reshape(-1, 2), ego_m])
     low_m, high_m = all_m.min(axis=0) - FILM_AROUND_M, all_m.max(axis=0) + FILM_AROUND_M
     for step, now_m in zip(steps.tolist(), outlines_m, strict=True):
         instant, at = scene.get_snapshot(step), np.array([step])
         scans = [one.scan(instant, SensorNoise(np.random.default_rng(step), one.sensor.num_rays)) for one in sensors]
-        seen = ", ".join(f"{sensor} {looks.points([k], at)[0]}" for k, sensor in enumerate(names))
+        seen = ", ".join(f"{sensor} {looks.count_points([k], at)[0]}" for k, sensor in enumerate(names))
         yield plot_scene(
             *zip(low_m.tolist(), high_m.tolist(), strict=True),
             static_faces=StaticFaces(np.empty((0, 3, 2)), np.empty(0)),
             ego_outline_m=ego_m,
             actors=[ActorMark(get_shape_name(body), there) for (body, _), there in zip(bodies, now_m, strict=True)],
             sensor_points=np.concatenate([scan.points for scan in scans]),
-            title=f"{staged.contact_s - STEP_S * step:.2f} s to the collision; points on it: {seen}",
+            title=f"{staged.contact_time_s - STEP_S * step:.2f} s to the collision; points on it: {seen}",
             subtitle=told,
         )
 
 
 def save_encounters(
-    encounter_results: Sightings, folder: str | Path, *, file_kinds: str | Iterable[str] = FILES
+    encounter_results: EncounterResults, folder: str | Path, *, file_kinds: str | Iterable[str] = FILES
 ) -> list[Path]:
     """Write the files of the command line.
 
@@ -231,7 +248,7 @@ def save_encounters(
         file_kinds: What to write beside `summary.json`, as in `Result.save`; "maps" is the picture.
     """
     wanted = parse_file_kinds(file_kinds)
-    record = {"verdict": list(summarize_encounters(encounter_results)), **encounter_results.record()}
+    record = {"verdict": list(summarize_encounters(encounter_results)), **encounter_results.to_record()}
     with AtomicOutput(Path(folder)) as written:
         with defer_signals():
             if "numbers" in wanted:
@@ -239,41 +256,43 @@ def save_encounters(
             written.publish(record)
         if "page" in wanted:
             written.add_text("report.html", render_page(build_encounters_page(encounter_results)))
-        if "maps" in wanted and not encounter_results.hours:
+        if "maps" in wanted and not encounter_results.scene_durations_h:
             written.add_figure("encounters.png", encounter_results.plot())
         written.publish(record)
     return written.paths
 
 
-def summarize_encounters(encounter_results: Sightings) -> tuple[str, ...]:
+def summarize_encounters(encounter_results: EncounterResults) -> tuple[str, ...]:
     """In how many of the encounters each rig is in time, in a sentence; of traffic, who was met when too late."""
-    rows = [row for row in encounter_results.rows if row.encounter != ALL and row.to_brake]
-    of_rigs = {rig: [row for row in rows if row.rig == rig] for rig in encounter_results.sensors}
+    rows = [row for row in encounter_results.rows if row.encounter != ALL and row.braking_count]
+    of_rigs = {rig: [row for row in rows if row.rig == rig] for rig in encounter_results.sensor_names}
     if not rows:
         return ("Nobody was met for whom the vehicle had to brake.",)
-    if encounter_results.hours:
-        late = {rig: round(sum((1 - row.in_time) * row.to_brake for row in of)) for rig, of in of_rigs.items()}
-        most = max(sum(row.to_brake for row in of) for of in of_rigs.values())
+    if encounter_results.scene_durations_h:
+        late = {
+            rig: round(sum((1 - row.in_time_share) * row.braking_count for row in of)) for rig, of in of_rigs.items()
+        }
+        most = max(sum(row.braking_count for row in of) for of in of_rigs.values())
         told = "; ".join(f"{rig} {count}" for rig, count in late.items())
         return (f"Of {most} for whom the vehicle had to brake, detected too late: {told}.",)
-    told = "; ".join(f"{rig} {sum(row.in_time == 1 for row in of)}" for rig, of in of_rigs.items())
+    told = "; ".join(f"{rig} {sum(row.in_time_share == 1 for row in of)}" for rig, of in of_rigs.items())
     count = max(map(len, of_rigs.values()))
     return (f"Of {count} encounters of {encounter_results.name}, each speed counted, always in time: {told}.",)
 
 
-def build_encounters_page(encounter_results: Sightings) -> Page:
+def build_encounters_page(encounter_results: EncounterResults) -> Page:
     """All of it on one page."""
     pictures = []
-    if not encounter_results.hours:
+    if not encounter_results.scene_durations_h:
         png = BytesIO()
         encounter_results.plot().savefig(png, format="png")
         pictures = [PagePicture("Time to collision at detection against the speed", png.getvalue())]
     return Page(
-        title=f"In time? {', '.join(encounter_results.sensors)}",
+        title=f"In time? {', '.join(encounter_results.sensor_names)}",
         lead=f"The encounters of {encounter_results.name}, measured by torchcover. In time is geometry: what was seen when, with "
         "the brakes and the latency that were assumed.",
         findings=summarize_encounters(encounter_results),
-        tables=encounter_results.tables(),
+        tables=encounter_results.build_tables(),
         pictures=pictures,
-        facts={"Settings": format_facts(encounter_results.settings()), "Run": {"torchcover": __version__}},
+        facts={"Settings": format_facts(encounter_results.get_settings()), "Run": {"torchcover": __version__}},
     )

@@ -22,7 +22,7 @@ from torchcover.files import lock_folder
 from torchcover.frames import BadFrameError, FrameSource
 from torchcover.simulation import QueryPlan, SimulatedFrames
 from torchcover.simulation.memory import check_memory_fits
-from torchcover.targets import Probes, Target
+from torchcover.targets import NearFieldObserver, Target
 
 Observers = Mapping[str, AnyObserver]
 # For standard errors: at least half as many are in use at the end of a long run.
@@ -48,9 +48,9 @@ def measure_coverage(task: Task[FrameSource], settings: Settings, stopping_rule:
     with ranks.abort_on_error() if ranks else nullcontext():
         coverage, seen, run = _observed(task, settings, others, stopping_rule)
     coverages = {name: observer.compute() for name, observer in coverage.items()}
-    if isinstance(probes := seen.get(BODIES), Probes):
+    if isinstance(probes := seen.get(BODIES), NearFieldObserver):
         for name, one in coverages.items():
-            one.target_sums = probes.seen_by(name)
+            one.target_sums = probes.get_target_sums(name)
     if len({coverage.counts["num_frames"] for coverage in coverages.values()}) > 1:
         run.raise_failure()  # within a step: the rigs have not seen the same
     report = None
@@ -120,7 +120,7 @@ def _workers(task: Task[FrameSource], settings: Settings) -> int:
     return compute_num_workers(most, len({frames.get_scene_id(index) for index in range(most)}), sends_frames=whole)
 
 
-def _probes(task: Task[FrameSource], settings: Settings) -> dict[str, Probes]:
+def _probes(task: Task[FrameSource], settings: Settings) -> dict[str, NearFieldObserver]:
     """Who puts bodies beside the vehicle; nobody where there is no scene to put them into."""
     usual = () if settings.only_detection or (settings.regions and settings.regions.regions) else PROBES
     names = usual if settings.test_targets is None else settings.test_targets
@@ -129,7 +129,7 @@ def _probes(task: Task[FrameSource], settings: Settings) -> dict[str, Probes]:
     bodies = [Target.load(name) for name in names]
     if len({body.name for body in bodies}) < len(bodies):
         raise ValueError(f"probe: one is given twice: {', '.join(body.name for body in bodies)}")
-    return {BODIES: Probes(task.frames.simulator, bodies, BLOCKS)}
+    return {BODIES: NearFieldObserver(task.frames.simulator, bodies, BLOCKS)}
 
 
 def _observed(

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
-from torchcover.encounters import EncounterSet, Sightings
+from torchcover.encounters import EncounterResults, EncounterSet
 from torchcover.estimation import MIN_BLOCKS
 from torchcover.evaluation.checking import CheckResult, check
 from torchcover.evaluation.encountering import build_encounters_page, evaluate_encounters
@@ -60,7 +60,7 @@ class Report:
     result: Result
     targets: Mapping[str, TargetMap]
     num_frames: int
-    encounters: Sightings | None = None
+    encounters: EncounterResults | None = None
     check_result: CheckResult | None = None
 
     @property
@@ -88,7 +88,7 @@ class Report:
         """The answer and what shows it; below it the tables and maps that it comes from."""
         target, *_ = self.targets.values()
         steps = f"{self.result.table.first_conditions.counts['num_frames']:,} steps of {self.result.source['scenario']}"
-        lead = f"{target.target}, {target.hits} points or more, on flat ground with nothing else; {steps}."
+        lead = f"{target.target}, {target.detection_points} points or more, on flat ground with nothing else; {steps}."
         of_targets = [build_target_page(one) for one in self.targets.values()]
         sides = [
             replace(build_sides_table(one), title=f"{rig}: {build_sides_table(one).title}")
@@ -127,7 +127,7 @@ class Report:
             "complete": not self.cut_short,
             "traffic": self.result.record,
             "targets": {rig: build_target_record(one) for rig, one in self.targets.items()},
-            "encounters": self.encounters.record() if self.encounters else None,
+            "encounters": self.encounters.to_record() if self.encounters else None,
             "requirements": self.check_result.record if self.check_result else None,
         }
 

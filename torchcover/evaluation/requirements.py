@@ -46,7 +46,7 @@ from torchcover.simulation.documents import (
 )
 from torchcover.simulation.kinds import SENSORS
 from torchcover.targets import SIDES, TARGETS
-from torchcover.targets.placing import side_of
+from torchcover.targets.placing import find_sides
 from torchcover.targets.survey import HITS, THRESHOLD_M
 
 Float64 = NDArray[np.float64]
@@ -216,7 +216,7 @@ class TargetPositions(Document):
             there_m = np.stack(np.meshgrid(self._between(x0, x1), self._between(y0, y1)), axis=-1).reshape(-1, 2)
             there = shapely.intersects_xy(area, there_m)
             if self.within_m:
-                there &= np.isin(side_of(vehicle, there_m), [*map(SIDES.index, self.sides or SIDES)])
+                there &= np.isin(find_sides(vehicle, there_m), [*map(SIDES.index, self.sides or SIDES)])
             places_m = there_m[there]
         return np.asarray(origin_m + places_m)
 
@@ -423,7 +423,7 @@ class EncounterRequirement(_Requirement):
     braking: BrakingModel | None = None
     points: PositiveInt = Criterion.points
     pixels: PositiveInt = Criterion.pixels
-    consecutive_scans: PositiveInt = Criterion.looks
+    consecutive_scans: PositiveInt = Criterion.consecutive_scans
 
     @property
     def bounds(self) -> list[Bound]:

@@ -35,7 +35,7 @@ from torchcover.simulation import Rig, Scenario, Sensor, set_ego
 from torchcover.simulation.bodies import Body
 from torchcover.simulation.scenario import ActorDescription
 from torchcover.simulation.shapes import Plane
-from torchcover.targets import Place, Target, TargetMap, survey, write_arrays, write_csv
+from torchcover.targets import Target, TargetMap, TargetPosition, measure_target_visibility, write_arrays, write_csv
 
 # Steps of a world in which something moves, or a sensor is noisy; else they are all alike.
 DEFAULT_STEPS = 16
@@ -70,7 +70,7 @@ def map_target_visibility(
         sensor_model: What sensors make of their hits; as for `evaluate`.
         num_frames: How many steps are averaged; 1 where all are alike, else 16.
         frame_interval_s: Time between two of them; as for `evaluate` if not given.
-        settings: Others of `torchcover.targets.survey`: `raster`, `seed`, `hits`, `threshold_m`, `heading`.
+        settings: Others of `torchcover.targets.measure_target_visibility`: `raster`, `seed`, `hits`, `threshold_m`, `heading`.
 
     Returns:
         The map; see `TargetMap`.
@@ -86,11 +86,11 @@ def map_target_visibility(
         ('dog_57cm', 8)
     """
     rig, world, usual_steps = load_rig_and_scenario(rig, scenario, vehicle, sensor_model)
-    return survey(
+    return measure_target_visibility(
         rig,
         world,
         target if isinstance(target, Target) else Target.load(target),
-        steps=usual_steps if num_frames is None else num_frames,
+        num_frames=usual_steps if num_frames is None else num_frames,
         frame_interval_s=compute_frame_interval_s(world, frame_interval_s),
         **settings,
     )
@@ -153,11 +153,11 @@ def save_target_map(
 def build_target_record(target_map: TargetMap) -> dict[str, Any]:
     """Settings, counts, shares of the sides and worst places, for JSON; None for what is unknown."""
     return {
-        **target_map.settings(),
+        **target_map.get_settings(),
         "cells": target_map.counts,
-        "sides": [to_json_record(side._asdict()) for side in target_map.sides()],
-        "unseen_to_m": to_json_record(target_map.unseen_to_m()),
-        "worst": [to_json_record(place._asdict()) for place in target_map.worst()],
+        "sides": [to_json_record(side._asdict()) for side in target_map.summarize_sides()],
+        "unseen_to_m": to_json_record(target_map.find_max_undetected_ranges_m()),
+        "worst": [to_json_record(place._asdict()) for place in target_map.find_worst_positions()],
     }
 
 
@@ -168,37 +168,40 @@ def build_target_page(target_map: TargetMap, sensors: Sequence[Sensor] = ()) -> 
         lead=f"In {target_map.scenario}, sensor model {target_map.sensor_model}, measured by torchcover.",
         findings=summarize_target_maps({target_map.rig: target_map}),
         target_maps=[build_target_plan(target_map)],
-        tables=[build_sides_table(target_map), build_positions_table(target_map.worst(), "The worst places")],
+        tables=[
+            build_sides_table(target_map),
+            build_positions_table(target_map.find_worst_positions(), "The worst places"),
+        ],
         maps=_maps(target_map),
         rigs=[PageRig(target_map.rig, build_sensor_views(sensors), format_rig_yaml(target_map.rig, sensors))],
         ego_outline_m=target_map.vehicle_outline_m,
-        facts={"Settings": format_facts(target_map.settings()), "Run": {"torchcover": __version__}},
+        facts={"Settings": format_facts(target_map.get_settings()), "Run": {"torchcover": __version__}},
     )
 
 
 def build_target_plan(target_map: TargetMap) -> TargetVisibilityMap:
     """Where it is seen, and what is lost with each sensor, as a page shows it."""
-    by = np.where(target_map.enough, np.maximum(np.nan_to_num(target_map.least_sensors), 1), 0).astype(np.int64)
-    near = target_map.free & (target_map.distance_m <= NEAR_M)
-    count, unseen = int(near.sum()), int((near & ~target_map.enough).sum())
-    m2 = format_square_meters(unseen * target_map.raster.step_m**2)
+    by = np.where(target_map.detected_mask, np.maximum(np.nan_to_num(target_map.min_sensors), 1), 0).astype(np.int64)
+    near = target_map.free_mask & (target_map.distance_m <= NEAR_M)
+    count, unseen = int(near.sum()), int((near & ~target_map.detected_mask).sum())
+    m2 = format_square_meters(unseen * target_map.raster.cell_m**2)
     return TargetVisibilityMap(
         rig=target_map.rig,
         title=f"Not seen at {unseen:,} of {count:,} places within {NEAR_M:g} m, {m2} m².",
-        x=target_map.raster.x,
-        y=target_map.raster.y,
-        cell_m=target_map.raster.step_m,
-        sensor_counts=np.where(target_map.free, by, -1),
-        vehicle_box_m=target_map.vehicle.outline_m,
+        x=target_map.raster.x_bounds_m,
+        y=target_map.raster.y_bounds_m,
+        cell_m=target_map.raster.cell_m,
+        sensor_counts=np.where(target_map.free_mask, by, -1),
+        vehicle_box_m=target_map.vehicle_box.outline_m,
         vehicle_outline_m=target_map.vehicle_outline_m,
         max_distance_m=NEAR_M,
-        failure_effects_m2=target_map.losses_m2(NEAR_M) if len(target_map.sensor_names) > 1 else {},
+        failure_effects_m2=target_map.compute_failure_effects_m2(NEAR_M) if len(target_map.sensor_names) > 1 else {},
     )
 
 
 def summarize_target_maps(target_maps: Mapping[str, TargetMap]) -> tuple[str, ...]:
     """Where rigs, by name, see the same body on the same places, and on which sensor most hangs, in sentences."""
-    shares = {rig: one.share_seen(NEAR_M) for rig, one in target_maps.items()}
+    shares = {rig: one.compute_detected_share(NEAR_M) for rig, one in target_maps.items()}
     known = sorted((rig for rig in shares if not math.isnan(shares[rig])), key=lambda rig: -shares[rig])
     if not known:
         return (f"No place within {NEAR_M:g} m is free: what is seen there is unknown.",)
@@ -207,7 +210,7 @@ def summarize_target_maps(target_maps: Mapping[str, TargetMap]) -> tuple[str, ..
     first = target_maps[known[0]]
     height = f", {first.target_bottom_m:.2f} m above the ground," if first.target_bottom_m else ""
     body = f"{format_target_name(first.target)} of {first.target_size_m[2]:.2f} m{height}"
-    seen_words = f"is seen ({first.hits} points or more)"
+    seen_words = f"is seen ({first.detection_points} points or more)"
     told = [f"{capitalize(body)} {seen_words} at {most} % of the places within {NEAR_M:g} m by {best}"]
     told += [f"at {share} % by {rigs}" for share, rigs in others]
     return (f"{', '.join(told)}.", *(_on_loss(rig, target_maps[rig]) for rig in known))
@@ -215,7 +218,7 @@ def summarize_target_maps(target_maps: Mapping[str, TargetMap]) -> tuple[str, ..
 
 def _on_loss(rig: str, seen: TargetMap) -> str:
     """Of one rig, the sensor with which most places are lost; several where the cells are too coarse to tell."""
-    losses = seen.losses_m2(NEAR_M)
+    losses = seen.compute_failure_effects_m2(NEAR_M)
     most_m2 = max(losses.values())
     if len(losses) == 1:
         return f"{rig} has one sensor: without it, it sees nothing."
@@ -229,23 +232,32 @@ def _on_loss(rig: str, seen: TargetMap) -> str:
 def _maps(seen: TargetMap) -> list[PageMap]:
     some = seen.points[seen.points > 0]
     most = max(float(np.percentile(some, ROBUST_PERCENTILE)), 10.0) if len(some) else 10.0
-    of_sensors = f"sensors with {seen.hits} points or more", "sensors", "viridis", 0.0, float(len(seen.sensor_names))
+    of_sensors = (
+        f"sensors with {seen.detection_points} points or more",
+        "sensors",
+        "viridis",
+        0.0,
+        float(len(seen.sensor_names)),
+    )
     near = f"visible surface within {seen.threshold_m:g} m of a point"
     each = [
         (seen.points, ColorScale("points on it", "points", "viridis", 1.0, most, logarithmic=True)),
-        (100 * seen.seen, ColorScale(f"steps with {seen.hits} points or more", "%", "viridis", 0.0, 100.0)),
-        (100 * seen.share, ColorScale(near, "%", "viridis", 0.0, 100.0)),
-        (seen.sensors, ColorScale(*of_sensors)),
+        (
+            100 * seen.detected_share,
+            ColorScale(f"steps with {seen.detection_points} points or more", "%", "viridis", 0.0, 100.0),
+        ),
+        (100 * seen.surface_share, ColorScale(near, "%", "viridis", 0.0, 100.0)),
+        (seen.detecting_sensors, ColorScale(*of_sensors)),
     ]
-    line = MapLine(f"border of what is seen, with {seen.hits} points", seen.border_m())
+    line = MapLine(f"border of what is seen, with {seen.detection_points} points", seen.compute_detection_border_m())
     return [
         PageMap(
             quantity=scale.quantity,
             band=seen.target,
             rig=seen.rig,
-            x=seen.raster.x,
-            y=seen.raster.y,
-            cell_m=seen.raster.step_m,
+            x=seen.raster.x_bounds_m,
+            y=seen.raster.y_bounds_m,
+            cell_m=seen.raster.cell_m,
             values=values,
             scale=scale,
             unobserved_label=NO_ROOM,
@@ -257,26 +269,34 @@ def _maps(seen: TargetMap) -> list[PageMap]:
 
 def build_sides_table(target_map: TargetMap) -> PageTable:
     """The share of the places on each side that have enough points, and how far out one has not."""
-    sides, unseen_to_m = target_map.sides(), target_map.unseen_to_m()
-    within = list(dict.fromkeys(side.within_m for side in sides))
+    sides, unseen_to_m = target_map.summarize_sides(), target_map.find_max_undetected_ranges_m()
+    within = list(dict.fromkeys(side.max_distance_m for side in sides))
     rows = []
     for name in dict.fromkeys(side.side for side in sides):
-        shares = ["-" if one.cells == 0 else format_percent(one.seen) for one in sides if one.side == name]
+        shares = [
+            "-" if one.free_cells == 0 else format_percent(one.detected_share) for one in sides if one.side == name
+        ]
         to_m = unseen_to_m[name]
         unseen = "-" if np.isnan(to_m) else f"{to_m:.2f}" if to_m else "nowhere"
         rows.append(tuple(map(TextCell, (name, *shares, unseen))))
-    of_steps = ", mean over the steps" if target_map.step_count > 1 else ""
+    of_steps = ", mean over the steps" if target_map.num_frames > 1 else ""
     headings = ("side", *(f"within {limit_m:g} m\n(%)" for limit_m in within), "unseen to\n(m)")
-    return PageTable(f"Free places with {target_map.hits} points or more{of_steps}", headings, rows)
+    return PageTable(f"Free places with {target_map.detection_points} points or more{of_steps}", headings, rows)
 
 
-def build_positions_table(positions: Sequence[Place], title: str) -> PageTable:
+def build_positions_table(positions: Sequence[TargetPosition], title: str) -> PageTable:
     """Where places are, and how much of a target is seen there."""
     headings = ("side", "x\n(m)", "y\n(m)", "distance\n(m)", "points", "sensors", "surface\n(%)")
     rows = [tuple(map(TextCell, _place(place))) for place in positions]
     return PageTable(title, headings, rows)
 
 
-def _place(place: Place) -> tuple[str, ...]:
+def _place(place: TargetPosition) -> tuple[str, ...]:
     lengths = (f"{value:.2f}" for value in (place.x_m, place.y_m, place.distance_m))
-    return place.side, *lengths, f"{place.points:.4g}", f"{place.sensors:.3g}", format_percent(place.share)
+    return (
+        place.side,
+        *lengths,
+        f"{place.points:.4g}",
+        f"{place.detecting_sensors:.3g}",
+        format_percent(place.surface_share),
+    )

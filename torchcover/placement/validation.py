@@ -20,7 +20,7 @@ from torchcover.placement.objective import DEFAULT_THRESHOLD_M, Objective
 from torchcover.report import PageTable, TextCell
 from torchcover.report.number_format import format_difference, get_display_unit
 from torchcover.simulation import RegionsOfInterest, Rig, set_ego
-from torchcover.targets import TARGETS, Raster, Target, survey
+from torchcover.targets import TARGETS, Raster, Target, measure_target_visibility
 
 
 @dataclass(frozen=True)

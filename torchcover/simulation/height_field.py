@@ -7,7 +7,7 @@ import numpy as np
 from torchcover.geometry import HeightField
 from torchcover.geometry.arrays import Bools, Float64
 from torchcover.simulation.shapes import Mesh
-from torchcover.simulation.traffic.scenery import ground
+from torchcover.simulation.traffic.scenery import build_ground_plane
 
 CELL_M = 5.0
 # Beyond what may be seen, so that nobody looks past its end.
@@ -28,7 +28,7 @@ class FlatGround(NamedTuple):
 
     def build_mesh(self) -> Mesh:
         """Two triangles."""
-        sheet = ground(self.lower_m, self.upper_m)
+        sheet = build_ground_plane(self.lower_m, self.upper_m)
         return sheet._replace(vertices_m=sheet.vertices_m + np.array([0.0, 0.0, self.height_m]))
 
 

@@ -6,9 +6,9 @@ from torchcover.simulation.radar import Radar
 from torchcover.simulation.recorded.traffic import RecordedTraffic
 from torchcover.simulation.reference_sensor import PaperReference, ReferenceSensor
 from torchcover.simulation.sensor import Sensor
-from torchcover.simulation.sumo import Sumo
+from torchcover.simulation.sumo import SumoTraffic
 from torchcover.simulation.surface_reference import SurfaceReference
-from torchcover.simulation.traffic import Highway, Parking, Urban
+from torchcover.simulation.traffic import HighwayTraffic, ParkingTraffic, UrbanTraffic
 from torchcover.simulation.traffic.kind import Traffic
 
 # By the key `type` in a rig's file.
@@ -18,9 +18,9 @@ REFERENCE_SENSORS: dict[str, type[ReferenceSensor]] = {
 }
 # By the key `type` of a scenario's `traffic`.
 TRAFFIC: dict[str, type[Traffic]] = {
-    "urban": Urban,
-    "highway": Highway,
-    "parking": Parking,
-    "sumo": Sumo,
+    "urban": UrbanTraffic,
+    "highway": HighwayTraffic,
+    "parking": ParkingTraffic,
+    "sumo": SumoTraffic,
     "tracks": RecordedTraffic,
 }

@@ -30,7 +30,7 @@ from torchcover.recordings.recording import Recording
 from torchcover.recordings.sweep_window import compute_voxel_indices, find_first_occurrences
 from torchcover.recordings.vehicle_cloud import find_points_in_box
 from torchcover.simulation.height_field import GroundHeightField
-from torchcover.simulation.recorded.run import pieces
+from torchcover.simulation.recorded.run import split_at_gaps
 from torchcover.simulation.shapes import Mesh
 
 # Parameters of the reference that separates static points from moving ones.
@@ -310,7 +310,7 @@ def _labelled(recording: Recording, last_s: float) -> Iterator[TableRow]:
     assert pose is not None  # as checked
     first_m = pose[:3, 3]
     for track in extract_objects(recording).tracks:
-        for number, piece in enumerate(pieces(track.trajectory, GAP_S)):
+        for number, piece in enumerate(split_at_gaps(track.trajectory, GAP_S)):
             name = track.name if not number else f"{track.name} #{number + 1}"
             times_s = np.append(np.arange(piece.times_s[0], piece.times_s[-1] - 1e-6, STEP_S), piece.times_s[-1])
             times_s = times_s[times_s <= last_s]

@@ -18,7 +18,7 @@ from torchcover.simulation.kinds import TRAFFIC
 from torchcover.simulation.lidar import Lidar
 from torchcover.simulation.local_ground import STEEPEST_DEG, find_level_faces
 from torchcover.simulation.radar import Radar
-from torchcover.simulation.recorded.bodies import read_boxes
+from torchcover.simulation.recorded.bodies import read_box_actors
 from torchcover.simulation.returns import CLEAR, Weather
 from torchcover.simulation.sensor import Sensor
 from torchcover.simulation.shapes import Mesh, MeshFile
@@ -316,7 +316,7 @@ class Scenario(BuiltInDocument):
             [
                 self.ego.build_actor("ego", "ego"),
                 *(actor.build_actor(actor.name, actor.category) for actor in self.actors),
-                *(read_boxes(self.boxes) if self.boxes else ()),
+                *(read_box_actors(self.boxes) if self.boxes else ()),
             ],
             self.duration_s,
         )

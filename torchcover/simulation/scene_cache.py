@@ -25,7 +25,7 @@ from torchcover.simulation.builtin import list_builtin_names
 from torchcover.simulation.documents import hash_builtin_documents
 from torchcover.simulation.scenario import ActorDescription, Scenario
 from torchcover.simulation.shapes import Mesh
-from torchcover.simulation.sumo.simulating import home
+from torchcover.simulation.sumo.simulating import find_sumo_home
 from torchcover.simulation.traffic.fleet import load_bodies
 from torchcover.simulation.world import Actor, Scene
 
@@ -133,7 +133,7 @@ def _hash_sources(scenario: Scenario) -> str:
     ]
     sources.append((scenario.ego or ActorDescription()).collect_content())
     with suppress(ImportError, OSError):  # SUMO is not installed
-        sources.append((home() / "bin" / "sumo").stat().st_mtime_ns)
+        sources.append((find_sumo_home() / "bin" / "sumo").stat().st_mtime_ns)
     return hashlib.sha256(json.dumps(sources, sort_keys=True, default=repr).encode()).hexdigest()
 
 

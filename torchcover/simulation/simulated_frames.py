@@ -199,7 +199,7 @@ class SimulatedFrames(FrameDataset):
     def reference_record(self) -> Mapping[str, object]:
         """The reference sensor, the time between two frames; notes on ground, traffic and rays that the ego ends."""
         traffic, ego = self.scenario.traffic, self.get_ego_mesh()
-        words = [self.simulator.ground_note, traffic.drawn_words if traffic else ""]
+        words = [self.simulator.ground_note, traffic.sampling_note if traffic else ""]
         if getattr(self.reference_sensor, "is_over_areas", False):
             words.append("Reference positions: anywhere in the regions, for the rig is on a mast and not on a vehicle.")
         for name, rig in self.rigs.items():

@@ -22,9 +22,9 @@ class Raster:
     """Equal cells in the vehicle frame; a target stands in the middle of one.
 
     Args:
-        x: Bounds forward in metres, low and high.
-        y: Bounds to the left.
-        step_m: Side of a cell; the bounds are a whole number of them apart.
+        x_bounds_m: Bounds forward in metres, low and high.
+        y_bounds_m: Bounds to the left.
+        cell_m: Side of a cell; the bounds are a whole number of them apart.
 
     Raises:
         ValueError: Bounds or a step that are none, or more than a million cells.
@@ -35,60 +35,69 @@ class Raster:
         ((2, 4), [-0.75, -0.25, 0.25, 0.75])
     """
 
-    x: tuple[float, float]
-    y: tuple[float, float]
-    step_m: float = STEP_M
+    x_bounds_m: tuple[float, float]
+    y_bounds_m: tuple[float, float]
+    cell_m: float = STEP_M
 
     def __post_init__(self) -> None:
-        if not 0 < self.step_m < math.inf:
-            raise ValueError(f"raster: a step above 0 m is needed; got {self.step_m}")
-        for name, (low, high) in (("x", self.x), ("y", self.y)):
+        if not 0 < self.cell_m < math.inf:
+            raise ValueError(f"raster: a step above 0 m is needed; got {self.cell_m}")
+        for name, (low, high) in (("x", self.x_bounds_m), ("y", self.y_bounds_m)):
             if not -math.inf < low < high < math.inf:
                 raise ValueError(f"raster: {name} needs finite bounds, low < high; got {low} and {high}")
-        if (self.x[1] - self.x[0]) * (self.y[1] - self.y[0]) > (MAX_POSITIONS + 0.5) * self.step_m**2:
-            cells = (self.x[1] - self.x[0]) / self.step_m * (self.y[1] - self.y[0]) / self.step_m
+        if (self.x_bounds_m[1] - self.x_bounds_m[0]) * (self.y_bounds_m[1] - self.y_bounds_m[0]) > (
+            MAX_POSITIONS + 0.5
+        ) * self.cell_m**2:
+            cells = (
+                (self.x_bounds_m[1] - self.x_bounds_m[0])
+                / self.cell_m
+                * (self.y_bounds_m[1] - self.y_bounds_m[0])
+                / self.cell_m
+            )
             raise ValueError(
                 f"raster: {cells:,.0f} cells; at most {MAX_POSITIONS:,} are placed in one run: take a larger step or "
                 "a smaller area"
             )
-        for name, (low, high) in (("x", self.x), ("y", self.y)):
-            cells = (high - low) / self.step_m
+        for name, (low, high) in (("x", self.x_bounds_m), ("y", self.y_bounds_m)):
+            cells = (high - low) / self.cell_m
             if round(cells) < 1 or abs(cells - round(cells)) > 1e-6:
                 raise ValueError(
-                    f"raster: {name} from {low:g} to {high:g} m is no whole number of steps of {self.step_m:g} m; "
+                    f"raster: {name} from {low:g} to {high:g} m is no whole number of steps of {self.cell_m:g} m; "
                     "change the bounds or the step"
                 )
 
     @classmethod
-    def around(cls, vehicle: BoundingBox, margin_m: float = MARGIN_M, step_m: float = STEP_M) -> Self:
+    def from_vehicle(cls, vehicle_box: BoundingBox, margin_m: float = MARGIN_M, cell_m: float = STEP_M) -> Self:
         """All that is within a margin of a vehicle, in whole steps from its origin.
 
         Example:
             >>> Raster.around(BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5)), 1.0, 0.5).x
             (-3.0, 3.0)
         """
-        (x0, y0, _), (x1, y1, _) = vehicle.lower_m, vehicle.upper_m
+        (x0, y0, _), (x1, y1, _) = vehicle_box.lower_m, vehicle_box.upper_m
 
         def bounds(low: float, high: float) -> tuple[float, float]:
-            first, last = math.floor((low - margin_m) / step_m + 1e-9), math.ceil((high + margin_m) / step_m - 1e-9)
-            return first * step_m, last * step_m
+            first, last = math.floor((low - margin_m) / cell_m + 1e-9), math.ceil((high + margin_m) / cell_m - 1e-9)
+            return first * cell_m, last * cell_m
 
-        return cls(bounds(x0, x1), bounds(y0, y1), step_m)
+        return cls(bounds(x0, x1), bounds(y0, y1), cell_m)
 
     @property
     def shape(self) -> tuple[int, int]:
         """Rows along y and columns along x."""
-        return round((self.y[1] - self.y[0]) / self.step_m), round((self.x[1] - self.x[0]) / self.step_m)
+        return round((self.y_bounds_m[1] - self.y_bounds_m[0]) / self.cell_m), round(
+            (self.x_bounds_m[1] - self.x_bounds_m[0]) / self.cell_m
+        )
 
     @property
     def x_m(self) -> Float64:
         """(X,) middles of the columns."""
-        return _middles_m(self.x[0], self.step_m, self.shape[1])
+        return _middles_m(self.x_bounds_m[0], self.cell_m, self.shape[1])
 
     @property
     def y_m(self) -> Float64:
         """(Y,) middles of the rows."""
-        return _middles_m(self.y[0], self.step_m, self.shape[0])
+        return _middles_m(self.y_bounds_m[0], self.cell_m, self.shape[0])
 
     @property
     def positions_m(self) -> Float64:
@@ -103,7 +112,7 @@ def _middles_m(low_m: float, step_m: float, count: int) -> Float64:
     return middles_m.round(9)
 
 
-def side_of(box: BoundingBox, positions_m: Float64) -> Int64:
+def find_sides(box: BoundingBox, positions_m: Float64) -> Int64:
     """(P,) number in `SIDES` of the side of a box that each of (P, 2) places is on; -1 within it.
 
     Sides meet at 45 degrees from the corners.
@@ -113,18 +122,18 @@ def side_of(box: BoundingBox, positions_m: Float64) -> Int64:
         >>> [SIDES[k] for k in side_of(box, np.array([[3.0, 1.5], [0.0, -2.0]]))]
         ['front', 'right']
     """
-    x, y = from_outline_m(box, positions_m).T
+    x, y = compute_outline_offsets_m(box, positions_m).T
     side = np.where(np.abs(x) >= np.abs(y), np.where(x > 0, 0, 1), np.where(y > 0, 2, 3))
     side[(x == 0) & (y == 0)] = -1
     return side
 
 
-def from_outline_m(box: BoundingBox, positions_m: Float64) -> Float64:
+def compute_outline_offsets_m(box: BoundingBox, positions_m: Float64) -> Float64:
     """(P, 2) how far along x and y each of (P, 2) places is from the nearest point of a box, seen from above.
 
     Example:
         >>> box = BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5))
-        >>> from_outline_m(box, np.array([[3.0, 0.5], [-2.5, -1.25]])).tolist()
+        >>> compute_outline_offsets_m(box, np.array([[3.0, 0.5], [-2.5, -1.25]])).tolist()
         [[1.0, 0.0], [-0.5, -0.25]]
     """
     nearest_m = np.clip(positions_m, box.lower_m[:2], box.upper_m[:2])
@@ -143,14 +152,16 @@ STEP_UP_M = 0.2
 TOUCHING_SHARE = 0.05
 
 
-def yaws(heading: Heading, target: BoundingBox, vehicle: BoundingBox, positions_m: Float64) -> Float64:
+def compute_yaws_rad(
+    heading: Heading, target_box: BoundingBox, vehicle_box: BoundingBox, positions_m: Float64
+) -> Float64:
     """(P,) yaw of a target in radians at (P, 2) places, by the boxes of both.
 
     The "narrow" or "wide" side is turned to the nearest point of the vehicle; degrees are about z, 0 as the vehicle.
     """
     if heading in ("narrow", "wide"):
-        towards_m = 0.0 - from_outline_m(vehicle, positions_m)  # no -0.0, which is another angle
-        length_m, width_m, _ = target.size_m
+        towards_m = 0.0 - compute_outline_offsets_m(vehicle_box, positions_m)  # no -0.0, which is another angle
+        length_m, width_m, _ = target_box.size_m
         # Whoever looks along the longer side sees the narrow one.
         along_x = (length_m >= width_m) == (heading == "narrow")
         return np.asarray(np.arctan2(towards_m[:, 1], towards_m[:, 0]) - (0.0 if along_x else math.pi / 2))
@@ -159,7 +170,7 @@ def yaws(heading: Heading, target: BoundingBox, vehicle: BoundingBox, positions_
     return np.full(len(positions_m), math.radians(heading))
 
 
-def poses(positions_m: Float64, yaw_rad: Float64) -> Float64:
+def build_poses(positions_m: Float64, yaw_rad: Float64) -> Float64:
     """(P, 4, 4) `vehicle_T_target` of targets on the plane z = 0 of the vehicle frame, until the ground is known."""
     matrices = np.tile(np.eye(4), (len(positions_m), 1, 1))
     cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
@@ -168,7 +179,7 @@ def poses(positions_m: Float64, yaw_rad: Float64) -> Float64:
     return matrices
 
 
-def ground_under(instant: SceneSnapshot, positions_m: Float64) -> Float64:
+def compute_ground_heights_m(instant: SceneSnapshot, positions_m: Float64) -> Float64:
     """(P,) z of the ground in the vehicle frame at (P, 2) places; NaN where there is none.
 
     Of several grounds above each other that counts which somebody walks on who comes from the vehicle: the highest that
@@ -183,20 +194,20 @@ def ground_under(instant: SceneSnapshot, positions_m: Float64) -> Float64:
     return np.where(np.abs(z_m) < LEVEL_M, 0.0, z_m)
 
 
-def standing(vehicle_T_target: Float64, z_m: Float64) -> Float64:
+def set_pose_heights(vehicle_T_target: Float64, z_m: Float64) -> Float64:
     """(P, 4, 4) the same poses at other heights, (P,)."""
     poses = vehicle_T_target.copy()
     poses[:, 2, 3] = z_m
     return poses
 
 
-def holding(box: BoundingBox, vehicle_T_target: Float64, place_m: Float64) -> Bools:
+def is_point_inside(box: BoundingBox, vehicle_T_target: Float64, point_m: Float64) -> Bools:
     """(P,) whether a target's box holds a (3,) place of the vehicle frame."""
-    there_m = np.einsum("pji,pj->pi", vehicle_T_target[:, :3, :3], place_m - vehicle_T_target[:, :3, 3])
+    there_m = np.einsum("pji,pj->pi", vehicle_T_target[:, :3, :3], point_m - vehicle_T_target[:, :3, 3])
     return np.asarray(((there_m > box.lower_m) & (there_m < box.upper_m)).all(axis=1))
 
 
-def blocked(instant: SceneSnapshot, box: BoundingBox, samples_m: Float64, vehicle_T_target: Float64) -> Bools:
+def is_blocked(instant: SceneSnapshot, box: BoundingBox, surface_points_m: Float64, vehicle_T_target: Float64) -> Bools:
     """(P,) whether anything but the ego takes a target's room, (P, 4, 4) poses of its box.
 
     What moves does so with its box. Of what rests, its faces are asked: whether one lies between the middle of the
@@ -208,7 +219,7 @@ def blocked(instant: SceneSnapshot, box: BoundingBox, samples_m: Float64, vehicl
     near = (away_m <= moving.radius_m + reach_m) & (moving.body_indices != instant.ego_index)
     for k in np.flatnonzero(near.any(axis=0)).tolist():
         taken[near[:, k]] |= find_overlaps(box, vehicle_T_target[near[:, k]], moving.box_corners_m[k])
-    return taken | _meets_static(instant, box, samples_m, vehicle_T_target)
+    return taken | _meets_static(instant, box, surface_points_m, vehicle_T_target)
 
 
 def _meets_static(instant: SceneSnapshot, box: BoundingBox, samples_m: Float64, vehicle_T_target: Float64) -> Bools:

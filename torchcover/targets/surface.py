@@ -66,7 +66,7 @@ class Target:
         return cls(Path(name).stem if Path(name).suffix else name, mesh)
 
 
-Bits = NDArray[np.uint8]
+PackedBits = NDArray[np.uint8]
 
 # A byte of bits has 8 of them.
 SAMPLES = 64
@@ -76,20 +76,20 @@ DRAWN_FOR_EACH = 16
 HITS_AT_ONCE = 512
 
 
-class Surface(NamedTuple):
+class TargetSurface(NamedTuple):
     """Points that stand for equal shares of a target's outer surface.
 
-    `points_m` (M, 3) in the target's frame; `normals` (M, 3) of length one; `two_sided` (M,) whether both sides may be
-    looked at, as of what is not closed; `m2_each` the square metres that each stands for.
+    `points_m` (M, 3) in the target's frame; `normals` (M, 3) of length one; `is_two_sided` (M,) whether both sides may be
+    looked at, as of what is not closed; `sample_area_m2` the square metres that each stands for.
     """
 
     points_m: Float64
     normals: Float64
-    two_sided: Bools
-    m2_each: float
+    is_two_sided: Bools
+    sample_area_m2: float
 
     @classmethod
-    def of(cls, target: Target) -> Self:
+    def from_target(cls, target: Target) -> Self:
         """Spread the points: equal steps of area over all faces, less what lies within another part of the body."""
         corners_m = target.mesh.vertices_m[target.mesh.faces]
         across = np.cross(corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0])
@@ -106,18 +106,24 @@ class Surface(NamedTuple):
         m2_each = float(up_to[-1]) / 2 * len(outer) / drawn / SAMPLES
         return cls(points_m[kept], normals[kept], two_sided[kept], m2_each)
 
-    def seen_from(
-        self, place_m: Float64, target: Target, vehicle_T_target: Float64, instant: SceneSnapshot, *, threads: int = 1
-    ) -> Bits:
+    def find_visible_samples(
+        self,
+        viewpoint_m: Float64,
+        target: Target,
+        vehicle_T_target: Float64,
+        instant: SceneSnapshot,
+        *,
+        num_threads: int = 1,
+    ) -> PackedBits:
         """(P, M / 8) bits: which of the points a (3,) place sees, the target itself and everything else in the way.
 
         The target stands at (P, 4, 4) poses in the instant, which is without it. Threads do not change the result.
         """
         target_R_vehicle = vehicle_T_target[:, :3, :3].swapaxes(1, 2)
-        there_m = (target_R_vehicle @ (place_m - vehicle_T_target[:, :3, 3])[..., None])[..., 0]
+        there_m = (target_R_vehicle @ (viewpoint_m - vehicle_T_target[:, :3, 3])[..., None])[..., 0]
         above = np.einsum("pmi,mi->pm", there_m[:, None] - self.points_m, self.normals)
-        position, sample = np.nonzero((above > 0) | self.two_sided)
-        side = np.where(self.two_sided[sample], np.sign(above[position, sample]), 1.0)
+        position, sample = np.nonzero((above > 0) | self.is_two_sided)
+        side = np.where(self.is_two_sided[sample], np.sign(above[position, sample]), 1.0)
         ends_m = self.points_m[sample] + ABOVE_M * side[:, None] * self.normals[sample]
         ways_m = ends_m - there_m[position]
         length_m = np.linalg.norm(ways_m, axis=1)
@@ -132,19 +138,19 @@ class Surface(NamedTuple):
         in_vehicle_m += vehicle_T_target[position, :3, 3]
         seen = np.zeros((len(vehicle_T_target), SAMPLES), dtype=bool)
         seen[position, sample] = compute_visibility(
-            instant, place_m, in_vehicle_m.astype(np.float32), num_threads=threads
+            instant, viewpoint_m, in_vehicle_m.astype(np.float32), num_threads=num_threads
         ).is_visible
         return np.packbits(seen, axis=1)
 
-    def near(self, hits_m: Float64, within_m: float) -> Bits:
+    def find_nearby_samples(self, hit_points_m: Float64, max_distance_m: float) -> PackedBits:
         """(N, M / 8) bits: which of the points are within a distance of each of (N, 3) points in the target's frame."""
-        near = np.empty((len(hits_m), SAMPLES // 8), dtype=np.uint8)
+        near = np.empty((len(hit_points_m), SAMPLES // 8), dtype=np.uint8)
         own = (self.points_m**2).sum(axis=1)
-        for first in range(0, len(hits_m), HITS_AT_ONCE):
-            some = hits_m[first : first + HITS_AT_ONCE]
+        for first in range(0, len(hit_points_m), HITS_AT_ONCE):
+            some = hit_points_m[first : first + HITS_AT_ONCE]
             # In float64 nothing is lost where it could matter: both are within metres of the target's origin.
             squared = (some**2).sum(axis=1)[:, None] + own - 2 * some @ self.points_m.T
-            near[first : first + HITS_AT_ONCE] = np.packbits(squared <= within_m**2, axis=1)
+            near[first : first + HITS_AT_ONCE] = np.packbits(squared <= max_distance_m**2, axis=1)
         return near
 
 

@@ -12,10 +12,10 @@ from torchcover.geometry.arrays import Float64
 from torchcover.simulation.memory import check_memory_fits
 from torchcover.simulation.rig import Rig, set_ego
 from torchcover.simulation.scenario import Scenario
-from torchcover.targets.counting import PLACES, Steps, count
-from torchcover.targets.placing import Heading, Raster, holding, poses, yaws
-from torchcover.targets.result import FREE, OCCUPIED, OUTSIDE, Spots, TargetMap
-from torchcover.targets.surface import SAMPLES, Surface, Target
+from torchcover.targets.counting import PLACES, TargetFrames, count_target_points
+from torchcover.targets.placing import Heading, Raster, build_poses, compute_yaws_rad, is_point_inside
+from torchcover.targets.result import FREE, OCCUPIED, OUTSIDE, PositionVisibility, TargetMap
+from torchcover.targets.surface import SAMPLES, Target, TargetSurface
 
 # Of one step: where each ends, on what, two random numbers. Of one cell: poses, sums, and what is made on the way.
 BYTES_PER_RAY = 21
@@ -25,16 +25,16 @@ HITS = 5
 THRESHOLD_M = 0.4
 
 
-def survey(
+def measure_target_visibility(
     rig: Rig,
     scenario: Scenario,
     target: Target,
     raster: Raster | None = None,
     *,
-    steps: int = 1,
+    num_frames: int = 1,
     frame_interval_s: float | None = None,
     seed: int = 0,
-    hits: int = HITS,
+    detection_points: int = HITS,
     threshold_m: float = THRESHOLD_M,
     heading: Heading = "narrow",
 ) -> TargetMap:
@@ -52,10 +52,10 @@ def survey(
         target: What is placed, upright, at its own height above the local ground; where there is none, the place is
             `OUTSIDE`.
         raster: Where; within 5 m of the vehicle in steps of 0.2 m if not given.
-        steps: How many steps are averaged.
+        num_frames: How many steps are averaged.
         frame_interval_s: Time between two of them; the scenario's time step if not given.
         seed: Of traffic, random places, noise and drop-out.
-        hits: How many points are enough to see it.
+        detection_points: How many points are enough to see it.
         threshold_m: How near a measured point on the target must be to a point of its surface, for the share.
         heading: Which side of it the vehicle sees: "narrow" (fewest points), "wide" (most), or its yaw in degrees.
 
@@ -71,11 +71,11 @@ def survey(
     """
     scenario = set_ego(scenario, {rig.name: rig})
     vehicle = scenario.compute_ego_box()
-    raster = Raster.around(vehicle) if raster is None else raster
+    raster = Raster.from_vehicle(vehicle) if raster is None else raster
     _check_size(target, raster)
-    spots = survey_places(
+    spots = measure_visibility_at_positions(
         rig, scenario, target, raster.positions_m,
-        steps=steps, frame_interval_s=frame_interval_s, seed=seed, hits=hits, threshold_m=threshold_m, heading=heading,
+        num_frames=num_frames, frame_interval_s=frame_interval_s, seed=seed, detection_points=detection_points, threshold_m=threshold_m, heading=heading,
     )  # fmt: skip
     return TargetMap(
         rig=rig.name,
@@ -85,73 +85,77 @@ def survey(
         target_bottom_m=target.bottom_m,
         heading=heading,
         raster=raster,
-        vehicle=vehicle,
+        vehicle_box=vehicle,
         vehicle_outline_m=_outline_m(scenario),
         sensor_model=rig.sensor_model,
         sensor_names=tuple(sensor.name for sensor in rig.sensors),
-        sensors_m=np.array([sensor.mount.to_matrix()[:2, 3] for sensor in rig.sensors]),
-        hits=hits,
+        sensor_positions_m=np.array([sensor.mount.to_matrix()[:2, 3] for sensor in rig.sensors]),
+        detection_points=detection_points,
         threshold_m=threshold_m,
         seed=seed,
-        step_count=steps,
+        num_frames=num_frames,
         **{name: array.reshape(*array.shape[:-1], *raster.shape) for name, array in vars(spots).items()},
     )
 
 
-def survey_places(
+def measure_visibility_at_positions(
     rig: Rig,
     scenario: Scenario,
     target: Target,
     positions_m: Float64,
-    counting: Sequence[int] | None = None,
+    counted_sensors: Sequence[int] | None = None,
     *,
-    steps: int = 1,
+    num_frames: int = 1,
     frame_interval_s: float | None = None,
     seed: int = 0,
-    hits: int = HITS,
+    detection_points: int = HITS,
     threshold_m: float = THRESHOLD_M,
     heading: Heading = "narrow",
-) -> Spots:
+) -> PositionVisibility:
     """What some sensors see of a target at places; all that is not said here is as in `survey`.
 
-    `positions_m`: (P, 2) where, in the vehicle frame; `counting`: numbers of the sensors that count, all if not given;
+    `positions_m`: (P, 2) where, in the vehicle frame; `counted_sensors`: numbers of the sensors that count, all if not given;
     the others are in the way as ever.
     """
-    _check(steps, seed, hits, threshold_m)
+    _check(num_frames, seed, detection_points, threshold_m)
     scenario = set_ego(scenario, {rig.name: rig})
     vehicle, box = scenario.compute_ego_box(), target.solid.bounding_box
-    _check_memory(rig, len(positions_m), steps)
-    vehicle_T_target = poses(positions_m, yaws(heading, box, vehicle, positions_m))
+    _check_memory(rig, len(positions_m), num_frames)
+    vehicle_T_target = build_poses(positions_m, compute_yaws_rad(heading, box, vehicle, positions_m))
     occupied = find_overlaps(box, vehicle_T_target, vehicle.corners_m)
     for sensor in rig.sensors:
-        occupied |= holding(box, vehicle_T_target, sensor.mount.to_matrix()[:3, 3])
-    surface, elsewhere = Surface.of(target), np.flatnonzero(~occupied)
+        occupied |= is_point_inside(box, vehicle_T_target, sensor.mount.to_matrix()[:3, 3])
+    surface, elsewhere = TargetSurface.from_target(target), np.flatnonzero(~occupied)
     every_steps = 1 if frame_interval_s is None else scenario.count_time_steps(frame_interval_s)
     around = vehicle_T_target[elsewhere]
-    run = Steps(rig, scenario, target, surface, around, steps=steps, every_steps=every_steps, seed=seed)
-    some = range(len(rig.sensors)) if counting is None else counting
-    every = run.mounted
+    run = TargetFrames(
+        rig, scenario, target, surface, around, num_frames=num_frames, frame_stride=every_steps, seed=seed
+    )
+    some = range(len(rig.sensors)) if counted_sensors is None else counted_sensors
+    every = run.mounted_sensors
     mounted = [every[k] for k in some]
-    taken = [step._replace(sensors=[step.sensors[k] for k in some]) for step in run]
-    sums = count(target, surface, around, mounted, taken, hits=hits, threshold_m=threshold_m)
+    taken = [step._replace(sensor_frames=[step.sensor_frames[k] for k in some]) for step in run]
+    sums = count_target_points(
+        target, surface, around, mounted, taken, detection_points=detection_points, threshold_m=threshold_m
+    )
 
     def spread(values: NDArray[Any], empty: float = np.nan) -> NDArray[Any]:
         everywhere = np.full((*values.shape[:-1], len(positions_m)), empty, dtype=values.dtype)
         everywhere[..., elsewhere] = values
         return everywhere
 
-    steps_with = np.where(sums.steps > 0, sums.steps, np.nan)
-    visible = np.where(sums.visible > 0, sums.visible, np.nan)
-    return Spots(
-        state=spread(np.where(sums.steps > 0, FREE, OUTSIDE).astype(np.uint8), OCCUPIED),
-        steps=spread(sums.steps, 0),
-        sensor_points=spread(sums.points / steps_with),
-        sensors=spread(sums.sensors / steps_with),
-        seen=spread(sums.seen / steps_with),
-        least_points=spread(np.where(sums.steps > 0, sums.least_points, np.nan)),
-        least_sensors=spread(np.where(sums.steps > 0, sums.least_sensors, np.nan)),
-        share=spread(sums.near / visible),
-        visible_m2=spread(sums.visible / steps_with * surface.m2_each / run.places),
+    steps_with = np.where(sums.free_frames > 0, sums.free_frames, np.nan)
+    visible = np.where(sums.visible_samples > 0, sums.visible_samples, np.nan)
+    return PositionVisibility(
+        state=spread(np.where(sums.free_frames > 0, FREE, OUTSIDE).astype(np.uint8), OCCUPIED),
+        free_frames=spread(sums.free_frames, 0),
+        sensor_points=spread(sums.sensor_points / steps_with),
+        detecting_sensors=spread(sums.detecting_sensors / steps_with),
+        detected_share=spread(sums.detected_frames / steps_with),
+        min_points=spread(np.where(sums.free_frames > 0, sums.min_points, np.nan)),
+        min_sensors=spread(np.where(sums.free_frames > 0, sums.min_sensors, np.nan)),
+        surface_share=spread(sums.detected_samples / visible),
+        visible_m2=spread(sums.visible_samples / steps_with * surface.sample_area_m2 / run.viewpoints_per_frame),
     )
 
 
@@ -172,7 +176,7 @@ def _check(steps: int, seed: int, hits: int, threshold_m: float) -> None:
 
 def _check_size(target: Target, raster: Raster) -> None:
     length_m, width_m, _ = target.solid.bounding_box.size_m
-    wide_m, high_m = raster.x[1] - raster.x[0], raster.y[1] - raster.y[0]
+    wide_m, high_m = raster.x_bounds_m[1] - raster.x_bounds_m[0], raster.y_bounds_m[1] - raster.y_bounds_m[0]
     if max(length_m, width_m) > max(wide_m, high_m) or min(length_m, width_m) > min(wide_m, high_m):
         raise ValueError(
             f"target {target.name!r} is {length_m:.3g} x {width_m:.3g} m, larger than the raster of {wide_m:.3g} x "

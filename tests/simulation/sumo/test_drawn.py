@@ -16,10 +16,10 @@ from torchcover import Rig, Scenario
 from torchcover.data import SimulatedFrames
 from torchcover.files import BadFileError, parse_xml
 from torchcover.simulation import PaperReference
-from torchcover.simulation.sumo import Sumo, simulating, traffic
+from torchcover.simulation.sumo import SumoTraffic, simulating, traffic
 from torchcover.simulation.sumo.network import read_network
-from torchcover.simulation.sumo.simulating import from_opendrive
-from torchcover.simulation.sumo.streets import TURN_MPS2, DrawnStreets, turning_mps, write_routes
+from torchcover.simulation.sumo.simulating import convert_opendrive
+from torchcover.simulation.sumo.streets import TURN_MPS2, RandomStreets, compute_turning_speed_mps, write_routes
 from torchcover.simulation.traffic.fleet import KIND_OF, Fleet, load_bodies
 
 from .towns import XODR, street, write_net
@@ -32,7 +32,7 @@ ROUTES = """<routes><vType id="car" length="5"/>{more}<vehicle id="{name}" type=
 
 
 def drawn(network="grid", **options):
-    return Sumo(random={"network": network, **LITTLE, **options}, duration_s=2.0, time_step_s=0.5)
+    return SumoTraffic(random={"network": network, **LITTLE, **options}, duration_s=2.0, time_step_s=0.5)
 
 
 def fingerprint(world):
@@ -72,13 +72,13 @@ def test_workers_see_the_same_frames_and_each_run_is_another_town():
 
 @pytest.mark.parametrize("network", ["rand", "grid", "spider"])
 def test_drawn_streets_go_on_everywhere_and_have_all_that_was_asked_for(network, tmp_path):
-    streets = DrawnStreets(network=network, lanes=3, hills_m=0.0)
-    town = read_network(streets.build(tmp_path, np.random.default_rng(2)))
+    streets = RandomStreets(layout=network, max_lanes_per_direction=3, hill_height_std_m=0.0)
+    town = read_network(streets.build_network(tmp_path, np.random.default_rng(2)))
     assert not any(lane.line_m[:, 2].any() for lane in town.lanes)
     assert {lane.use for lane in town.lanes} == {"road", "turn", "bay", "sidewalk", "crossing", "corner"}
     turns = [lane for lane in town.lanes if lane.use == "turn"]
-    assert all(lane.speed_mps <= turning_mps(lane.line_m[:, :2]) + 0.01 for lane in turns)
-    follow = town.follow("passenger")
+    assert all(lane.speed_mps <= compute_turning_speed_mps(lane.line_m[:, :2]) + 0.01 for lane in turns)
+    follow = town.find_successors("passenger")
     assert len(follow) > 10
     assert all(follow.values())
     # Nobody has to turn round.
@@ -86,8 +86,8 @@ def test_drawn_streets_go_on_everywhere_and_have_all_that_was_asked_for(network,
 
 
 def test_drawn_traffic_has_bodies_of_all_sizes_and_lorries_and_buses_among_them(tmp_path):
-    generator, streets = np.random.default_rng(0), DrawnStreets(network="grid", buses_per_km=5.0)
-    town, routes = read_network(streets.build(tmp_path, generator)), tmp_path / "drawn.rou.xml"
+    generator, streets = np.random.default_rng(0), RandomStreets(layout="grid", buses_per_km=5.0)
+    town, routes = read_network(streets.build_network(tmp_path, generator)), tmp_path / "drawn.rou.xml"
     fleet = Fleet(load_bodies(), None, generator)
     write_routes(routes, town, streets, fleet, 20.0, generator)
     told = parse_xml(routes)
@@ -95,13 +95,15 @@ def test_drawn_traffic_has_bodies_of_all_sizes_and_lorries_and_buses_among_them(
     driven = [vehicle.get("type") for vehicle in told.iter("vehicle")]
     assert {KIND_OF[kind] for kind in driven if kind != "ego"} > {"sedan", "suv", "hatchback", "van", "lorry", "bus"}
     assert len({lengths_m[kind] for kind in driven}) > 12
-    assert all(abs(lengths_m[kind] - fleet.length_m(kind)) < 0.01 for kind in driven)
+    assert all(abs(lengths_m[kind] - fleet.get_length_m(kind)) < 0.01 for kind in driven)
 
 
 def test_open_drive_brings_its_heights_and_sidewalks(tmp_path):
     (tmp_path / "road.xodr").write_text(XODR)
     (tmp_path / "r.xml").write_text(ROUTES.format(name="me", more=""))
-    made = Sumo(net=tmp_path / "road.xodr", routes=(tmp_path / "r.xml",), ego_id="me", begin_s=0.0, duration_s=8.0)
+    made = SumoTraffic(
+        net=tmp_path / "road.xodr", routes=(tmp_path / "r.xml",), ego_id="me", begin_s=0.0, duration_s=8.0
+    )
     world = made.build_scene(0)
     x_m, _, z_m = world.ego.trajectory.positions_m.T
     assert np.ptp(x_m) > 60.0
@@ -136,10 +138,10 @@ def test_losses_of_open_drive_are_reported(old, new, told, tmp_path):
     assert XODR.count(old) == 1
     (tmp_path / "road.xodr").write_text(XODR.replace(old, new))
     with pytest.warns(UserWarning, match=f"OpenDRIVE: left out, .*{told}"):
-        from_opendrive(tmp_path / "road.xodr", tmp_path, leave_out_links=False)
+        convert_opendrive(tmp_path / "road.xodr", tmp_path, leave_out_links=False)
     (tmp_path / "road.xodr").write_text(XODR.replace('junction="-1"', 'junction="-1" rule="LHT"'))
     with pytest.raises(BadFileError, match=r"road 1: left-hand traffic .* netconvert --lefthand"):
-        from_opendrive(tmp_path / "road.xodr", tmp_path, leave_out_links=False)
+        convert_opendrive(tmp_path / "road.xodr", tmp_path, leave_out_links=False)
 
 
 MANY = " ".join(f"a{number}='1'" for number in range(1001))  # attributes, of which SUMO compares each with each
@@ -150,11 +152,11 @@ def test_projections_of_open_drive_name_no_files_and_attributes_are_few(tmp_path
     reference = "<geoReference><![CDATA[{}]]></geoReference></header>"
     (tmp_path / "road.xodr").write_text(XODR.replace("<road", f"<road {MANY}", 1))
     with pytest.raises(BadFileError, match="<road> has 1005 attributes; at most 1000 are read"):
-        from_opendrive(tmp_path / "road.xodr", tmp_path, leave_out_links=False)
+        convert_opendrive(tmp_path / "road.xodr", tmp_path, leave_out_links=False)
     for words, told in (("+proj=utm +geoidgrids=/a/pipe", "'.*/a/pipe' names a file"), ("+proj=utm +zone=32", None)):
         (tmp_path / "road.xodr").write_text(XODR.replace('"4"/>', f'"4">{reference.format(words)}', 1))
         with nullcontext() if told is None else pytest.raises(BadFileError, match=f"the projection {told}; remove"):
-            from_opendrive(tmp_path / "road.xodr", tmp_path, leave_out_links=False)
+            convert_opendrive(tmp_path / "road.xodr", tmp_path, leave_out_links=False)
 
 
 def test_links_of_open_drive_that_lead_nowhere_are_named_and_may_be_left_out(tmp_path):
@@ -164,7 +166,9 @@ def test_links_of_open_drive_that_lead_nowhere_are_named_and_may_be_left_out(tmp
         XODR.replace("<planView>", f"{link}<planView>").replace("</OpenDRIVE>", f"{nowhere}</OpenDRIVE>")
     )
     (tmp_path / "r.xml").write_text(ROUTES.format(name="me", more=""))
-    made = Sumo(net=tmp_path / "road.xodr", routes=(tmp_path / "r.xml",), ego_id="me", begin_s=0.0, duration_s=2.0)
+    made = SumoTraffic(
+        net=tmp_path / "road.xodr", routes=(tmp_path / "r.xml",), ego_id="me", begin_s=0.0, duration_s=2.0
+    )
     told = "road 1, predecessor road 7; junction 8, connection 0, connectingRoad .none.; `leave_out_links: true`"
     with pytest.raises(BadFileError, match=f"road.xodr: SUMO's netconvert fails: .*{told}"):
         made.build_scene(0)
@@ -183,13 +187,13 @@ def test_links_of_open_drive_that_lead_nowhere_are_named_and_may_be_left_out(tmp
 def test_a_road_that_netconvert_refuses_ends_with_its_message(text, message, tmp_path):
     (tmp_path / "road.xodr").write_text(text)
     with pytest.raises(BadFileError, match=f"road.xodr: .*{message}"):
-        Sumo(net=tmp_path / "road.xodr", random={}, duration_s=2.0).build_scene(0)
+        SumoTraffic(net=tmp_path / "road.xodr", random={}, duration_s=2.0).build_scene(0)
 
 
 def test_what_sumo_says_is_passed_on_and_entities_never_get_to_it(tmp_path):
     net = write_net(tmp_path / "a.net.xml", street())
     routes = tmp_path / "r.xml"
-    made = Sumo(net=net, routes=(routes,), duration_s=2.0)
+    made = SumoTraffic(net=net, routes=(routes,), duration_s=2.0)
     routes.write_text(ROUTES.format(name="me", more=""))
     with pytest.raises(ValueError, match=r"SUMO's sumo fails: .+") as failed:
         made.build_scene(0)
@@ -198,7 +202,7 @@ def test_what_sumo_says_is_passed_on_and_entities_never_get_to_it(tmp_path):
     with pytest.raises(BadFileError, match=r"r\.xml: .*without entities"):
         made.build_scene(0)
     with pytest.raises(FileNotFoundError, match=r"none\.xml"):
-        Sumo(net=net, routes=(tmp_path / "none.xml",), duration_s=2.0).build_scene(0)
+        SumoTraffic(net=net, routes=(tmp_path / "none.xml",), duration_s=2.0).build_scene(0)
 
 
 OUTPUT = "x.out"
@@ -209,7 +213,7 @@ def road(tmp_path_factory):
     """A network with one street, the edge -1."""
     folder = tmp_path_factory.mktemp("road")
     (folder / "road.xodr").write_text(XODR)
-    return simulating.from_opendrive(folder / "road.xodr", folder, leave_out_links=False)
+    return simulating.convert_opendrive(folder / "road.xodr", folder, leave_out_links=False)
 
 
 @pytest.mark.parametrize(
@@ -253,7 +257,7 @@ def test_scenarios_name_no_outputs_and_no_addresses(road, tmp_path, where, added
     route = f'<vehicle id="me" depart="0"><route edges="-1"/>{added * (where == "route")}</vehicle>'
     (tmp_path / "r.xml").write_text(f"<routes>{added * (where == 'root')}{route}</routes>")
     with pytest.raises(BadFileError, match=re.escape(told)):
-        Sumo(
+        SumoTraffic(
             net=tmp_path / "a.net.xml", routes=(tmp_path / "r.xml",), ego_id="me", begin_s=0.0, duration_s=1.0
         ).build_scene(0)
     assert [one.read_text() for one in tmp_path.glob(OUTPUT)] == ["a user's file"]
@@ -266,7 +270,7 @@ def test_pictures_and_notes_of_scenarios_change_nothing(road, tmp_path):
         '<routes><vType id="t" imgFile="car.png" emissionClass="PHEMlight/../x" lcStrategic="1" jmTimegapMinor="1"/>'
         f'<vehicle id="me" type="t" depart="0"><route edges="-1"/>{notes}</vehicle></routes>'
     )
-    world = Sumo(net=road, routes=(routes,), ego_id="me", begin_s=1.0, duration_s=1.0).build_scene(0)
+    world = SumoTraffic(net=road, routes=(routes,), ego_id="me", begin_s=1.0, duration_s=1.0).build_scene(0)
     assert len(world.ego.trajectory.times_s)
 
 
@@ -287,15 +291,15 @@ def test_a_program_writes_no_files_talks_without_end_and_may_run_out_of_memory(s
     program.chmod(0o700)
     monkeypatch.setattr(simulating, "home", lambda: tmp_path)
     with pytest.raises(ValueError, match=message):
-        list(simulating.output_of("sumo"))
+        list(simulating.stream_output("sumo"))
     assert new.read_text() == ""
 
 
 def test_a_simulation_that_is_over_before_the_run_begins_is_refused(tmp_path):
-    net, routes = DrawnStreets().build(tmp_path, np.random.default_rng(0)), tmp_path / "r.xml"
+    net, routes = RandomStreets().build_network(tmp_path, np.random.default_rng(0)), tmp_path / "r.xml"
     routes.write_text("<routes/>")
     with pytest.raises(ValueError, match=r"the simulation is over before t = 60 s, where the run begins: .*begin_s"):
-        Sumo(net=net, routes=(routes,), duration_s=2.0).build_scene(0)
+        SumoTraffic(net=net, routes=(routes,), duration_s=2.0).build_scene(0)
 
 
 def test_without_sumo_one_line_says_what_to_install(monkeypatch):
@@ -308,7 +312,7 @@ def test_without_sumo_one_line_says_what_to_install(monkeypatch):
 def test_a_net_without_ways_and_too_much_traffic_are_refused(tmp_path):
     net = write_net(tmp_path / "a.net.xml", street())
     with pytest.raises(ValueError, match="no street that cars may use and that leads on"):
-        Sumo(net=net, random={}, duration_s=2.0).build_scene(0)
+        SumoTraffic(net=net, random={}, duration_s=2.0).build_scene(0)
     with pytest.raises(ValueError, match=r"traffic of about [\d,]+ vehicles and people; at most 20,000 are drawn"):
         drawn(traffic_per_km=200.0, people_per_km=1000.0, cyclists_per_km=1000.0, buses_per_km=200.0).build_scene(0)
 
@@ -329,11 +333,13 @@ def test_a_turn_is_driven_as_slowly_as_its_tightest_piece_asks_for():
     angle = np.linspace(0.0, np.pi / 2, 40)
     arc_m = 6.0 * np.stack([np.sin(angle), 1 - np.cos(angle)], axis=1)
     lead_m = np.column_stack([np.linspace(-30.0, -1.0, 30), np.zeros(30)])
-    assert turning_mps(np.concatenate([lead_m, arc_m])) == pytest.approx(np.sqrt(TURN_MPS2 * 6.0), rel=0.02)
-    assert turning_mps(lead_m) > 100.0
+    assert compute_turning_speed_mps(np.concatenate([lead_m, arc_m])) == pytest.approx(
+        np.sqrt(TURN_MPS2 * 6.0), rel=0.02
+    )
+    assert compute_turning_speed_mps(lead_m) > 100.0
 
 
 def test_a_program_that_finds_no_end_is_ended(tmp_path, monkeypatch):
     monkeypatch.setattr(simulating, "MOST_S", 0.5)
     with pytest.raises(ValueError, match=r"SUMO's netgenerate took more than 0\.5 s of processor time"):
-        simulating.run("netgenerate", "--rand", "--rand.iterations", "9999999", "-o", tmp_path / "a.net.xml")
+        simulating.run_program("netgenerate", "--rand", "--rand.iterations", "9999999", "-o", tmp_path / "a.net.xml")

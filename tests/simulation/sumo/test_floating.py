@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from torchcover.files import BadFileError
-from torchcover.simulation.sumo.floating import TimeWindow, read_floating, record
-from torchcover.simulation.sumo.motion import RoadUser, motions
+from torchcover.simulation.sumo.floating import TimeWindow, parse_floating_car_data, read_floating_car_data
+from torchcover.simulation.sumo.motion import RoadUser, compute_motions
 
 from .towns import drive, fcd, together, vehicle
 
@@ -13,7 +13,7 @@ ALL = TimeWindow(-np.inf, 100.0)
 
 
 def recorded(steps, window=ALL):
-    return record([fcd(steps).encode()], window)
+    return parse_floating_car_data([fcd(steps).encode()], window)
 
 
 @pytest.mark.parametrize(
@@ -23,9 +23,9 @@ def test_places_are_those_of_the_front_and_angles_run_clockwise_from_north(angle
     row = vehicle("a", 10.0, 20.0, angle, z=3.0)
     track = recorded({0.0: [row], 1.0: [row]}).tracks[0]
     assert (track.yaw_deg[0] - yaw) % 360 == 0
-    (body,) = motions([RoadUser(track, "van", 6.0, ((5.0, 2.0),))], 1.0, np.zeros(2))
+    (body,) = compute_motions([RoadUser(track, "van", 6.0, ((5.0, 2.0),))], 1.0, np.zeros(2))
     np.testing.assert_allclose(body.poses[0, :2], np.array([10.0, 20.0]) - 3.0 * np.array(ahead), atol=1e-12)
-    assert track.places_m[0, 2] == 3.0
+    assert track.front_positions_m[0, 2] == 3.0
 
 
 def test_who_is_gone_in_between_or_jumps_has_several_tracks():
@@ -39,7 +39,7 @@ def test_who_is_gone_in_between_or_jumps_has_several_tracks():
         for name in "sgj"
     }
     assert spans == {"s": [(0.0, 4.0)], "g": [(0.0, 0.8), (1.4, 4.0)], "j": [(0.0, 1.8), (2.0, 4.0)]}
-    assert [track.covers(4.0) for track in found.tracks if track.name == "s"] == [True]
+    assert [track.is_present_for(4.0) for track in found.tracks if track.name == "s"] == [True]
 
 
 def test_a_window_begins_when_it_is_due_or_the_ego_is_there_and_reads_no_further():
@@ -55,7 +55,7 @@ def test_a_window_begins_when_it_is_due_or_the_ego_is_there_and_reads_no_further
             yield text[start : start + 100].encode()
         raise AssertionError("asked for more than the window needs")
 
-    assert record(pieces(), TimeWindow(0.0, 1.0)).last_s == 1.0
+    assert parse_floating_car_data(pieces(), TimeWindow(0.0, 1.0)).last_time_s == 1.0
 
 
 def test_a_window_waits_for_a_vehicle_and_not_for_a_type_of_that_name():
@@ -69,14 +69,14 @@ def test_who_rides_is_inside():
     ride = {t: vehicle("p", 50.0 + 10.0 * t, 0.0, tag="person") for t in drive() if 0.4 < t < 2.0}
     on = {t: vehicle("p", 70.0, -3.0, tag="person") for t in drive() if t >= 2.0}
     only = {t: vehicle("q", 50.0 + 10.0 * t, 0.0, tag="person") for t in drive()}
-    found = [track for track in recorded(together(drive(), walk | ride | on, only)).tracks if track.on_foot]
+    found = [track for track in recorded(together(drive(), walk | ride | on, only)).tracks if track.is_pedestrian]
     spans = [(track.name, round(track.times_s[0], 6), round(track.times_s[-1], 6)) for track in found]
     assert spans == [("p", 0.0, 0.4), ("p", 2.0, 4.0)]
 
 
 def test_rows_may_have_different_attributes():
     steps = {0.0: [vehicle("a", 0, 0, z=1.0, slope=2.0), vehicle("b", 5, 0, z=2.0)], 0.2: [vehicle("b", 5, 0)]}
-    assert {track.name: track.places_m[0, 2] for track in recorded(steps).tracks} == {"a": 1.0, "b": 2.0}
+    assert {track.name: track.front_positions_m[0, 2] for track in recorded(steps).tracks} == {"a": 1.0, "b": 2.0}
 
 
 def geo(**more):
@@ -88,7 +88,7 @@ def geo(**more):
 def test_what_stands_near_the_origin_is_no_longitude():
     there = [vehicle("a", "8.402076", "49.000110", angle="0.00", speed=0.0)]
     (track,) = recorded({0.0: there, 0.2: there}).tracks
-    assert track.places_m[0].tolist() == [8.402076, 49.00011, 0.0]
+    assert track.front_positions_m[0].tolist() == [8.402076, 49.00011, 0.0]
 
 
 @pytest.mark.parametrize(
@@ -110,4 +110,4 @@ def test_what_is_no_floating_car_data_is_refused(text, message, tmp_path):
     path = tmp_path / "fcd.xml"
     path.write_text(text)
     with pytest.raises(BadFileError, match=f"fcd.xml: .*{message}"):
-        read_floating(path, ALL)
+        read_floating_car_data(path, ALL)

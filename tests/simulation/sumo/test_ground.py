@@ -5,7 +5,7 @@ import pytest
 import trimesh
 
 from torchcover.simulation.height_field import FlatGround, GroundHeightField
-from torchcover.simulation.sumo.ground import Pavement, decks, ground_of, tilts_deg
+from torchcover.simulation.sumo.ground import Sidewalks, build_bridges, build_ground, compute_tilts_deg
 from torchcover.simulation.sumo.network import Vicinity, read_network
 
 from .towns import DRIVE, WALK, edge, street, write_net
@@ -25,7 +25,7 @@ def hill():
 
 
 def test_a_network_of_one_height_has_plain_ground_of_two_triangles(tmp_path):
-    ground = ground_of(vicinity(tmp_path, street(z=(3.0, 3.0))))
+    ground = build_ground(vicinity(tmp_path, street(z=(3.0, 3.0))))
     assert isinstance(ground, FlatGround)
     assert len(ground.build_mesh().faces) == 2
     assert (ground.build_mesh().vertices_m[:, 2] == 3.0).all()
@@ -33,13 +33,13 @@ def test_a_network_of_one_height_has_plain_ground_of_two_triangles(tmp_path):
 
 
 def test_a_street_that_climbs_takes_the_ground_with_it(tmp_path):
-    ground = ground_of(vicinity(tmp_path, street(z=(0.0, 20.0))))
+    ground = build_ground(vicinity(tmp_path, street(z=(0.0, 20.0))))
     along = np.column_stack([np.linspace(20.0, 380.0, 50), np.zeros(50)])
     np.testing.assert_allclose(ground.compute_heights_m(along), 0.05 * along[:, 0], atol=0.02)
-    pitch, roll = tilts_deg(ground, along, np.zeros(50), (5.0, 2.0)).T
+    pitch, roll = compute_tilts_deg(ground, along, np.zeros(50), (5.0, 2.0)).T
     np.testing.assert_allclose(pitch, -np.rad2deg(np.arctan(0.05)), atol=0.1)  # the nose is up
     np.testing.assert_allclose(roll, 0.0, atol=0.1)
-    _, roll = tilts_deg(ground, along, np.full(50, -90.0), (5.0, 2.0)).T
+    _, roll = compute_tilts_deg(ground, along, np.full(50, -90.0), (5.0, 2.0)).T
     np.testing.assert_allclose(roll, np.rad2deg(np.arctan(0.05)), atol=0.1)  # to the south, the left side is up
 
 
@@ -68,9 +68,9 @@ def test_the_ground_faces_up_and_has_no_holes():
 @pytest.mark.parametrize("z", [(1.0, 1.0), (0.0, 12.0)])
 def test_kerbs_are_closed_and_as_high_as_they_should_be(z, tmp_path):
     near = vicinity(tmp_path, street(z=z))
-    ground = ground_of(near)
-    pavement = Pavement(near, ground)
-    (mesh,) = pavement.meshes()
+    ground = build_ground(near)
+    pavement = Sidewalks(near, ground)
+    (mesh,) = pavement.build_meshes()
     body = trimesh.Trimesh(*mesh, process=False)
     assert body.is_watertight
     assert body.is_winding_consistent
@@ -78,33 +78,33 @@ def test_kerbs_are_closed_and_as_high_as_they_should_be(z, tmp_path):
     above_m = mesh.vertices_m[:, 2] - ground.compute_heights_m(mesh.vertices_m[:, :2])
     np.testing.assert_allclose(np.unique(above_m.round(9)), [-0.3, 0.15])
     on, off = np.array([[50.0, -2.75], [399.0, -3.7]]), np.array([[50.0, -1.7], [50.0, 0.0], [50.0, -3.8]])
-    assert pavement.holds(on).all()
-    assert not pavement.holds(off).any()
+    assert pavement.is_inside(on).all()
+    assert not pavement.is_inside(off).any()
 
 
 def test_nobody_drives_over_a_kerb(tmp_path):
     crossing = edge(":j_c0", (WALK, 4.0, [(100, -5, 0), (100, 5, 0)]), function="crossing")
     corner = edge(":j_w0", (WALK, 4.0, [(200, -9, 0), (240, -9, 0), (240, 1, 0), (200, 1, 0)]), function="walkingarea")
     near = vicinity(tmp_path, street(), crossing, corner)
-    pavement = Pavement(near, ground_of(near))
+    pavement = Sidewalks(near, build_ground(near))
     xs = np.linspace(1.0, 399.0, 400)
-    assert not pavement.holds(np.column_stack([xs, np.full(400, -1.7)])).any()
-    assert not pavement.holds(np.array([[99.0, -2.75], [101.0, -3.5]])).any()
-    assert pavement.holds(np.array([[97.0, -2.75], [103.0, -2.75], [220.0, -8.0]])).all()
-    assert len(pavement.parts) == 2
-    for mesh in pavement.meshes():
+    assert not pavement.is_inside(np.column_stack([xs, np.full(400, -1.7)])).any()
+    assert not pavement.is_inside(np.array([[99.0, -2.75], [101.0, -3.5]])).any()
+    assert pavement.is_inside(np.array([[97.0, -2.75], [103.0, -2.75], [220.0, -8.0]])).all()
+    assert len(pavement.polygons) == 2
+    for mesh in pavement.build_meshes():
         assert trimesh.Trimesh(*mesh, process=False).is_watertight
 
 
 def test_a_bridge_has_a_deck_and_the_ground_goes_below(tmp_path):
     over = edge("over", (DRIVE, 7.0, [(100, -150, 0), (100, -60, 6), (100, 60, 6), (100, 150, 0)]))
     near = vicinity(tmp_path, street(), over)
-    ground = ground_of(near)
+    ground = build_ground(near)
     np.testing.assert_allclose(
         ground.compute_heights_m(np.array([[80.0, 0.0], [100.0, 0.0], [120.0, 0.0]])), 0.0, atol=0.05
     )
     np.testing.assert_allclose(ground.compute_heights_m(np.array([[100.0, -55.0], [100.0, 55.0]])), 6.0, atol=0.1)
-    (deck,) = decks(near)
+    (deck,) = build_bridges(near)
     body = trimesh.Trimesh(*deck, process=False)
     assert body.is_watertight
     assert body.volume > 0

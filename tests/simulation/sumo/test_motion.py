@@ -5,10 +5,16 @@ import pytest
 import shapely
 
 from torchcover.simulation.sumo.floating import SumoTrack
-from torchcover.simulation.sumo.ground import Pavement, ground_of
-from torchcover.simulation.sumo.motion import CATCH_UP_MPS, RoadUser, corners_m, motions, possible
+from torchcover.simulation.sumo.ground import Sidewalks, build_ground
+from torchcover.simulation.sumo.motion import (
+    CATCH_UP_MPS,
+    RoadUser,
+    compute_motions,
+    compute_rectangle_corners_m,
+    drop_colliding_users,
+)
 from torchcover.simulation.sumo.network import Vicinity, read_network
-from torchcover.simulation.traffic.fleet import DRAWS, tractrix
+from torchcover.simulation.traffic.fleet import DRAWS, compute_tractrix_yaw_rad
 
 from .towns import DRIVE, WALK, edge, write_net
 
@@ -48,14 +54,14 @@ def turn(radius_m, speed_mps=5.0, begin_m=(0.0, 0.0), lead_in_m=30.0):
 
 
 def test_straight_on_nothing_changes_and_bodies_are_as_long_as_told():
-    (motion,) = motions([user(straight())], 10.0, ORIGIN)
+    (motion,) = compute_motions([user(straight())], 10.0, ORIGIN)
     np.testing.assert_allclose(motion.poses[:, 0], 10.0 * motion.times_s - 2.5, atol=1e-9)
     np.testing.assert_allclose(motion.poses[:, 1:], 0.0, atol=1e-12)
 
 
 def test_a_corner_is_driven_round_and_lane_changes_are_smooth():
     corner = np.concatenate([straight(4.0, 6.0), [[24.0, 0.8 * k] for k in range(1, 30)]])
-    (motion,) = motions([user(corner)], 11.8, ORIGIN)
+    (motion,) = compute_motions([user(corner)], 11.8, ORIGIN)
     assert accelerations(motion).max() < 6.0
     assert speeds(motion).max() < 4.01
     heading = np.arctan2(*np.diff(motion.poses[:, :2], axis=0).T[::-1])
@@ -63,15 +69,15 @@ def test_a_corner_is_driven_round_and_lane_changes_are_smooth():
     assert np.abs(motion.poses[1:, 2] - heading).max() < 0.6
     drift = straight(10.0, 8.0)
     drift[:, 1] = (1.1 * (drift[:, 0] / 10.0 - 2.0)).clip(0.0, 3.3)
-    (motion,) = motions([user(drift)], 8.0, ORIGIN)
+    (motion,) = compute_motions([user(drift)], 8.0, ORIGIN)
     assert accelerations(motion).max() < 2.0
 
 
 def test_poses_of_one_do_not_depend_on_who_else_is_there():
     bodies = [user(turn(8.0)), user(straight(3.0, 2.0), begin_s=4.0), user(straight(1.0, 9.0), on_foot=True)]
-    together = motions(bodies, 14.0, ORIGIN)
+    together = compute_motions(bodies, 14.0, ORIGIN)
     for body, motion in zip(bodies, together, strict=True):
-        (alone,) = motions([body], 14.0, ORIGIN)
+        (alone,) = compute_motions([body], 14.0, ORIGIN)
         np.testing.assert_array_equal(alone.times_s, motion.times_s)
         np.testing.assert_allclose(alone.poses, motion.poses, atol=1e-9)
     assert together[1].times_s[[0, -1]] == pytest.approx([4.0, 6.0])
@@ -82,33 +88,38 @@ def test_people_walk_what_they_jumped(jump_m, back):
     places_m = straight(1.2, 30.0)
     places_m[75:, 1] += 0.6 * jump_m
     places_m[75:, 0] += 0.8 * jump_m * back
-    (motion,) = motions([user(places_m, on_foot=True, kind="adult", size_m=(0.3, 0.5))], 30.0, ORIGIN)
+    (motion,) = compute_motions([user(places_m, on_foot=True, kind="adult", size_m=(0.3, 0.5))], 30.0, ORIGIN)
     assert speeds(motion).max() < 1.2 + CATCH_UP_MPS + 1e-6
-    assert motion.can_be
+    assert motion.is_plausible
     np.testing.assert_allclose(motion.poses[[0, -1], :2], places_m[[0, -1]], atol=1e-6)
 
 
 def test_nobody_runs_faster_than_people_do():
-    (motion,) = motions([user(straight(9.0, 10.0), on_foot=True)], 10.0, ORIGIN)
-    assert not motion.can_be
+    (motion,) = compute_motions([user(straight(9.0, 10.0), on_foot=True)], 10.0, ORIGIN)
+    assert not motion.is_plausible
 
 
 def test_who_is_where_another_one_is_goes_and_of_two_the_one_that_meets_more():
     rows = [user(straight(y_m=20.0)), *(user(straight(x_m=4.0 * k)) for k in range(3)), user(straight(y_m=2.2))]
-    bodies = motions(rows, 10.0, ORIGIN)
-    assert [body.poses[0].round(1).tolist() for body in possible(bodies)] == [
+    bodies = compute_motions(rows, 10.0, ORIGIN)
+    assert [body.poses[0].round(1).tolist() for body in drop_colliding_users(bodies)] == [
         bodies[k].poses[0].round(1).tolist() for k in (0, 1, 3, 4)
     ]
-    rest = motions([user(np.tile([[x, 20.5]], (51, 1))) for x in (30.0, 50.0)], 10.0, ORIGIN)
-    assert possible([bodies[0], *rest]) == [bodies[0]]
-    (later,) = motions([user(straight(0.1, 2.0, x_m=50.0, y_m=20.5), begin_s=7.0)], 10.0, ORIGIN)
-    assert possible([bodies[0], later]) == [bodies[0], later]
+    rest = compute_motions([user(np.tile([[x, 20.5]], (51, 1))) for x in (30.0, 50.0)], 10.0, ORIGIN)
+    assert drop_colliding_users([bodies[0], *rest]) == [bodies[0]]
+    (later,) = compute_motions([user(straight(0.1, 2.0, x_m=50.0, y_m=20.5), begin_s=7.0)], 10.0, ORIGIN)
+    assert drop_colliding_users([bodies[0], later]) == [bodies[0], later]
 
 
 def test_who_is_on_a_bridge_meets_nobody_below_it():
     below, above = user(straight()), user(np.column_stack([np.full(51, 50.0), straight(x_m=-50.0)[:, 0]]), yaw_deg=90.0)
-    lifted = above._replace(track=above.track._replace(places_m=above.track.places_m + np.array([0.0, 0.0, 6.0])))
-    assert [len(possible(motions([below, other], 10.0, ORIGIN))) for other in (above, lifted)] == [1, 2]
+    lifted = above._replace(
+        track=above.track._replace(places_m=above.track.front_positions_m + np.array([0.0, 0.0, 6.0]))
+    )
+    assert [len(drop_colliding_users(compute_motions([below, other], 10.0, ORIGIN))) for other in (above, lifted)] == [
+        1,
+        2,
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -121,21 +132,22 @@ def corner(tmp_path_factory):
     ]
     net = write_net(tmp_path_factory.mktemp("corner") / "a.net.xml", *ways)
     near = Vicinity(read_network(net), np.array([[0.0, 0.0], [10.0, 0.0]]), ORIGIN)
-    return Pavement(near, ground_of(near)).parts
+    return Sidewalks(near, build_ground(near)).polygons
 
 
 def test_long_vehicles_swing_out_and_none_comes_over_a_kerb(corner):
     bus = user(turn(5.0, 3.0, (3.5, 4.5)), size_m=(9.0, 2.4))
-    (cuts,), (swings,) = (motions([bus], 22.0, ORIGIN, kerbs) for kerbs in (None, corner))
+    (cuts,), (swings,) = (compute_motions([bus], 22.0, ORIGIN, kerbs) for kerbs in (None, corner))
     over = [
         shapely.intersection(
-            shapely.polygons(corners_m(m.poses, np.tile(bus.sizes_m[0], (len(m.poses), 1)))), shapely.union_all(corner)
+            shapely.polygons(compute_rectangle_corners_m(m.poses, np.tile(bus.part_sizes_m[0], (len(m.poses), 1)))),
+            shapely.union_all(corner),
         )
         for m in (cuts, swings)
     ]
     assert shapely.area(over[0]).max() > 1.0
     assert shapely.area(over[1]).max() == 0.0
-    assert swings.over_kerb_m == 0.0
+    assert swings.curb_overlap_m == 0.0
     assert accelerations(swings).max() < 3.5
 
 
@@ -145,40 +157,42 @@ def semi_trailer(places_m):
 
 def test_a_trailer_follows_its_kingpin_and_both_parts_count(corner):
     truck = semi_trailer(turn(14.0, 5.0, lead_in_m=40.0))
-    (motion,) = motions([truck], 20.0, ORIGIN)
+    (motion,) = compute_motions([truck], 20.0, ORIGIN)
     (front, _), (rear, size_m) = motion.parts
     assert rear[0] == pytest.approx([*(front[0, :2] - [6.375, 0.0]), 0.0], abs=1e-9)
     assert [front[0, 0] + 6.65 / 2, rear[0, 0] - 13.6 / 2] == pytest.approx([-40.0, -56.5])
-    hitches_m = DRAWS["truck"].hitches_m(front)[:, None]
-    np.testing.assert_allclose(tractrix(hitches_m, np.array([8.41]), np.zeros(1))[:, 0], rear[:, 2], atol=1e-12)
+    hitches_m = DRAWS["truck"].compute_hitch_positions_m(front)[:, None]
+    np.testing.assert_allclose(
+        compute_tractrix_yaw_rad(hitches_m, np.array([8.41]), np.zeros(1))[:, 0], rear[:, 2], atol=1e-12
+    )
     # Only the trailer comes over the place where that one stands.
     where = len(rear) // 2
     inside_m = rear[where, :2] + (size_m[1] / 2 - 0.2) * np.array([-np.sin(rear[where, 2]), np.cos(rear[where, 2])])
-    alone = motion._replace(user=truck._replace(kind="van", sizes_m=truck.sizes_m[:1]), rear=None)
-    (rests,) = motions([user(np.tile(inside_m, (101, 1)), on_foot=True, size_m=(0.3, 0.5))], 20.0, ORIGIN)
-    (far,) = motions([user(straight(0.1, 20.0, y_m=-50.0))], 20.0, ORIGIN)
-    assert possible([far, motion]) == [far, motion]
-    assert possible([motion, rests]) == [motion]
-    assert possible([alone, rests]) == [alone, rests]
-    wide = motions([semi_trailer(turn(5.0, 3.0, (3.5, 4.5)))], 22.0, ORIGIN, corner)[0]
-    assert not wide.can_be
+    alone = motion._replace(user=truck._replace(kind="van", sizes_m=truck.part_sizes_m[:1]), rear=None)
+    (rests,) = compute_motions([user(np.tile(inside_m, (101, 1)), on_foot=True, size_m=(0.3, 0.5))], 20.0, ORIGIN)
+    (far,) = compute_motions([user(straight(0.1, 20.0, y_m=-50.0))], 20.0, ORIGIN)
+    assert drop_colliding_users([far, motion]) == [far, motion]
+    assert drop_colliding_users([motion, rests]) == [motion]
+    assert drop_colliding_users([alone, rests]) == [alone, rests]
+    wide = compute_motions([semi_trailer(turn(5.0, 3.0, (3.5, 4.5)))], 22.0, ORIGIN, corner)[0]
+    assert not wide.is_plausible
 
 
 def test_who_keeps_to_a_lane_beside_a_kerb_is_looked_at_too(corner):
-    off, on = (motions([user(straight(x_m=-80.0, y_m=y))], 8.0, ORIGIN, corner)[0] for y in (3.5, 0.4))
-    assert off.over_kerb_m == 0.0
+    off, on = (compute_motions([user(straight(x_m=-80.0, y_m=y))], 8.0, ORIGIN, corner)[0] for y in (3.5, 0.4))
+    assert off.curb_overlap_m == 0.0
     assert off.poses[:, 1] == pytest.approx(3.5)
-    assert on.over_kerb_m == 0.0
+    assert on.curb_overlap_m == 0.0
     assert on.poses[5:, 1].min() > 1.0
 
 
 def test_who_cannot_get_round_is_not_there(corner):
-    (lorry,) = motions([user(turn(5.0, 5.0, (3.5, 4.5)), size_m=(16.5, 2.55))], 15.0, ORIGIN, corner)
-    assert lorry.over_kerb_m > 0.05
-    assert not lorry.can_be
-    assert possible([lorry]) == [lorry]  # the first is the ego
-    (walker,) = motions([user(turn(5.0, 1.4), on_foot=True)], 40.0, ORIGIN, corner)
-    assert walker.can_be
+    (lorry,) = compute_motions([user(turn(5.0, 5.0, (3.5, 4.5)), size_m=(16.5, 2.55))], 15.0, ORIGIN, corner)
+    assert lorry.curb_overlap_m > 0.05
+    assert not lorry.is_plausible
+    assert drop_colliding_users([lorry]) == [lorry]  # the first is the ego
+    (walker,) = compute_motions([user(turn(5.0, 1.4), on_foot=True)], 40.0, ORIGIN, corner)
+    assert walker.is_plausible
 
 
 def test_people_go_round_what_is_driven_on_where_sumo_leads_them_straight_across():
@@ -186,11 +200,11 @@ def test_people_go_round_what_is_driven_on_where_sumo_leads_them_straight_across
     way_m = np.concatenate([straight(1.3, 10.0, y_m=3.0)[:20], [[5.2 + 0.2 * k, 3.0 + 0.26 * k] for k in range(61)]])
     across = user(way_m, on_foot=True, kind="adult", size_m=(0.3, 0.5))
     inside = user(straight(1.3, 8.0, x_m=1.0, y_m=2.0), on_foot=True, kind="adult", size_m=(0.3, 0.5))
-    free, led, same = (motions([who], 16.0, ORIGIN, None, area)[0] for who, area in
+    free, led, same = (compute_motions([who], 16.0, ORIGIN, None, area)[0] for who, area in
                        ((across, None), (across, walked), (inside, walked)))  # fmt: skip
     on = [shapely.contains_xy(walked, *motion.poses[:, :2].T) for motion in (free, led)]
     assert on[0].mean() < 0.5
     assert on[1].mean() > 0.9
     assert shapely.distance(shapely.points(led.poses[:, :2]), walked).max() < 0.5
-    assert led.can_be
-    np.testing.assert_array_equal(same.poses, motions([inside], 16.0, ORIGIN)[0].poses)
+    assert led.is_plausible
+    np.testing.assert_array_equal(same.poses, compute_motions([inside], 16.0, ORIGIN)[0].poses)

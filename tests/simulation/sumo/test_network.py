@@ -28,8 +28,8 @@ def test_lanes_are_for_those_who_may_use_them(tmp_path):
     network = read_network(path)
     uses = [lane.use for lane in network.lanes]
     assert uses == ["sidewalk", "bay", "shoulder", "road", "road", "crossing", "corner", "turn"]
-    assert [lane.allows("bicycle") for lane in network.lanes[:5]] == [False, False, False, True, True]
-    assert [lane.allows("passenger") for lane in network.lanes[:5]] == [False, False, False, False, True]
+    assert [lane.is_allowed("bicycle") for lane in network.lanes[:5]] == [False, False, False, True, True]
+    assert [lane.is_allowed("passenger") for lane in network.lanes[:5]] == [False, False, False, False, True]
     np.testing.assert_array_equal(network.lanes[4].line_m, np.array(LINE, dtype=float))
     assert len(network.junctions) == 1
 
@@ -43,15 +43,15 @@ def test_ways_go_on_only_where_a_class_may_drive(tmp_path):
         more=CONNECTED,
     )
     network = read_network(path)
-    assert network.follow("passenger") == {"a": ("b",), "b": ()}
-    assert network.follow("bus") == {"a": ("b",), "b": ("c",), "c": ()}
+    assert network.find_successors("passenger") == {"a": ("b",), "b": ()}
+    assert network.find_successors("bus") == {"a": ("b",), "b": ("c",), "c": ()}
 
 
 def test_lanes_without_length_are_left_out_and_a_file_that_changes_is_read_again(tmp_path):
     path = write_net(tmp_path / "a.net.xml", street(), edge("short", (DRIVE, 3, [(7, 7), (7, 7)])))
-    assert {lane.edge for lane in read_network(path).lanes} == {"east"}
+    assert {lane.edge_id for lane in read_network(path).lanes} == {"east"}
     write_net(path, street(), street("another"))
-    assert {lane.edge for lane in read_network(path).lanes} == {"east", "another"}
+    assert {lane.edge_id for lane in read_network(path).lanes} == {"east", "another"}
 
 
 @pytest.mark.parametrize(

@@ -6,9 +6,9 @@ import shapely
 
 from tests.simulation.traffic.test_separation import pieces
 from torchcover import Scenario
-from torchcover.simulation.sumo import Sumo
+from torchcover.simulation.sumo import SumoTraffic
 from torchcover.simulation.traffic.fleet import REAR_OF
-from torchcover.simulation.traffic.kind import Procedural
+from torchcover.simulation.traffic.kind import ProceduralTraffic
 
 from .towns import DRIVE, WALK, drive, edge, fcd, street, together, vehicle, write_net
 
@@ -19,7 +19,7 @@ def made(folder, *edges, steps=None, **options):
     net = write_net(folder / "a.net.xml", *(edges or (street(),)))
     (folder / "fcd.xml").write_text(fcd(steps or together(drive())))
     options = {"duration_s": 4.0, **options}
-    return Sumo(net=net, fcd=folder / "fcd.xml", **options)
+    return SumoTraffic(net=net, fcd=folder / "fcd.xml", **options)
 
 
 def test_the_ego_drives_as_it_did_there(tmp_path):
@@ -251,7 +251,7 @@ def test_files_lie_beside_the_document_and_count_as_content(tmp_path):
     document = tmp_path / "s.yaml"
     document.write_text("name: s\ntraffic: {type: sumo, net: a.net.xml, fcd: fcd.xml, duration_s: 4.0}")
     traffic = Scenario.load(document).traffic
-    assert isinstance(traffic, Procedural)
+    assert isinstance(traffic, ProceduralTraffic)
     before = traffic.collect_content()
     assert traffic.build_scene(0).actors == ()
     (tmp_path / "fcd.xml").write_text(fcd(together(drive(), drive("b"))))

@@ -6,21 +6,21 @@ import pytest
 
 from torchcover.geometry import BoundingBox
 from torchcover.simulation import shapes
-from torchcover.simulation.traffic import Highway, Parking, Urban
+from torchcover.simulation.traffic import HighwayTraffic, ParkingTraffic, UrbanTraffic
 from torchcover.simulation.traffic.fleet import load_bodies
 
 # Hills lift and tilt, and change no place: what overlaps is found out on a plain.
-PLAIN = {"hills_m": 0.0}
-STRAIGHT = {**PLAIN, "bend_deg": 0.0, "turn_share": 0.0}
+PLAIN = {"hill_height_std_m": 0.0}
+STRAIGHT = {**PLAIN, "max_bend_deg": 0.0, "turn_share": 0.0}
 KINDS = {
-    "urban": Urban(**PLAIN),
-    "narrow": Urban(lanes=2, **PLAIN),
-    "winding": Urban(lanes=4, bend_deg=35.0, turn_share=0.6, built_share=1.0, **PLAIN),
-    "straight": Urban(built_share=1.0, **STRAIGHT),
-    "hilly": Urban(hills_m=2.0),
-    "highway": Highway(**PLAIN),
-    "motorway": Highway(hills_m=10.0),
-    "parking": Parking(),
+    "urban": UrbanTraffic(**PLAIN),
+    "narrow": UrbanTraffic(num_lanes=2, **PLAIN),
+    "winding": UrbanTraffic(num_lanes=4, max_bend_deg=35.0, turn_share=0.6, built_share=1.0, **PLAIN),
+    "straight": UrbanTraffic(built_share=1.0, **STRAIGHT),
+    "hilly": UrbanTraffic(hill_height_std_m=2.0),
+    "highway": HighwayTraffic(**PLAIN),
+    "motorway": HighwayTraffic(hill_height_std_m=10.0),
+    "parking": ParkingTraffic(),
 }
 
 

@@ -6,7 +6,14 @@ import pytest
 from torchcover.geometry import build_transform, convert_euler_to_rotation
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation.bodies import Vehicle
-from torchcover.simulation.traffic.fleet import DRAWS, REAR_OF, Fleet, load_bodies, rears_of, tractrix
+from torchcover.simulation.traffic.fleet import (
+    DRAWS,
+    REAR_OF,
+    Fleet,
+    compute_tractrix_yaw_rad,
+    compute_trailer_poses,
+    load_bodies,
+)
 from torchcover.simulation.world import Actor
 
 from .test_separation import Solids, among
@@ -18,7 +25,7 @@ def test_on_a_circle_the_rear_follows_a_smaller_one():
     radius_m, length_m = 10.0, 3.0
     angle = np.linspace(0.0, 4 * np.pi, 2000)
     lead_m = radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    (yaw,) = tractrix(lead_m[:, None], np.array([length_m]), np.array([np.pi / 2])).T
+    (yaw,) = compute_tractrix_yaw_rad(lead_m[:, None], np.array([length_m]), np.array([np.pi / 2])).T
     rear_m = lead_m - length_m * np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
     assert np.linalg.norm(rear_m[-1]) == pytest.approx(np.sqrt(radius_m**2 - length_m**2), abs=1e-4)
     assert np.abs(np.diff(yaw)).max() < 0.02
@@ -27,33 +34,33 @@ def test_on_a_circle_the_rear_follows_a_smaller_one():
 def test_along_a_line_the_angle_falls_as_in_the_closed_form_whatever_the_steps():
     ways_m = np.array([0.0, 0.1, 3.0, 3.5, 9.0])
     lead_m = np.stack([ways_m, np.zeros(5)], axis=1)[:, None]
-    (yaw,) = tractrix(lead_m, np.array([4.0]), np.array([2.5])).T
+    (yaw,) = compute_tractrix_yaw_rad(lead_m, np.array([4.0]), np.array([2.5])).T
     np.testing.assert_allclose(np.tan(yaw / 2), np.tan(1.25) * np.exp(-ways_m / 4.0), rtol=1e-12)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_on_a_straight_both_parts_are_the_whole_vehicle(kind):
     hitch, bodies, whole = DRAWS[kind], load_bodies(), Vehicle.load(kind).build_mesh()
-    front = np.array([[hitch.ahead_m, 0.0, 0.0]])
-    (rear,) = rears_of([kind], [front])
-    parts = [bodies[part].transform(at(pose[0])) for part, pose in ((kind, front), (hitch.rear, rear))]
+    front = np.array([[hitch.center_offset_m, 0.0, 0.0]])
+    (rear,) = compute_trailer_poses([kind], [front])
+    parts = [bodies[part].transform(at(pose[0])) for part, pose in ((kind, front), (hitch.trailer_kind, rear))]
     vertices_m = np.concatenate([mesh.vertices_m for mesh in parts])
     assert sorted(vertices_m.round(6).tolist()) == sorted(whole.vertices_m.round(6).tolist())
-    assert Fleet(bodies, None, np.random.default_rng()).length_m(kind) == pytest.approx(np.ptp(vertices_m[:, 0]))
+    assert Fleet(bodies, None, np.random.default_rng()).get_length_m(kind) == pytest.approx(np.ptp(vertices_m[:, 0]))
     # The axles are where those of the vehicle are, and the hitch is before them.
     wheels_m = [
         mesh for part in Vehicle.load(kind).parts if part.name == "trailer wheels" for mesh in part.build_meshes()
     ]
     middle_m = np.mean([mesh.vertices_m[:, 0].mean() for mesh in wheels_m])
-    assert hitch.ahead_m + hitch.hitch_m - hitch.rod_m == pytest.approx(middle_m, abs=1e-6)
+    assert hitch.center_offset_m + hitch.hitch_offset_m - hitch.hitch_to_axle_m == pytest.approx(middle_m, abs=1e-6)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("turned_deg", [-70.0, -25.0, 5.0, 50.0])
 def test_the_parts_of_a_vehicle_never_meet_however_it_turns(kind, turned_deg):
     bodies = load_bodies()
-    (rear,) = rears_of([kind], [np.zeros((1, 3))], [np.deg2rad(turned_deg)])
-    meshes = bodies[kind], bodies[DRAWS[kind].rear].transform(at(rear[0]))
+    (rear,) = compute_trailer_poses([kind], [np.zeros((1, 3))], [np.deg2rad(turned_deg)])
+    meshes = bodies[kind], bodies[DRAWS[kind].trailer_kind].transform(at(rear[0]))
     pieces = [Solids.of_static([mesh]) for mesh in meshes]
     both = Solids.of_static(meshes)
     part = np.repeat([0, 1], [len(solids.low) for solids in pieces])
@@ -72,8 +79,10 @@ def test_in_traffic_axles_do_not_slip_and_the_hitch_holds(kind, world):
         assert (front.category, rear.category) == ("truck", "trailer")
         drawn, own = poses(rear), poses(front)
         back = np.stack([np.cos(drawn[:, 2]), np.sin(drawn[:, 2])], axis=1)
-        np.testing.assert_allclose(drawn[:, :2] + both.middle_m * back, both.hitches_m(own), atol=1e-9)
-        axles_m = both.hitches_m(own) - both.rod_m * back
+        np.testing.assert_allclose(
+            drawn[:, :2] + both.hitch_to_center_m * back, both.compute_hitch_positions_m(own), atol=1e-9
+        )
+        axles_m = both.compute_hitch_positions_m(own) - both.hitch_to_axle_m * back
         way_m, middle = np.diff(axles_m, axis=0), (back[1:] + back[:-1]) / 2
         assert np.abs(way_m[:, 0] * middle[:, 1] - way_m[:, 1] * middle[:, 0]).max() < 2e-3
         assert np.abs(np.diff(np.unwrap(drawn[:, 2]))).max() < np.deg2rad(1.0)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from torchcover.simulation.traffic.assemble import attitude
+from torchcover.simulation.traffic.assemble import compute_attitude_deg
 
 TIMES_S = np.arange(0.0, 20.0, 0.1)
 
@@ -11,7 +11,7 @@ TIMES_S = np.arange(0.0, 20.0, 0.1)
 def tilt(speed, yaw_deg=None, seed=0):
     way = np.concatenate([[0.0], np.cumsum((speed[1:] + speed[:-1]) / 2 * 0.1)])
     yaw = np.zeros_like(speed) if yaw_deg is None else yaw_deg
-    return attitude(TIMES_S, way, speed, yaw, np.random.default_rng(seed))
+    return compute_attitude_deg(TIMES_S, way, speed, yaw, np.random.default_rng(seed))
 
 
 def mean_change(angles, base, axis, when):
@@ -21,7 +21,7 @@ def mean_change(angles, base, axis, when):
 def test_braking_turns_the_nose_down_and_starting_up():
     speed = np.interp(TIMES_S, [0, 5, 10, 15, 20], [0, 15, 15, 0, 0])
     way = np.concatenate([[0.0], np.cumsum((speed[1:] + speed[:-1]) / 2 * 0.1)])
-    road = attitude(TIMES_S, way, np.full_like(speed, 1.0), np.zeros_like(speed), np.random.default_rng(0))
+    road = compute_attitude_deg(TIMES_S, way, np.full_like(speed, 1.0), np.zeros_like(speed), np.random.default_rng(0))
     angles = tilt(speed)
     assert mean_change(angles, road, 1, (TIMES_S > 2) & (TIMES_S < 4.5)) == pytest.approx(-0.9, abs=0.2)
     assert mean_change(angles, road, 1, (TIMES_S > 12) & (TIMES_S < 14.5)) == pytest.approx(0.9, abs=0.2)

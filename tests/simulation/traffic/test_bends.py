@@ -6,13 +6,13 @@ import shapely
 import trimesh
 
 from torchcover.simulation.raycaster import RayCaster
-from torchcover.simulation.traffic import Urban
-from torchcover.simulation.traffic.alignment import Alignment, Beside, Territory
-from torchcover.simulation.traffic.city import City
+from torchcover.simulation.traffic import UrbanTraffic
+from torchcover.simulation.traffic.alignment import Alignment, OffsetPath, StreetCorridor
+from torchcover.simulation.traffic.city import CityBuilder
 from torchcover.simulation.traffic.fleet import Fleet, load_bodies
 from torchcover.simulation.traffic.flow import LIMIT_EVERY_M
 from torchcover.simulation.traffic.hills import SQUARE_M, Hills
-from torchcover.simulation.traffic.scenery import slab
+from torchcover.simulation.traffic.scenery import build_slab
 from torchcover.simulation.traffic.streets import (
     APART_M,
     BRAKING_MPS2,
@@ -20,9 +20,9 @@ from torchcover.simulation.traffic.streets import (
     GUTTER_M,
     NEIGHBOURS_M,
     SMALLEST_RADIUS_M,
-    Section,
-    course,
-    plan,
+    CrossSection,
+    sample_main_street,
+    sample_street_plan,
 )
 
 RADIUS_M, REACH_M = 20.0, 1500.0
@@ -32,24 +32,24 @@ STATIONS_M = np.arange(-300.0, 1200.0, 0.37)
 def drawn(seed, bend_deg=30.0, turn_share=0.5):
     generator = np.random.default_rng(seed)
     junctions = np.cumsum(generator.uniform(80, 130, 14)) - 250.0
-    return course(junctions, np.full(14, 5.0), bend_deg, turn_share, RADIUS_M, REACH_M, generator)
+    return sample_main_street(junctions, np.full(14, 5.0), bend_deg, turn_share, RADIUS_M, REACH_M, generator)
 
 
 @pytest.fixture(scope="module", params=[0, 1, 2])
 def street(request):
-    return drawn(request.param).street
+    return drawn(request.param).alignment
 
 
 def test_a_straight_alignment_changes_nothing():
     x, y = STATIONS_M, np.linspace(-50.0, 50.0, len(STATIONS_M))
-    poses = Alignment([0.0], [0.0]).poses(x, y)
+    poses = Alignment([0.0], [0.0]).compute_poses(x, y)
     np.testing.assert_array_equal(poses, np.stack([x, y, np.zeros_like(x)], axis=1))
 
 
 def test_a_circle_is_a_circle():
     # Between its short ends: the centre lies to the left, a radius away.
     arc = Alignment([0.0, 1e-3, 60.0, 60.001], [0.0, 1 / RADIUS_M, 1 / RADIUS_M, 0.0])
-    places = arc.poses(np.linspace(0.1, 59.0, 50), 3.0)[:, :2]
+    places = arc.compute_poses(np.linspace(0.1, 59.0, 50), 3.0)[:, :2]
     np.testing.assert_allclose(np.linalg.norm(places - [5e-4, RADIUS_M], axis=1), RADIUS_M - 3.0, atol=1e-6)
 
 
@@ -69,49 +69,56 @@ def test_it_is_as_long_as_its_stations_and_heads_where_it_goes(street):
 @pytest.mark.parametrize("way", [1, -1])
 @pytest.mark.parametrize("left_m", [-12.0, 9.0])
 def test_beside_it_one_goes_as_far_as_one_gets(street, left_m, way):
-    line = Beside(street, left_m, way, REACH_M)
+    line = OffsetPath(street, left_m, way, REACH_M)
     places = np.arange(REACH_M - 700.0, REACH_M + 700.0, 0.05)
-    poses = line.poses(places)
+    poses = line.compute_poses(places)
     steps = np.diff(poses[:, :2], axis=0)
     np.testing.assert_allclose(np.linalg.norm(steps, axis=1), 0.05, rtol=2e-4)
     turned = np.deg2rad((poses[:-1, 2] + poses[1:, 2]) / 2)
     ahead = steps[:, 0] * np.cos(turned) + steps[:, 1] * np.sin(turned)
     assert ahead.min() > 0.0499
-    np.testing.assert_allclose(line.places_at(line.stations(places)), places, atol=0.02)
-    there = street.poses(line.stations(places), left_m)[:, :2]
+    np.testing.assert_allclose(
+        line.convert_stations_to_distances_m(line.convert_distances_to_stations_m(places)), places, atol=0.02
+    )
+    there = street.poses(line.convert_distances_to_stations_m(places), left_m)[:, :2]
     np.testing.assert_allclose(poses[:, :2], there, atol=0.02)
 
 
 @pytest.mark.parametrize("seed", range(8))
 def test_courses_keep_within_bounds_and_away_from_themselves(seed):
     found = drawn(seed)
-    assert found.turns.any()
-    assert not found.turns[[0, -1]].any()
-    assert (np.abs(np.cumsum(found.turns)) <= 1).all()
-    curvature = np.abs(found.street.curvatures(STATIONS_M))
+    assert found.turn_directions.any()
+    assert not found.turn_directions[[0, -1]].any()
+    assert (np.abs(np.cumsum(found.turn_directions)) <= 1).all()
+    curvature = np.abs(found.alignment.compute_curvatures_per_m(STATIONS_M))
     assert curvature.max() <= 1 / RADIUS_M + 1e-9
     junctions = np.cumsum(np.random.default_rng(seed).uniform(80, 130, 14)) - 250.0
-    in_turn = (np.abs(STATIONS_M[:, None] - junctions[found.turns != 0]) < found.halves_m[found.turns != 0]).any(axis=1)
+    in_turn = (
+        np.abs(STATIONS_M[:, None] - junctions[found.turn_directions != 0])
+        < found.junction_half_lengths_m[found.turn_directions != 0]
+    ).any(axis=1)
     assert curvature[~in_turn].max() <= 1 / SMALLEST_RADIUS_M + 1e-9
     # Junctions that are passed straight on lie on straights, with their crossings.
-    for middle, half in zip(junctions[found.turns == 0], found.halves_m[found.turns == 0], strict=True):
-        assert not found.street.curvatures(middle + np.linspace(-half - 7.0, half + 7.0, 9)).any()
-    places = found.street.poses(np.arange(-REACH_M, REACH_M, 20.0), 0.0)[:, :2]
+    for middle, half in zip(
+        junctions[found.turn_directions == 0], found.junction_half_lengths_m[found.turn_directions == 0], strict=True
+    ):
+        assert not found.alignment.compute_curvatures_per_m(middle + np.linspace(-half - 7.0, half + 7.0, 9)).any()
+    places = found.alignment.compute_poses(np.arange(-REACH_M, REACH_M, 20.0), 0.0)[:, :2]
     away = np.linalg.norm(places[:, None] - places, axis=2)
     far = np.abs(np.subtract.outer(np.arange(len(places)), np.arange(len(places)))) * 20.0 > NEIGHBOURS_M
     assert away[far].min() >= APART_M
 
 
 def test_without_bends_and_turns_a_course_is_straight():
-    assert drawn(0, bend_deg=0.0, turn_share=0.0).street.is_straight
+    assert drawn(0, bend_deg=0.0, turn_share=0.0).alignment.is_straight
 
 
 def test_territories_are_apart(street):
     # Places that two stretches would both call theirs do not exist: whoever is nearest has them.
-    territory = Territory(street, (-400.0, 1300.0))
+    territory = StreetCorridor(street, (-400.0, 1300.0))
     station, left = np.meshgrid(np.arange(-200.0, 1100.0, 9.0), [-80.0, -40.0, 40.0, 80.0])
     station, left = station.ravel(), left.ravel()
-    owned = territory.owns(station, left)
+    owned = territory.is_inside(station, left)
     assert owned.any()
     assert not owned.all()
     places = street.poses(station, left)[:, :2]
@@ -122,39 +129,41 @@ def test_territories_are_apart(street):
 
 
 def test_cars_may_drive_as_fast_as_is_comfortable_and_brake_gently_for_it():
-    section = Section(2, 3.4)
+    section = CrossSection(2, 3.4)
     generator, shapes = np.random.default_rng(3), np.random.default_rng(4)
-    streets = plan(section, 25.0, 0.5, (-120.0, 900.0), 1400.0, generator, shapes)
-    assert streets.course.turns.any()
-    lane = streets.traffic_lanes()[0]
-    places = LIMIT_EVERY_M * np.arange(len(lane.limits_mps))
-    yaw = np.unwrap(np.deg2rad(lane.line.poses(places)[:, 2]))
-    across = np.abs(np.gradient(yaw, places)) * lane.limits_mps**2
-    in_curves = lane.line.street.curvatures(lane.line.stations(places)) != 0.0
-    assert across[in_curves & (lane.limits_mps < 15.0)].max() < 1.1 * COMFORTABLE_MPS2
-    assert lane.limits_mps.min() < 8.0
-    braking = -np.diff(lane.limits_mps**2) / (2 * LIMIT_EVERY_M)
+    streets = sample_street_plan(section, 25.0, 0.5, (-120.0, 900.0), 1400.0, generator, shapes)
+    assert streets.main_street.turn_directions.any()
+    lane = streets.build_traffic_lanes()[0]
+    places = LIMIT_EVERY_M * np.arange(len(lane.speed_limits_mps))
+    yaw = np.unwrap(np.deg2rad(lane.centerline.compute_poses(places)[:, 2]))
+    across = np.abs(np.gradient(yaw, places)) * lane.speed_limits_mps**2
+    in_curves = (
+        lane.centerline.street.compute_curvatures_per_m(lane.centerline.convert_distances_to_stations_m(places)) != 0.0
+    )
+    assert across[in_curves & (lane.speed_limits_mps < 15.0)].max() < 1.1 * COMFORTABLE_MPS2
+    assert lane.speed_limits_mps.min() < 8.0
+    braking = -np.diff(lane.speed_limits_mps**2) / (2 * LIMIT_EVERY_M)
     assert braking.max() < 1.001 * BRAKING_MPS2
     # A bus keeps off the bus beside it.
-    inner = section.turn_radius_m - (section.lanes_each_way - 0.5) * section.lane_m
+    inner = section.min_turn_radius_m - (section.lanes_per_direction - 0.5) * section.lane_width_m
     corner = np.hypot(inner + 2.55 / 2, 6.0)
-    assert corner < inner + section.lane_m - 2.55 / 2
+    assert corner < inner + section.lane_width_m - 2.55 / 2
 
 
 def test_hills_are_what_their_slopes_say_and_their_mesh_is_near():
     hills = Hills(1.5, np.random.default_rng(1))
     places = np.random.default_rng(2).uniform(-200, 200, (500, 2))
     yaw_deg = np.linspace(0, 360, 500)
-    height, pitch, roll = hills.stances(places, yaw_deg).T
-    np.testing.assert_allclose(height, hills.heights_m(places), atol=1e-5)
+    height, pitch, roll = hills.compute_heights_and_tilts(places, yaw_deg).T
+    np.testing.assert_allclose(height, hills.compute_heights_m(places), atol=1e-5)
     yaw = np.deg2rad(yaw_deg)
     ahead = 0.5 * np.stack([np.cos(yaw), np.sin(yaw)], axis=1)
     left = 0.5 * np.stack([-np.sin(yaw), np.cos(yaw)], axis=1)
     for way, angle in ((ahead, -pitch), (left, roll)):
-        rise = hills.heights_m(places + way) - hills.heights_m(places - way)
+        rise = hills.compute_heights_m(places + way) - hills.compute_heights_m(places - way)
         np.testing.assert_allclose(np.rad2deg(np.arctan(rise)), angle, atol=0.02)
     way_m = np.stack([np.linspace(-200, 200, 11), np.zeros(11)], axis=1)
-    mesh = hills.mesh(way_m, 250.0)
+    mesh = hills.build_mesh(way_m, 250.0)
     down = np.tile(np.array([[0.0], [0.0], [-1.0]], dtype=np.float32), 500)
     starts = np.column_stack([places, np.full(500, 50.0)]).astype(np.float32)
     hits = RayCaster([mesh]).cast_from_each(starts, down, np.full(500, 100.0, dtype=np.float32))
@@ -165,16 +174,16 @@ def test_hills_are_what_their_slopes_say_and_their_mesh_is_near():
 def test_hills_of_a_motorway_are_high_and_nowhere_too_steep():
     hills = Hills(100.0, np.random.default_rng(1), (1000.0, 2500.0), 0.04)
     places = np.random.default_rng(2).uniform(-5000, 5000, (20_000, 2))
-    _, pitch, _ = hills.stances(places, np.linspace(0, 360, 20_000)).T
+    _, pitch, _ = hills.compute_heights_and_tilts(places, np.linspace(0, 360, 20_000)).T
     assert np.deg2rad(np.abs(pitch).max()) == pytest.approx(0.04, rel=0.2)
     assert np.deg2rad(np.abs(pitch).max()) <= 0.04
-    assert np.ptp(hills.heights_m(places)) > 10.0
+    assert np.ptp(hills.compute_heights_m(places)) > 10.0
 
 
 def test_a_slab_over_a_bent_net_is_closed_and_looks_outwards():
     x, y = np.meshgrid(np.linspace(0, 30, 7), np.linspace(0, 8, 3), indexing="ij")
-    net = Alignment([0.0, 5.0, 25.0, 30.0], [0.0, 0.04, 0.04, 0.0]).poses(x, y)[..., :2]
-    mesh = slab(net, (0.0, 0.15))
+    net = Alignment([0.0, 5.0, 25.0, 30.0], [0.0, 0.04, 0.04, 0.0]).compute_poses(x, y)[..., :2]
+    mesh = build_slab(net, (0.0, 0.15))
     solid = trimesh.Trimesh(mesh.vertices_m, mesh.faces, process=False)
     assert solid.is_volume
     assert solid.volume == pytest.approx(0.15 * (30 * 8 - 0.04 * 25 * 8**2 / 2), rel=0.01)
@@ -185,30 +194,47 @@ def test_a_slab_over_a_bent_net_is_closed_and_looks_outwards():
 def test_beside_streets_there_is_pavement_and_between_pavements_no_bare_ground(seed, built_share):
     generator, shapes = np.random.default_rng(seed), np.random.default_rng(seed)
     seen_m, span_m = (-120.0, 700.0), (-440.0, 1020.0)
-    streets = plan(Section(2), 25.0, 0.5, span_m, 1200.0, generator, shapes)
-    territory, level, fleet = Territory(streets.main, span_m), Hills(0.0, shapes), Fleet(load_bodies(), None, generator)
-    _, pavement, *_ = City(streets, territory, level, fleet, 0.0, built_share, 0.0, generator, shapes).static(seen_m)[0]
+    streets = sample_street_plan(CrossSection(2), 25.0, 0.5, span_m, 1200.0, generator, shapes)
+    territory, level, fleet = (
+        StreetCorridor(streets.main_alignment, span_m),
+        Hills(0.0, shapes),
+        Fleet(load_bodies(), None, generator),
+    )
+    _, pavement, *_ = CityBuilder(
+        streets, territory, level, fleet, 0.0, built_share, 0.0, generator, shapes
+    ).build_static_scenery(seen_m)[0]
     triangles_m = pavement.vertices_m[pavement.faces]
     up = np.cross(triangles_m[:, 1] - triangles_m[:, 0], triangles_m[:, 2] - triangles_m[:, 0])[:, 2] > 1e-6
     paved = shapely.union_all(shapely.polygons(triangles_m[up][..., :2])).buffer(0.02)
-    lines = [(streets.main, np.arange(*span_m, 2.0), streets.section.kerb_m)]
-    for street, lanes in zip(streets.crossing, streets.cross_lanes_each_way, strict=True):
-        lines.append((street, np.arange(-150.0, 150.0, 2.0), lanes * streets.section.lane_m + GUTTER_M))
+    lines = [(streets.main_alignment, np.arange(*span_m, 2.0), streets.cross_section.curb_offset_m)]
+    for street, lanes in zip(streets.cross_streets, streets.cross_lanes_per_direction, strict=True):
+        lines.append((street, np.arange(-150.0, 150.0, 2.0), lanes * streets.cross_section.lane_width_m + GUTTER_M))
     driven = shapely.union_all([
-        shapely.LineString(street.poses(along_m, 0.0)[:, :2]).buffer(half_m, cap_style="flat", quad_segs=32)
+        shapely.LineString(street.compute_poses(along_m, 0.0)[:, :2]).buffer(half_m, cap_style="flat", quad_segs=32)
         for street, along_m, half_m in lines
     ])  # fmt: skip
-    assert (streets.course.turns[(streets.junctions_m > seen_m[0]) & (streets.junctions_m < seen_m[1])] != 0).any()
+    assert (
+        streets.main_street.turn_directions[
+            (streets.junction_stations_m > seen_m[0]) & (streets.junction_stations_m < seen_m[1])
+        ]
+        != 0
+    ).any()
     known = paved.union(driven.buffer(0.3))
-    along_m, left_m = np.meshgrid(np.arange(*seen_m), streets.section.kerb_m + np.array([0.5, 1.5, 2.8]))
+    along_m, left_m = np.meshgrid(np.arange(*seen_m), streets.cross_section.curb_offset_m + np.array([0.5, 1.5, 2.8]))
     for side in (1, -1):
-        assert shapely.contains_xy(known, streets.main.poses(along_m, side * left_m)[..., :2].reshape(-1, 2)).all()
+        assert shapely.contains_xy(
+            known, streets.main_alignment.compute_poses(along_m, side * left_m)[..., :2].reshape(-1, 2)
+        ).all()
     # Along the streets that cross it, too.
-    for (street, _, half_m), station_m, turn in zip(lines[1:], streets.junctions_m, streets.course.turns, strict=True):
+    for (street, _, half_m), station_m, turn in zip(
+        lines[1:], streets.junction_stations_m, streets.main_street.turn_directions, strict=True
+    ):
         if not turn and seen_m[0] < station_m < seen_m[1]:
-            away_m, left_m = np.meshgrid(streets.section.kerb_m + np.arange(0.5, 17.0), half_m + np.array([0.5, 2.8]))
+            away_m, left_m = np.meshgrid(
+                streets.cross_section.curb_offset_m + np.arange(0.5, 17.0), half_m + np.array([0.5, 2.8])
+            )
             for way, side in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
-                places_m = street.poses(way * away_m, side * left_m)[..., :2]
+                places_m = street.compute_poses(way * away_m, side * left_m)[..., :2]
                 assert shapely.contains_xy(known, places_m.reshape(-1, 2)).all()
     between = paved.buffer(9.0, join_style="mitre").buffer(-9.0, join_style="mitre").difference(known)
     assert between.buffer(-1.5).is_empty
@@ -255,6 +281,6 @@ def test_the_ego_turns_at_junctions(world):
 
 
 def test_open_country_has_no_houses():
-    w = Urban(duration_s=2.0, built_share=0.0, hills_m=0.0).build_scene(1)
+    w = UrbanTraffic(duration_s=2.0, built_share=0.0, hill_height_std_m=0.0).build_scene(1)
     assert len(w.static_meshes) == 3
     assert max(mesh.vertices_m[:, 2].max() for mesh in w.static_meshes) < 12.0

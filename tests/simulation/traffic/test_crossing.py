@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 
-from torchcover.simulation.traffic.assemble import Footpath, free_for, step_height, walk
+from torchcover.simulation.traffic.assemble import Footpath, compute_step_height_m, is_free_for, simulate_walking
 
 TIMES_S = np.arange(0.0, 120.0, 0.1)
-PATH = Footpath(np.array([3.0, -8.0]), np.array([3.0, 8.0]), kerb_m=0.5)
+PATH = Footpath(np.array([3.0, -8.0]), np.array([3.0, 8.0]), curb_distance_m=0.5)
 
 
 @pytest.mark.parametrize("seed", range(10))
 def test_sets_off_only_when_one_may_and_goes_all_the_way(seed):
     may_go = (TIMES_S % 40.0 > 20.0) & (TIMES_S % 40.0 < 24.0)
-    position, yaw = walk(PATH, may_go, 12.0, TIMES_S, 0.2, np.random.default_rng(seed))
+    position, yaw = simulate_walking(PATH, may_go, 12.0, TIMES_S, 0.2, np.random.default_rng(seed))
     y = position[:, 1]
     moving = np.abs(np.diff(y)) > 1e-9
     starts = np.flatnonzero(moving & ~np.concatenate([[False], moving[:-1]]))
@@ -26,13 +26,17 @@ def test_sets_off_only_when_one_may_and_goes_all_the_way(seed):
 
 
 def test_some_do_cross():
-    walks = [walk(PATH, np.ones(1200, bool), 12.0, TIMES_S, 0.2, np.random.default_rng(s))[0] for s in range(10)]
+    walks = [
+        simulate_walking(PATH, np.ones(1200, bool), 12.0, TIMES_S, 0.2, np.random.default_rng(s))[0] for s in range(10)
+    ]
     assert all(np.ptp(position[:, 1]) == pytest.approx(16.0) for position in walks)
 
 
 def test_feet_are_up_until_the_whole_body_is_past_the_kerb():
     beyond = np.array([-3.0, 0.0, 0.29, 0.3, 0.375, 0.45, 5.0])
-    np.testing.assert_allclose(step_height(beyond, 0.3), [0.15, 0.15, 0.15, 0.15, 0.075, 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(
+        compute_step_height_m(beyond, 0.3), [0.15, 0.15, 0.15, 0.15, 0.075, 0.0, 0.0], atol=1e-12
+    )
 
 
 def test_free_for_looks_ahead():
@@ -40,4 +44,4 @@ def test_free_for_looks_ahead():
     blocked[10] = True
     expected = np.ones(20, dtype=bool)
     expected[7:11] = False
-    np.testing.assert_array_equal(free_for(blocked, 0.3, 0.1), expected)
+    np.testing.assert_array_equal(is_free_for(blocked, 0.3, 0.1), expected)

@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from torchcover.simulation.traffic.alignment import Polyline, loop
+from torchcover.simulation.traffic.alignment import Polyline, build_rounded_rectangle
 from torchcover.simulation.traffic.flow import (
     BRAKING_FOR_A_LIGHT_MPS2,
     CROSS,
@@ -13,12 +13,12 @@ from torchcover.simulation.traffic.flow import (
     QUEUE_SPEED,
     STOP_BEFORE_LINE_M,
     Agent,
-    Gate,
+    JunctionPassage,
     Lane,
-    Signals,
-    Simulation,
+    LaneSimulation,
+    TrafficSignals,
 )
-from torchcover.simulation.traffic.idm import Driver, acceleration_in, advance, tightness
+from torchcover.simulation.traffic.idm import Driver, compute_acceleration_mps2, compute_gap_ratio, integrate_motion
 
 TIMES_S = np.arange(0.0, 60.0, 0.1)
 CAR = Driver(14.0)
@@ -30,67 +30,69 @@ def car(lane, place, driver=CAR):
 
 
 def run(lanes, agents, offset=0.0, times_s=TIMES_S, **lights):
-    return Simulation(lanes, agents, Signals(np.array([offset]), **lights)).run(times_s)
+    return LaneSimulation(lanes, agents, TrafficSignals(np.array([offset]), **lights)).run(times_s)
 
 
 def test_a_queue_keeps_its_order_and_never_touches():
     agents = [car(0, place, Driver(speed)) for place, speed in [(10, 20), (30, 25), (60, 5), (90, 30), (110, 9)]]
     flow = run([Lane(LONG)], agents)
-    assert (np.diff(flow.place_m, axis=1) > 5.5).all()
+    assert (np.diff(flow.lane_positions_m, axis=1) > 5.5).all()
     # All end up at the speed of the slowest ahead of them.
-    np.testing.assert_allclose(flow.speed_mps[-1], [5, 5, 5, 9, 9], rtol=0.05)
+    np.testing.assert_allclose(flow.speeds_mps[-1], [5, 5, 5, 9, 9], rtol=0.05)
 
 
 def test_who_cannot_stop_goes_on_and_is_through_before_the_others_get_green():
     for start in np.linspace(60.0, 200.0, 71):
-        lanes = [Lane(LONG, (Gate(200.0, 225.0, 0, MAIN),))]
+        lanes = [Lane(LONG, (JunctionPassage(200.0, 225.0, 0, MAIN),))]
         flow = run(lanes, [car(0, start)], green_s=(2.0, 18.0), times_s=np.arange(0.0, 12.0, 0.05))
         changes = np.arange(0.0, 12.0, 0.05) > 8.0
-        on_junction = (flow.place_m[:, 0] + 2.5 > 200.0) & (flow.place_m[:, 0] - 2.5 < 225.0)
+        on_junction = (flow.lane_positions_m[:, 0] + 2.5 > 200.0) & (flow.lane_positions_m[:, 0] - 2.5 < 225.0)
         assert not (on_junction & changes).any()
-        assert np.diff(flow.speed_mps[:, 0]).min() / 0.05 > -6.0
+        assert np.diff(flow.speeds_mps[:, 0]).min() / 0.05 > -6.0
 
 
 def test_waits_for_somebody_left_on_the_junction_in_spite_of_green():
     lanes = [
-        Lane(LONG, (Gate(200.0, 225.0, 0, MAIN),)),
-        Lane(Polyline(np.array([[0.0, 0.0], [0.0, 2000.0]])), (Gate(200.0, 225.0, 0, CROSS),)),
+        Lane(LONG, (JunctionPassage(200.0, 225.0, 0, MAIN),)),
+        Lane(Polyline(np.array([[0.0, 0.0], [0.0, 2000.0]])), (JunctionPassage(200.0, 225.0, 0, CROSS),)),
     ]
     stuck = car(1, 210.0, Driver(0.5))
     flow = run(lanes, [car(0, 100.0), stuck], green_s=(50.0, 10.0))
-    inside = flow.place_m[:, 1] - 2.5 < 225.0
+    inside = flow.lane_positions_m[:, 1] - 2.5 < 225.0
     assert inside.sum() > 100
-    assert (flow.place_m[inside, 0] + 2.5 <= 200.0).all()
-    assert flow.occupied[inside, 0, CROSS].all()
-    assert flow.place_m[-1, 0] > 200.0
+    assert (flow.lane_positions_m[inside, 0] + 2.5 <= 200.0).all()
+    assert flow.occupied_phases[inside, 0, CROSS].all()
+    assert flow.lane_positions_m[-1, 0] > 200.0
 
 
 def test_does_not_enter_a_junction_with_a_queue_behind_it():
-    lanes = [Lane(LONG, (Gate(200.0, 225.0, 0, MAIN),))]
+    lanes = [Lane(LONG, (JunctionPassage(200.0, 225.0, 0, MAIN),))]
     flow = run(lanes, [car(0, 100.0), car(0, 232.0, Driver(1e-3, acceleration_mps2=1e-3))], green_s=(80.0, 10.0))
-    assert (flow.place_m[:, 0] + 2.5 <= 200.0).all()
+    assert (flow.lane_positions_m[:, 0] + 2.5 <= 200.0).all()
 
 
 def test_who_is_slow_to_cross_needs_green_to_be_left():
-    gate = Gate(20.0, 40.0, 0, MAIN, green_needed_s=15.0)
+    gate = JunctionPassage(20.0, 40.0, 0, MAIN, min_green_s=15.0)
     walker = Driver(1.4, 0.4, 0.5, 1.0, 1.5)
     flow = run([Lane(LONG, (gate,))], [car(0, 5.0, walker)], green_s=(20.0, 5.0))
-    entered = TIMES_S[np.argmax(flow.place_m[:, 0] + 2.5 > 20.0)]
+    entered = TIMES_S[np.argmax(flow.lane_positions_m[:, 0] + 2.5 > 20.0)]
     assert 37.0 < entered < 40.0
 
 
 def test_a_coarse_time_step_gives_the_same_run():
-    lanes = [Lane(LONG, (Gate(200.0, 225.0, 0, MAIN),))]
+    lanes = [Lane(LONG, (JunctionPassage(200.0, 225.0, 0, MAIN),))]
     agents = [car(0, 20.0), car(0, 60.0)]
     # Green ends between two of the coarse times, and would still let the first one pass.
     fine = run(lanes, agents, times_s=np.arange(0.0, 40.5, 0.1), green_s=(9.05, 18.0))
     coarse = run(lanes, agents, times_s=np.arange(0.0, 40.5, 2.0), green_s=(9.05, 18.0))
-    np.testing.assert_allclose(fine.place_m[::20][: len(coarse.place_m)], coarse.place_m, atol=1e-6)
+    np.testing.assert_allclose(
+        fine.lane_positions_m[::20][: len(coarse.lane_positions_m)], coarse.lane_positions_m, atol=1e-6
+    )
 
 
 def twin(lanes, agents, lights, times_s):
     """(T, N) places, worked out for one agent after the other in the words of the rules."""
-    place, speed = [agent.place_m for agent in agents], Simulation(lanes, agents, lights).speed_mps.tolist()
+    place, speed = [agent.place_m for agent in agents], LaneSimulation(lanes, agents, lights).speeds_mps.tolist()
     found = [list(place)]
     for time, after in pairwise(times_s):
         left, gates, ahead = lights.green_left_s(time), [], []
@@ -122,16 +124,16 @@ def twin(lanes, agents, lights, times_s):
             stop = line + driver.standstill_gap_m - STOP_BEFORE_LINE_M
             closing = speed[n] - speed[m] if np.isfinite(at) else 0.0
             behind, before = (
-                acceleration_in(
+                compute_acceleration_mps2(
                     driver,
                     np.array([speed[n]]),
-                    tightness(driver, np.array([speed[n]]), np.array([room]), np.array([approach])),
+                    compute_gap_ratio(driver, np.array([speed[n]]), np.array([room]), np.array([approach])),
                     driver.desired_speed_mps,
                 )
                 for room, approach in ((gap, closing), (stop, speed[n]))
             )
             wanted, room = np.minimum(behind, before), np.array([min(gap, line)])
-            way, end = advance(np.array([speed[n]]), wanted, room, after - time)
+            way, end = integrate_motion(np.array([speed[n]]), wanted, room, after - time)
             moved.append((place[n] + float(way[0]), float(end[0])))
         place, speed = map(list, zip(*moved, strict=True))
         found.append(place)
@@ -140,29 +142,32 @@ def twin(lanes, agents, lights, times_s):
 
 def test_all_together_are_that_many_single_ones():
     generator = np.random.default_rng(0)
-    gates = [Gate(200.0, 225.0, 0, MAIN), Gate(260.0, 285.0, 1, MAIN, green_needed_s=4.0)]
+    gates = [JunctionPassage(200.0, 225.0, 0, MAIN), JunctionPassage(260.0, 285.0, 1, MAIN, min_green_s=4.0)]
     crossing = Polyline(np.array([[0.0, 0.0], [0.0, 2000.0]]))
     lanes = [
         Lane(LONG, tuple(gates)),
-        Lane(crossing, (Gate(200.0, 225.0, 0, CROSS),)),
-        Lane(crossing, (Gate(120.0, 145.0, 1, CROSS),)),
-        Lane(loop(84.0, 18.0, 6.0)),
+        Lane(crossing, (JunctionPassage(200.0, 225.0, 0, CROSS),)),
+        Lane(crossing, (JunctionPassage(120.0, 145.0, 1, CROSS),)),
+        Lane(build_rounded_rectangle(84.0, 18.0, 6.0)),
     ]
     agents = [
         Agent("car", 5.0, lane, start + 16.0 * number, Driver(generator.uniform(3.0, 16.0)))
         for lane, start, count in ((0, 100.0, 5), (1, 110.0, 4), (2, 70.0, 3), (3, 0.0, 3))
         for number in range(count)
     ]
-    lights, times_s = Signals(np.array([3.0, 11.0]), green_s=(7.0, 5.0), amber_s=2.0, clear_s=1.0), TIMES_S[:250]
-    together = Simulation(lanes, agents, lights).run(times_s)
-    np.testing.assert_allclose(together.place_m, twin(lanes, agents, lights, times_s), atol=1e-6)
-    held_up = (together.speed_mps == 0.0).any(axis=0)
+    lights, times_s = (
+        TrafficSignals(np.array([3.0, 11.0]), green_s=(7.0, 5.0), yellow_s=2.0, all_red_s=1.0),
+        TIMES_S[:250],
+    )
+    together = LaneSimulation(lanes, agents, lights).run(times_s)
+    np.testing.assert_allclose(together.lane_positions_m, twin(lanes, agents, lights, times_s), atol=1e-6)
+    held_up = (together.speeds_mps == 0.0).any(axis=0)
     assert 2 < held_up.sum() < len(agents)
 
 
 def test_green_is_exclusive_and_clearing_times_lie_between():
-    signals, times_s = Signals(np.array([0.0, 17.3, -211.0])), np.arange(0.0, 400.0, 0.05)
-    left = signals.green_left_s(times_s)
+    signals, times_s = TrafficSignals(np.array([0.0, 17.3, -211.0])), np.arange(0.0, 400.0, 0.05)
+    left = signals.compute_remaining_green_s(times_s)
     green = left > 0
     assert not (green[..., MAIN] & green[..., CROSS]).any()
     assert green[..., MAIN].any()
@@ -172,17 +177,17 @@ def test_green_is_exclusive_and_clearing_times_lie_between():
             starts = times_s[1:][~green[:-1, junction, 1 - phase] & green[1:, junction, 1 - phase]]
             waits = [(starts[starts > end] - end).min() for end in ends if (starts > end).any()]
             assert len(waits) > 3
-            np.testing.assert_allclose(waits, signals.amber_s + signals.clear_s, atol=0.11)
+            np.testing.assert_allclose(waits, signals.yellow_s + signals.all_red_s, atol=0.11)
 
 
 def test_the_green_left_counts_down_to_the_change():
-    signals = Signals(np.zeros(1), green_s=(20.0, 10.0), amber_s=3.0, clear_s=2.0)
+    signals = TrafficSignals(np.zeros(1), green_s=(20.0, 10.0), yellow_s=3.0, all_red_s=2.0)
     assert signals.cycle_s == 40.0
-    np.testing.assert_allclose(signals.green_left_s(0.0)[0], [20.0, -np.inf])
-    np.testing.assert_allclose(signals.green_left_s(19.0)[0, MAIN], 1.0)
-    assert (signals.green_left_s(24.9)[0] < 0).all()
-    np.testing.assert_allclose(signals.green_left_s(25.0)[0, CROSS], 10.0)
-    np.testing.assert_allclose(signals.green_left_s(34.0 + 5 * 40.0)[0, CROSS], 1.0)
+    np.testing.assert_allclose(signals.compute_remaining_green_s(0.0)[0], [20.0, -np.inf])
+    np.testing.assert_allclose(signals.compute_remaining_green_s(19.0)[0, MAIN], 1.0)
+    assert (signals.compute_remaining_green_s(24.9)[0] < 0).all()
+    np.testing.assert_allclose(signals.compute_remaining_green_s(25.0)[0, CROSS], 10.0)
+    np.testing.assert_allclose(signals.compute_remaining_green_s(34.0 + 5 * 40.0)[0, CROSS], 1.0)
 
 
 def circle(radius, corners=720):
@@ -194,28 +199,28 @@ def circle(radius, corners=720):
 def test_a_straight_line_goes_on_beyond_its_ends(place):
     yaw = np.deg2rad(30.0)
     ends_m = np.array([1.0, 2.0]) + np.array([[0.0], [100.0]]) * [np.cos(yaw), np.sin(yaw)]
-    x, y, yaw_deg = Polyline(ends_m).poses(place)
+    x, y, yaw_deg = Polyline(ends_m).compute_poses(place)
     np.testing.assert_allclose([x, y], [1 + place * np.cos(yaw), 2 + place * np.sin(yaw)])
     assert yaw_deg == pytest.approx(30.0)
 
 
 def test_poses_on_a_circle():
     place = np.linspace(1.0, 300.0, 57)
-    poses = circle(50.0).poses(place)
+    poses = circle(50.0).compute_poses(place)
     angle = place / 50.0
     np.testing.assert_allclose(poses[:, :2], 50 * np.stack([np.cos(angle), np.sin(angle)], axis=1), atol=0.01)
     np.testing.assert_allclose(poses[:, 2], np.rad2deg(angle) + 90, atol=0.05)
 
 
 def test_a_loop_closes_without_a_jump_and_repeats():
-    line = loop(80.0, 20.0, 6.0)
+    line = build_rounded_rectangle(80.0, 20.0, 6.0)
     assert line.length_m == pytest.approx(2 * (80 + 20) - 8 * 6 + 2 * np.pi * 6, rel=1e-3)
     place = np.arange(-30.0, line.length_m + 30.0, 0.1)
-    poses = line.poses(place)
+    poses = line.compute_poses(place)
     assert np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1).max() < 0.1001
     turn = (np.diff(poses[:, 2]) + 180) % 360 - 180
     assert turn.min() >= -1e-9
     assert turn.max() < 2.0
-    np.testing.assert_allclose(line.poses(place + line.length_m)[:, :2], poses[:, :2], atol=1e-9)
+    np.testing.assert_allclose(line.compute_poses(place + line.length_m)[:, :2], poses[:, :2], atol=1e-9)
     assert np.abs(poses[:, 0]).max() == pytest.approx(40.0)
     assert np.abs(poses[:, 1]).max() == pytest.approx(10.0)

@@ -7,8 +7,8 @@ import trimesh
 from pydantic import TypeAdapter, ValidationError
 
 from torchcover.simulation.bodies import merge_meshes
-from torchcover.simulation.traffic import Urban
-from torchcover.simulation.traffic.frontage import HOUSES, KINDS, Side, Times, stand
+from torchcover.simulation.traffic import UrbanTraffic
+from torchcover.simulation.traffic.frontage import HOUSES, KINDS, RoadsideDensity, StreetSide, place_scenery
 
 # A street along x to either side of a curve, 3 m wide, with a sidewalk of 2 m on its right.
 ARC_M = np.linspace(-1.2, 0.0, 30)
@@ -27,8 +27,10 @@ def slope(places_m):
 
 
 def stood(times, zone="built", heights_m=slope, pavements=(), seed=0):
-    sides = [Side("kerb", shifted(3.3)), Side(zone, shifted(5.3))]
-    return stand(sides, [STREET], [STREET.buffer(1.9)], pavements, heights_m, times, np.random.default_rng(seed))
+    sides = [StreetSide("kerb", shifted(3.3)), StreetSide(zone, shifted(5.3))]
+    return place_scenery(
+        sides, [STREET], [STREET.buffer(1.9)], pavements, heights_m, times, np.random.default_rng(seed)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +63,9 @@ def test_around_a_corner_nothing_is_stretched():
     turn = np.linspace(0.0, np.pi / 2, 8)
     around_m = 3.0 * np.column_stack([np.cos(turn), np.sin(turn)])
     line_m = np.concatenate([[[3.0, -80.0]], around_m, [[-80.0, 3.0]]])
-    houses, _ = stand([Side("built", line_m)], [], [], (), lambda at: np.zeros(len(at)), OFF, np.random.default_rng(0))
+    houses, _ = place_scenery(
+        [StreetSide("built", line_m)], [], [], (), lambda at: np.zeros(len(at)), OFF, np.random.default_rng(0)
+    )
     corners_m = np.concatenate([mesh.vertices_m.reshape(-1, 2, 4, 3)[:, 0, :, :2] for mesh in houses])
     lengths_m = np.linalg.norm(np.roll(corners_m, -1, axis=1) - corners_m, axis=2)[:, ::2]
     longest_m = max(KINDS[name].run_m[1] for name in HOUSES)
@@ -81,13 +85,13 @@ def test_densities_are_times_as_much_down_to_none():
 
 
 def test_nothing_stands_where_there_are_no_sides():
-    assert stand([], [STREET], [], [], slope, 1.0, np.random.default_rng(0)) == ([], [])
+    assert place_scenery([], [STREET], [], [], slope, 1.0, np.random.default_rng(0)) == ([], [])
 
 
 def test_lines_may_be_short_and_their_corners_coincide():
-    short = Side("kerb", np.array([[0.0, 0.0], [0.3, 0.0]]))
-    twice = Side("open", np.repeat(shifted(5.3), 2, axis=0))
-    _, others = stand([short, twice], [STREET], [], [], slope, 1.0, np.random.default_rng(0))
+    short = StreetSide("kerb", np.array([[0.0, 0.0], [0.3, 0.0]]))
+    twice = StreetSide("open", np.repeat(shifted(5.3), 2, axis=0))
+    _, others = place_scenery([short, twice], [STREET], [], [], slope, 1.0, np.random.default_rng(0))
     assert others
     assert all(np.isfinite(mesh.vertices_m).all() for mesh in others)
 
@@ -104,6 +108,6 @@ def test_what_stands_on_pavement_is_a_kerb_higher_and_nothing_stands_across_its_
 @pytest.mark.parametrize("times", [-0.1, 100.0, float("nan"), {"hedge": 100.0}, {"hedges": 1.0}, {"house": 0.0}])
 def test_other_densities_are_refused(times):
     with pytest.raises(ValidationError):
-        TypeAdapter(Times).validate_python(times)
+        TypeAdapter(RoadsideDensity).validate_python(times)
     with pytest.raises(ValidationError, match="roadside"):
-        Urban(roadside=times)
+        UrbanTraffic(roadside_density=times)

@@ -3,14 +3,22 @@
 import numpy as np
 import pytest
 
-from torchcover.simulation.traffic.idm import HARDEST_BRAKING_MPS2, Driver, acceleration_in, advance, tightness
+from torchcover.simulation.traffic.idm import (
+    HARDEST_BRAKING_MPS2,
+    Driver,
+    compute_acceleration_mps2,
+    compute_gap_ratio,
+    integrate_motion,
+)
 
 DRIVER = Driver(desired_speed_mps=30.0, headway_s=1.5, standstill_gap_m=2.0, acceleration_mps2=1.4)
 STEP_S = 0.05
 
 
 def acceleration(driver, speed, gap, closing):
-    return acceleration_in(driver, speed, tightness(driver, speed, gap, closing), driver.desired_speed_mps)
+    return compute_acceleration_mps2(
+        driver, speed, compute_gap_ratio(driver, speed, gap, closing), driver.desired_speed_mps
+    )
 
 
 def equilibrium_gap_m(speed):
@@ -23,7 +31,7 @@ def drive(driver, speed, leader_place, leader_speed, duration, step=STEP_S):
     place, speed, gaps, speeds = np.zeros(1), np.array([float(speed)]), [], []
     for index in range(round(duration / step)):
         gap = leader_place + leader_speed * index * step - place
-        way, speed = advance(speed, acceleration(driver, speed, gap, speed - leader_speed), gap, step)
+        way, speed = integrate_motion(speed, acceleration(driver, speed, gap, speed - leader_speed), gap, step)
         place = place + way
         gaps.append(float(leader_place + leader_speed * (index + 1) * step - place[0]))
         speeds.append(float(speed[0]))
@@ -69,7 +77,7 @@ def test_no_step_leads_backwards_or_through_the_one_ahead():
     speed, room = generator.uniform(0, 40, 10_000), generator.uniform(-1, 60, 10_000)
     room[::7] = 0.0
     for step in (0.01, 0.1, 1.0, 10.0):
-        way, after = advance(speed, generator.uniform(-9, 3, 10_000), room, step)
+        way, after = integrate_motion(speed, generator.uniform(-9, 3, 10_000), room, step)
         assert (way >= 0).all()
         assert (way <= np.maximum(room, 0)).all()
         assert (after >= 0).all()
@@ -77,7 +85,7 @@ def test_no_step_leads_backwards_or_through_the_one_ahead():
 
 def test_a_step_is_uniform_acceleration_with_a_stop():
     infinite = np.full(3, np.inf)
-    way, after = advance(np.array([10.0, 10.0, 1.0]), np.array([2.0, -2.0, -4.0]), infinite, 0.5)
+    way, after = integrate_motion(np.array([10.0, 10.0, 1.0]), np.array([2.0, -2.0, -4.0]), infinite, 0.5)
     np.testing.assert_allclose(way, [10 * 0.5 + 0.25, 10 * 0.5 - 0.25, 1.0 / 8.0])
     np.testing.assert_allclose(after, [11.0, 9.0, 0.0])
 

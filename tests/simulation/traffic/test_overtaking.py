@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from torchcover.simulation.traffic.flow import Agent
-from torchcover.simulation.traffic.highway import LANE_CENTRES_M, SideLane
+from torchcover.simulation.traffic.highway import LANE_CENTRES_M, AuxiliaryLane
 from torchcover.simulation.traffic.idm import Driver
-from torchcover.simulation.traffic.overtaking import LANES, SIDE_LANE, Change, Overtaking
+from torchcover.simulation.traffic.overtaking import LANES, SIDE_LANE, LaneChange, LaneChangeSimulation
 
 TIMES_S = np.arange(0.0, 60.0, 0.1)
 CAR, SLOW = Driver(33.0), Driver(23.0)
@@ -21,21 +21,24 @@ def drive(*agents, heavy=(), exits=(), side_m=FAR_M, times_s=TIMES_S, kind="car"
     """What happened, and the (T, N) lanes, of agents (lane, place, driver)."""
     made = [Agent(kind, 5.0, lane, place, driver) for lane, place, driver in agents]
     marked = [np.isin(np.arange(len(made)), which) for which in (heavy, exits)]
-    traffic = Overtaking(made, *marked, side_m, np.random.default_rng(0), LEVEL + np.array([[0.0], [slope]]))
+    traffic = LaneChangeSimulation(made, *marked, side_m, np.random.default_rng(0), LEVEL + np.array([[0.0], [slope]]))
     flow = traffic.run(times_s, 0.0)
-    lanes = np.tile([agent.lane for agent in made], (len(times_s), 1))
-    for change in traffic.changes:
-        lanes[flow.place_m[:, change.agent] > change.place_m, change.agent] = change.new
+    lanes = np.tile([agent.lane_index for agent in made], (len(times_s), 1))
+    for change in traffic.lane_changes:
+        lanes[flow.lane_positions_m[:, change.agent_index] > change.start_m, change.agent_index] = change.new_lane_index
     return traffic, flow, lanes
 
 
 def test_a_faster_one_overtakes_on_the_left_and_comes_back():
     traffic, flow, lanes = drive((2, 0.0, CAR), (2, 150.0, SLOW))
-    assert [(change.agent, change.old, change.new) for change in traffic.changes] == [(0, 2, 1), (0, 1, 2)]
-    assert flow.place_m[-1, 0] > flow.place_m[-1, 1] + 50.0
+    assert [(change.agent_index, change.old_lane_index, change.new_lane_index) for change in traffic.lane_changes] == [
+        (0, 2, 1),
+        (0, 1, 2),
+    ]
+    assert flow.lane_positions_m[-1, 0] > flow.lane_positions_m[-1, 1] + 50.0
     # Hardly slower for it: the model alone would have followed.
-    assert flow.speed_mps[100:, 0].min() > 28.0
-    passing = np.abs(flow.place_m[:, 0] - flow.place_m[:, 1]) < 5.0
+    assert flow.speeds_mps[100:, 0].min() > 28.0
+    passing = np.abs(flow.lane_positions_m[:, 0] - flow.lane_positions_m[:, 1]) < 5.0
     assert (lanes[passing, 0] == 1).all()
 
 
@@ -43,17 +46,20 @@ def test_nobody_comes_back_right_in_front_of_another_however_fast_they_get_away(
     pairs = [(2, 3000.0 * pair + 3.0 * pair * slow + 100.0 * slow, SLOW if slow else CAR)
              for pair in range(16) for slow in (0, 1)]  # fmt: skip
     traffic, flow, _ = drive(*pairs)
-    back = [change for change in traffic.changes if change.new == 2 and change.agent % 2 == 0]
+    back = [change for change in traffic.lane_changes if change.new_lane_index == 2 and change.agent_index % 2 == 0]
     assert len(back) > 8
     for change in back:
-        at, slow = int(np.argmax(flow.place_m[:, change.agent] >= change.place_m)), change.agent + 1
-        gap_m = flow.place_m[at, change.agent] - flow.place_m[at, slow] - 5.0
-        assert gap_m > 0.6 * flow.speed_mps[at, slow] - 0.1
+        at, slow = (
+            int(np.argmax(flow.lane_positions_m[:, change.agent_index] >= change.start_m)),
+            change.agent_index + 1,
+        )
+        gap_m = flow.lane_positions_m[at, change.agent_index] - flow.lane_positions_m[at, slow] - 5.0
+        assert gap_m > 0.6 * flow.speeds_mps[at, slow] - 0.1
 
 
 def test_one_keeps_to_the_right_where_nothing_is_gained_on_the_left():
     traffic, _, _ = drive((0, 0.0, CAR), (2, 400.0, Driver(34.5)))
-    assert [(change.old, change.new) for change in traffic.changes] == [(0, 1), (1, 2)]
+    assert [(change.old_lane_index, change.new_lane_index) for change in traffic.lane_changes] == [(0, 1), (1, 2)]
 
 
 def test_nobody_goes_to_the_right_to_pass_there():
@@ -61,36 +67,36 @@ def test_nobody_goes_to_the_right_to_pass_there():
     drives = [
         drive((1, 60.0, ahead), (1, 0.0, CAR), heavy=[1], times_s=TIMES_S[:15])[0] for ahead in (SLOW, Driver(40.0))
     ]
-    assert [[change[:3] for change in traffic.changes] for traffic in drives] == [[], [(1, 1, 2)]]
+    assert [[change[:3] for change in traffic.lane_changes] for traffic in drives] == [[], [(1, 1, 2)]]
 
 
 def test_nobody_cuts_in_where_another_would_have_to_brake_hard():
     # A fast one comes from behind: the change waits for it.
     traffic, flow, _ = drive((2, 100.0, CAR), (2, 160.0, SLOW), (1, 40.0, Driver(40.0)))
-    (first, *_) = [change for change in traffic.changes if change.agent == 0]
-    at = int(np.argmax(flow.place_m[:, 0] > first.place_m))
-    assert flow.place_m[at, 2] > flow.place_m[at, 0]
-    assert np.diff(flow.speed_mps[:, 2]).min() / 0.1 > -2.1
+    (first, *_) = [change for change in traffic.lane_changes if change.agent_index == 0]
+    at = int(np.argmax(flow.lane_positions_m[:, 0] > first.start_m))
+    assert flow.lane_positions_m[at, 2] > flow.lane_positions_m[at, 0]
+    assert np.diff(flow.speeds_mps[:, 2]).min() / 0.1 > -2.1
 
 
 @pytest.mark.parametrize(("lane", "slope"), [(2, 0.04), (6, -0.04), (2, 0.03)])
 def test_a_laden_lorry_goes_up_as_fast_as_its_power_lifts_it(lane, slope):
     limit = Driver(23.6, 1.6, 3.0, 0.6)
     _, flow, _ = drive((lane, 0.0, limit), kind="truck", slope=slope, times_s=np.arange(0.0, 400.0, 0.5))
-    speed = flow.speed_mps[-1, 0]
+    speed = flow.speeds_mps[-1, 0]
     assert 9.81 * (abs(slope) + 0.006) * speed + 9e-5 * speed**3 == pytest.approx(1000 / 120, rel=0.01)
     assert 15.0 < speed < 22.0
     # Down there, and on the level, it keeps to the limit as all do.
     for kind, down in (("truck", -slope), ("truck", 0.0), ("car", slope)):
         _, flow, _ = drive((lane, 0.0, limit), kind=kind, slope=down, times_s=np.arange(0.0, 200.0, 0.5))
-        assert flow.speed_mps[100:, 0].min() > 22.0
-        assert flow.speed_mps.max() < 1.03 * 23.6
+        assert flow.speeds_mps[100:, 0].min() > 22.0
+        assert flow.speeds_mps.max() < 1.03 * 23.6
 
 
 def test_lorries_keep_out_of_the_lane_at_the_median():
     agents = [(1, 0.0, CAR), (1, 150.0, SLOW), (2, 150.0, SLOW)]
-    assert any(change[:3] == (0, 1, 0) for change in drive(*agents)[0].changes)
-    assert not any(change[:3] == (0, 1, 0) for change in drive(*agents, heavy=[0])[0].changes)
+    assert any(change[:3] == (0, 1, 0) for change in drive(*agents)[0].lane_changes)
+    assert not any(change[:3] == (0, 1, 0) for change in drive(*agents, heavy=[0])[0].lane_changes)
 
 
 @pytest.mark.parametrize("direction", [0, LANES])
@@ -99,13 +105,13 @@ def test_who_enters_and_who_exits_does_so_beside_the_lanes(direction):
     agents = [(lane + direction, place, driver) for lane, place, driver in agents]
     traffic, flow, lanes = drive(*agents, exits=[1], side_m=NEAR_M)
     assert (lanes[-1] - direction).tolist() == [2, SIDE_LANE, 2]
-    for change in traffic.changes:
-        if SIDE_LANE in (change.old - direction, change.new - direction):
-            assert 1500.0 < change.place_m < change.place_m + change.way_m < 2100.0
+    for change in traffic.lane_changes:
+        if SIDE_LANE in (change.old_lane_index - direction, change.new_lane_index - direction):
+            assert 1500.0 < change.start_m < change.start_m + change.length_m < 2100.0
     # On ramps one is slow, and slows down before.
-    assert flow.speed_mps[flow.place_m[:, 0] < 1490.0, 0].max() < 22.5
-    assert flow.speed_mps[flow.place_m[:, 1] > 2100.0, 1].max() < 23.5
-    assert np.diff(flow.speed_mps[:, 1]).min() / 0.1 > -2.5
+    assert flow.speeds_mps[flow.lane_positions_m[:, 0] < 1490.0, 0].max() < 22.5
+    assert flow.speeds_mps[flow.lane_positions_m[:, 1] > 2100.0, 1].max() < 23.5
+    assert np.diff(flow.speeds_mps[:, 1]).min() / 0.1 > -2.5
 
 
 def test_who_finds_no_gap_stays_on_the_ramp():
@@ -123,23 +129,23 @@ def test_in_the_thick_of_it_nobody_touches_anybody_in_either_lane():
     ]
     exits = np.flatnonzero(np.array([agent[0] for agent in agents]) % LANES == 2)[::2]
     traffic, flow, lanes = drive(*agents, exits=exits, side_m=NEAR_M - 500.0, times_s=TIMES_S[:400:2])
-    assert len(traffic.changes) > 60
+    assert len(traffic.lane_changes) > 60
     in_lane = lanes[:, :, None] == lanes[:, None]
-    for change in traffic.changes:
+    for change in traffic.lane_changes:
         # Until well over the line, it is in its old lane, too.
-        place_m = flow.place_m[:, change.agent]
-        both = (place_m >= change.place_m) & (place_m < change.place_m + 0.6 * change.way_m)
-        there = lanes == change.old
-        in_lane[:, change.agent] |= both[:, None] & there
-    apart = np.abs(flow.place_m[:, :, None] - flow.place_m[:, None])
+        place_m = flow.lane_positions_m[:, change.agent_index]
+        both = (place_m >= change.start_m) & (place_m < change.start_m + 0.6 * change.length_m)
+        there = lanes == change.old_lane_index
+        in_lane[:, change.agent_index] |= both[:, None] & there
+    apart = np.abs(flow.lane_positions_m[:, :, None] - flow.lane_positions_m[:, None])
     np.einsum("tii->ti", apart)[...] = np.inf
     assert apart[in_lane].min() > 5.0
 
 
 def test_a_change_begins_and_ends_without_a_jerk_and_its_slope_is_its_slope():
-    change = Change(0, 2, 1, 100.0, 150.0)
+    change = LaneChange(0, 2, 1, 100.0, 150.0)
     place_m = np.linspace(50.0, 300.0, 2501)
-    done, per_m = change.share(place_m)
+    done, per_m = change.compute_progress(place_m)
     assert done[0] == 0.0
     assert done[-1] == 1.0
     np.testing.assert_allclose(np.gradient(done, place_m), per_m, atol=1e-5)
@@ -148,14 +154,14 @@ def test_a_change_begins_and_ends_without_a_jerk_and_its_slope_is_its_slope():
 
 
 def test_ramps_leave_gently_and_what_stands_there_keeps_off():
-    lane = SideLane(1000.0, 1500.0)
+    lane = AuxiliaryLane(1000.0, 1500.0)
     stations = np.arange(0.0, 2500.0, 0.5)
-    away_m, slope = lane.away_m(stations)
+    away_m, slope = lane.compute_offsets_m(stations)
     assert (away_m[(stations >= 1000.0) & (stations <= 1500.0)] == 0.0).all()
     np.testing.assert_allclose(np.gradient(away_m, stations), slope, atol=3e-4)
     assert np.abs(np.gradient(slope, stations)).max() <= 1 / 500.0 + 1e-9
     ramp_m = LANE_CENTRES_M[SIDE_LANE] + away_m
     for left_m, wide_m in ((16.8, 0.5), (19.5, 0.5), (30.0, 3.5)):
-        kept_m = lane.kept_off(stations, left_m, wide_m)
+        kept_m = lane.find_clear_offsets_m(stations, left_m, wide_m)
         assert (np.abs(kept_m - ramp_m) > 1.8 + wide_m).all()
         assert (kept_m >= left_m).all()

@@ -4,15 +4,27 @@ import numpy as np
 import pytest
 import trimesh
 
-from torchcover.simulation.traffic.scenery import block, box, few, ground, post, prism, rectangle, tree
+from torchcover.simulation.traffic.scenery import (
+    build_box,
+    build_box_from_bounds,
+    build_ground_plane,
+    build_post,
+    build_prism,
+    build_rectangle,
+    build_tree,
+    merge_by_kind,
+)
 
-TREE = tree((1.0, 2.0), 0.15, 2.5, 7.0, 1.5)
+TREE = build_tree((1.0, 2.0), 0.15, 2.5, 7.0, 1.5)
 PIECES = {
-    "block": (block((1.0, 3.0), (-2.0, 2.0), (0.0, 5.0)), 2 * 4 * 5),
-    "box": (box((5.0, 5.0), (2.0, 3.0, 4.0), 1.0, 35.0), 2 * 3 * 4),
-    "post": (post((1.0, 1.0), 0.1, 0.0, 3.0), 6 / 2 * np.sin(np.pi / 3) * 0.01 * 3),
+    "block": (build_box_from_bounds((1.0, 3.0), (-2.0, 2.0), (0.0, 5.0)), 2 * 4 * 5),
+    "box": (build_box((5.0, 5.0), (2.0, 3.0, 4.0), 1.0, 35.0), 2 * 3 * 4),
+    "post": (build_post((1.0, 1.0), 0.1, 0.0, 3.0), 6 / 2 * np.sin(np.pi / 3) * 0.01 * 3),
     "trunk": (TREE[0], 6 / 2 * np.sin(np.pi / 3) * 0.15**2 * 2.5),
-    "pyramid": (prism([rectangle((-1, 1), (-1, 1)), rectangle((-0.5, 0.5), (-0.5, 0.5))], [0.0, 3.0]), 7.0),
+    "pyramid": (
+        build_prism([build_rectangle((-1, 1), (-1, 1)), build_rectangle((-0.5, 0.5), (-0.5, 0.5))], [0.0, 3.0]),
+        7.0,
+    ),
 }
 
 
@@ -33,7 +45,7 @@ def test_a_crown_is_closed_and_begins_where_the_trunk_ends():
 
 
 def test_the_ground_covers_its_corners_and_few_merges_by_kind():
-    mesh = ground((-5.0, -1.0), (5.0, 1.0))
+    mesh = build_ground_plane((-5.0, -1.0), (5.0, 1.0))
     assert np.ptp(mesh.vertices_m, axis=0).tolist() == [10.0, 2.0, 0.0]
-    merged = few([PIECES["block"][0], PIECES["box"][0]], [], [TREE[0]])
+    merged = merge_by_kind([PIECES["block"][0], PIECES["box"][0]], [], [TREE[0]])
     assert [len(m.faces) for m in merged] == [24, 20]

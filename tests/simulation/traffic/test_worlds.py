@@ -7,7 +7,7 @@ from pydantic import ValidationError
 from torchcover.simulation.patches import find_outward_faces
 from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.shapes import Mesh
-from torchcover.simulation.traffic import Highway, Parking, Urban, urban
+from torchcover.simulation.traffic import HighwayTraffic, ParkingTraffic, UrbanTraffic, urban
 
 WORLDS = ["urban", "narrow", "highway", "parking"]
 
@@ -32,7 +32,7 @@ def speeds(actor):
 
 @pytest.mark.parametrize("kind", WORLDS)
 def test_the_same_seed_gives_the_same_world_and_another_seed_another(kind, bodies):
-    model = {"urban": Urban, "highway": Highway, "parking": Parking}.get(kind, Urban)
+    model = {"urban": UrbanTraffic, "highway": HighwayTraffic, "parking": ParkingTraffic}.get(kind, UrbanTraffic)
     options = {"lanes": 2} if kind == "narrow" else {}
     first, again = (model(duration_s=3.0, **options).build_scene(seed, bodies=bodies) for seed in (5, 5))
     other = model(duration_s=3.0, **options).build_scene(6, bodies=bodies)
@@ -202,7 +202,7 @@ def test_people_cross_the_aisles_of_the_lot_and_cars_are_slow(world):
 
 def test_a_lot_is_surrounded_by_what_stands_beside_streets_and_that_keeps_off_it(bodies):
     full, bare = (
-        Parking(duration_s=1.0, **keys).build_scene(0, bodies=bodies)
+        ParkingTraffic(duration_s=1.0, **keys).build_scene(0, bodies=bodies)
         for keys in ({}, {"built_share": 0, "roadside": 0})
     )
     *same, houses, others = full.static_meshes
@@ -218,13 +218,13 @@ def test_a_lot_is_surrounded_by_what_stands_beside_streets_and_that_keeps_off_it
 @pytest.mark.parametrize(
     ("model", "options"),
     [
-        (Urban, {"traffic_per_km": 0, "cyclists_per_km": 0, "people_per_km": 0, "parked_share": 0}),
-        (Urban, {"traffic_per_km": 120, "parked_share": 1}),
-        (Urban, {"time_step_s": 0.5, "duration_s": 0.2}),
-        (Highway, {"traffic_per_km": 0, "ego_lane": 1}),
-        (Highway, {"traffic_per_km": 200, "ego_lane": 3, "time_step_s": 1.5}),
-        (Parking, {"cars": 0, "crossings": 0, "parked_share": 0}),
-        (Parking, {"cars": 6, "crossings": 8, "parked_share": 1}),
+        (UrbanTraffic, {"traffic_per_km": 0, "cyclists_per_km": 0, "people_per_km": 0, "parked_share": 0}),
+        (UrbanTraffic, {"traffic_per_km": 120, "parked_share": 1}),
+        (UrbanTraffic, {"time_step_s": 0.5, "duration_s": 0.2}),
+        (HighwayTraffic, {"traffic_per_km": 0, "ego_lane": 1}),
+        (HighwayTraffic, {"traffic_per_km": 200, "ego_lane": 3, "time_step_s": 1.5}),
+        (ParkingTraffic, {"cars": 0, "crossings": 0, "parked_share": 0}),
+        (ParkingTraffic, {"cars": 6, "crossings": 8, "parked_share": 1}),
     ],
 )
 def test_extreme_parameters_still_make_a_world(model, options, bodies):
@@ -236,15 +236,15 @@ def test_extreme_parameters_still_make_a_world(model, options, bodies):
 @pytest.mark.parametrize(
     ("model", "options"),
     [
-        (Urban, {"lanes": 3}),
-        (Urban, {"parked_share": 1.5}),
-        (Urban, {"cross_share": 1.5}),
-        (Urban, {"traffic_per_km": -1}),
-        (Urban, {"lane": 4}),
-        (Highway, {"ego_lane": 4}),
-        (Highway, {"duration_s": 0}),
-        (Highway, {"hills_m": 11}),
-        (Parking, {"speed_mps": 20}),
+        (UrbanTraffic, {"lanes": 3}),
+        (UrbanTraffic, {"parked_share": 1.5}),
+        (UrbanTraffic, {"cross_traffic_share": 1.5}),
+        (UrbanTraffic, {"traffic_per_km": -1}),
+        (UrbanTraffic, {"lane": 4}),
+        (HighwayTraffic, {"ego_lane": 4}),
+        (HighwayTraffic, {"duration_s": 0}),
+        (HighwayTraffic, {"hill_height_std_m": 11}),
+        (ParkingTraffic, {"speed_mps": 20}),
     ],
 )
 def test_impossible_parameters_are_errors(model, options):
@@ -255,19 +255,19 @@ def test_impossible_parameters_are_errors(model, options):
 def test_a_missing_body_is_an_error_that_names_it(bodies):
     few = {kind: mesh for kind, mesh in bodies.items() if kind not in ("bus", "adult")}
     with pytest.raises(ValueError, match="none for adult, bus"):
-        Urban().build_scene(0, bodies=few)
+        UrbanTraffic().build_scene(0, bodies=few)
 
 
 def test_the_ego_may_have_a_body_of_its_own(bodies):
-    w = Urban(duration_s=2.0).build_scene(0, ego_mesh=bodies["bus"], bodies=bodies)
+    w = UrbanTraffic(duration_s=2.0).build_scene(0, ego_mesh=bodies["bus"], bodies=bodies)
     assert w.ego.mesh is bodies["bus"]
 
 
 def test_who_is_left_out_changes_nothing(monkeypatch, bodies):
-    few = Urban(duration_s=8.0).build_scene(3, bodies=bodies)
+    few = UrbanTraffic(duration_s=8.0).build_scene(3, bodies=bodies)
     monkeypatch.setattr(urban, "_who_matter", lambda lanes, agents, duration_s: agents)
-    monkeypatch.setattr(urban, "come_near", lambda lanes, agents, place_m: np.arange(len(agents)))
-    everybody = Urban(duration_s=8.0).build_scene(3, bodies=bodies)
+    monkeypatch.setattr(urban, "find_nearby_agents", lambda lanes, agents, place_m: np.arange(len(agents)))
+    everybody = UrbanTraffic(duration_s=8.0).build_scene(3, bodies=bodies)
     assert [actor.name for actor in few.actors] == [actor.name for actor in everybody.actors]
     for one, other in zip((few.ego, *few.actors), (everybody.ego, *everybody.actors), strict=True):
         np.testing.assert_array_equal(one.trajectory.positions_m, other.trajectory.positions_m)
@@ -278,7 +278,7 @@ def test_nobody_is_where_the_street_is_not_built(monkeypatch, bodies):
     # Farther on a street may come back, through what stands beside it here.
     for name, way_m in {"BEHIND_M": 30.0, "AHEAD_M": 60.0, "ASIDE_M": 20.0}.items():
         monkeypatch.setattr(urban, name, way_m)
-    city = Urban(bend_deg=0.5, turn_share=0.0, duration_s=4.0, time_step_s=0.5).build_scene(0, bodies=bodies)
+    city = UrbanTraffic(max_bend_deg=0.5, turn_share=0.0, duration_s=4.0, time_step_s=0.5).build_scene(0, bodies=bodies)
     first_m, last_m = city.ego.trajectory.positions_m[[0, -1], 0]
     along = [actor for actor in city.actors if abs(np.sin(np.deg2rad(actor.trajectory.angles_deg[0, 0]))) < 0.1]
     x_m = np.concatenate([actor.trajectory.positions_m[:, 0] for actor in along])
@@ -289,7 +289,9 @@ def test_nobody_is_where_the_street_is_not_built(monkeypatch, bodies):
 
 def test_cross_streets_have_a_share_of_the_traffic(bodies):
     def across(share):
-        city = Urban(bend_deg=0.0, turn_share=0.0, cross_share=share, duration_s=2.0, time_step_s=0.5)
+        city = UrbanTraffic(
+            max_bend_deg=0.0, turn_share=0.0, cross_traffic_share=share, duration_s=2.0, time_step_s=0.5
+        )
         drivers = [actor for actor in city.build_scene(0, bodies=bodies).actors if actor.category != "pedestrian"]
         return sum(abs(np.sin(np.deg2rad(actor.trajectory.angles_deg[0, 0]))) > 0.9 for actor in drivers)
 

@@ -22,16 +22,16 @@ TOLD = 8
 
 
 class Excerpt(NamedTuple):
-    """What is shown of a recording: `drive` of the ego and all `others`, in its time, from `begin_s` on."""
+    """What is shown of a recording: `ego_trajectory` of the ego and all `other_tracks`, in its time, from `begin_s` on."""
 
     name: str
-    drive: Trajectory
-    others: tuple[Track, ...]
+    ego_trajectory: Trajectory
+    other_tracks: tuple[Track, ...]
     begin_s: float = 0.0
     duration_s: float = 0.0
 
 
-def cast_of(recording: RecordedObjects, ego_id: str | None, ego_T_vehicle: Matrix | None) -> Excerpt:
+def choose_ego(recording: RecordedObjects, ego_id: str | None, ego_T_vehicle: Matrix | None) -> Excerpt:
     """Choose the ego, and no times yet: the track or the recording's own ego of an id, the first of these without one.
 
     `ego_T_vehicle` is the vehicle frame in that of the poses of its own ego, if not as published.
@@ -52,21 +52,21 @@ def cast_of(recording: RecordedObjects, ego_id: str | None, ego_T_vehicle: Matri
     return Excerpt(found[0].name, found[0].trajectory, (*others, *(body for body in bodies if body is not None)))
 
 
-def excerpt_of(cast: Excerpt, begin_s: float, duration_s: float | None, max_gap_s: float) -> Excerpt:
+def choose_time_span(excerpt: Excerpt, begin_s: float, duration_s: float | None, max_gap_s: float) -> Excerpt:
     """Choose the times: those at which the ego and the others are known, or of them what is asked for.
 
     An ego of which one pose is known stands there; that instant alone is shown, unless a duration is given.
     """
-    drive_s = cast.drive.times_s
+    drive_s = excerpt.ego_trajectory.times_s
     stands = len(drive_s) == 1
-    known_s = [track.trajectory.times_s for track in cast.others if track.trajectory.is_transient]
+    known_s = [track.trajectory.times_s for track in excerpt.other_tracks if track.trajectory.is_transient]
     earliest_s = min((float(times_s[0]) for times_s in known_s), default=-np.inf)
     latest_s = max((float(times_s[-1]) for times_s in known_s), default=np.inf)
     first_s = float(drive_s[0]) if stands else max(float(drive_s[0]), earliest_s)
     last_s = max(latest_s, first_s) if stands else min(float(drive_s[-1]), latest_s)
     if last_s < first_s - TIME_SLACK_S:
         raise ValueError(
-            f"the ego {cast.name!r} is there from {drive_s[0]:g} to {drive_s[-1]:g} s, the others from {earliest_s:g} "
+            f"the ego {excerpt.name!r} is there from {drive_s[0]:g} to {drive_s[-1]:g} s, the others from {earliest_s:g} "
             f"to {latest_s:g} s of the recording: never at the same time"
         )
     length_s = last_s - first_s
@@ -74,17 +74,19 @@ def excerpt_of(cast: Excerpt, begin_s: float, duration_s: float | None, max_gap_
         duration_s = 0.0 if stands else length_s - begin_s
     if begin_s + max(duration_s, 0.0) > length_s + TIME_SLACK_S:
         raise ValueError(
-            f"the ego {cast.name!r} and the others are known for {length_s:g} s; begin_s {begin_s:g} and duration_s "
+            f"the ego {excerpt.name!r} and the others are known for {length_s:g} s; begin_s {begin_s:g} and duration_s "
             f"{max(duration_s, 0.0):g} reach beyond: make them shorter"
         )
     begin_s += first_s
-    whole = cast.drive if stands else _without_gaps(cast, begin_s, begin_s + duration_s, max_gap_s, first_s)
-    return cast._replace(drive=whole, begin_s=begin_s, duration_s=duration_s)
+    whole = (
+        excerpt.ego_trajectory if stands else _without_gaps(excerpt, begin_s, begin_s + duration_s, max_gap_s, first_s)
+    )
+    return excerpt._replace(ego_trajectory=whole, begin_s=begin_s, duration_s=duration_s)
 
 
 def _without_gaps(cast: Excerpt, begin_s: float, end_s: float, max_gap_s: float, first_s: float) -> Trajectory:
     """The piece of the ego's drive that holds all of a time."""
-    found = pieces(cast.drive, max_gap_s)
+    found = split_at_gaps(cast.ego_trajectory, max_gap_s)
     for piece in found:
         if piece.times_s[0] <= begin_s + TIME_SLACK_S and piece.times_s[-1] >= end_s - TIME_SLACK_S:
             return piece
@@ -99,7 +101,7 @@ def _without_gaps(cast: Excerpt, begin_s: float, end_s: float, max_gap_s: float,
     )
 
 
-def pieces(trajectory: Trajectory, max_gap_s: float) -> list[Trajectory]:
+def split_at_gaps(trajectory: Trajectory, max_gap_s: float) -> list[Trajectory]:
     """What is left of a trajectory where it was unseen for too long, or jumps."""
     kept = _apart(trajectory.times_s)
     times_s, places_m, angles_deg = trajectory.times_s[kept], trajectory.positions_m[kept], trajectory.angles_deg[kept]
@@ -145,6 +147,6 @@ def _told(recording: RecordedObjects, like: str) -> str:
     return ", ".join(map(repr, told[:TOLD])) + (f" and {more} more" if more > 0 else "")
 
 
-def poses_at_all(trajectory: Trajectory) -> Matrix:
+def build_pose_matrices(trajectory: Trajectory) -> Matrix:
     """(K, 4, 4) the poses that a trajectory was given."""
     return build_transform(convert_euler_to_rotation(*trajectory.angles_deg.T), trajectory.positions_m)

@@ -17,14 +17,20 @@ from torchcover.recordings.formats.tracks import read_trajectory
 from torchcover.recordings.objects import Ego, RecordedObjects
 from torchcover.simulation.bodies import build_checked_mesh
 from torchcover.simulation.documents import Pose, RelativePath, hash_builtin_documents
-from torchcover.simulation.recorded.bodies import Bodies, ground_below, sides_of, stood_on, tilted
-from torchcover.simulation.recorded.run import Excerpt, cast_of, excerpt_of, pieces, poses_at_all
+from torchcover.simulation.recorded.bodies import (
+    BodyLibrary,
+    apply_ground_tilt,
+    collect_ground_positions,
+    find_visible_sides,
+    fit_ground,
+)
+from torchcover.simulation.recorded.run import Excerpt, build_pose_matrices, choose_ego, choose_time_span, split_at_gaps
 from torchcover.simulation.shapes import Mesh, MeshFile
 from torchcover.simulation.traffic.assemble import HORIZON_M
 from torchcover.simulation.traffic.fleet import EGO, load_bodies
-from torchcover.simulation.traffic.frontage import Times, stand
+from torchcover.simulation.traffic.frontage import RoadsideDensity, place_scenery
 from torchcover.simulation.traffic.kind import Traffic
-from torchcover.simulation.traffic.scenery import few
+from torchcover.simulation.traffic.scenery import merge_by_kind
 from torchcover.simulation.world import Actor, Scene, count_time_steps
 
 # A time that is so near to an instant is that instant.
@@ -54,7 +60,7 @@ class RecordedTraffic(Traffic):
         ground: File of a mesh, in metres and in the recording's frame; a height field below the tracks if not given.
         built_share: If it is given, what stands beside streets is drawn beside what was driven, with houses on such a
             share of the sides: none of that was recorded.
-        roadside: How many times as much of it but houses there is than usually, or of some kinds of it.
+        roadside_density: How many times as much of it but houses there is than usually, or of some kinds of it.
         time_step_s: Time between two frames.
     """
 
@@ -71,11 +77,11 @@ class RecordedTraffic(Traffic):
     max_gap_s: Annotated[float, Field(gt=0.0)] = 1.0
     ground: RelativePath | None = None
     built_share: Annotated[float | None, Field(ge=0.0, le=1.0)] = None
-    roadside: Times = 1.0
+    roadside_density: RoadsideDensity = 1.0
 
     @model_validator(mode="after")
     def _check_drawn(self) -> Self:
-        if self.built_share is None and self.roadside != 1.0:
+        if self.built_share is None and self.roadside_density != 1.0:
             raise ValueError("roadside is for what is drawn beside tracks: give built_share, too, from 0 to 1")
         if self.built_share is not None and self.ground is not None:
             raise ValueError(
@@ -84,7 +90,7 @@ class RecordedTraffic(Traffic):
         return self
 
     @property
-    def drawn_words(self) -> str:
+    def sampling_note(self) -> str:
         """What stands beside streets, if it is drawn."""
         if self.built_share is None:
             return ""
@@ -111,23 +117,30 @@ class RecordedTraffic(Traffic):
         Who is where the ego is at an instant is left out, with a warning.
         """
         run = self._run
-        drive = self._shown(run.drive)
+        drive = self._shown(run.ego_trajectory)
         mesh = load_bodies()["suv"] if ego_mesh is None else ego_mesh
         driver = Actor(EGO, "car", mesh, Trajectory(drive.times_s, drive.positions_m, drive.angles_deg))
-        others = list(self._actors(driver.trajectory, Bodies()))
+        others = list(self._actors(driver.trajectory, BodyLibrary()))
         shown = self._apart(driver, others)
         left_out = len(others) - len(shown)
         stood: tuple[Mesh, ...] = ()
         if self.ground is None:
-            standing = [track.trajectory.positions_m for track in run.others if track.vehicle_class is not None]
-            below = ground_below(
-                stood_on(standing), stood_on([driver.trajectory.interpolate_positions_m(self._times_s)])
+            standing = [track.trajectory.positions_m for track in run.other_tracks if track.vehicle_class is not None]
+            below = fit_ground(
+                collect_ground_positions(standing),
+                collect_ground_positions([driver.trajectory.interpolate_positions_m(self._times_s)]),
             )
             if self.built_share is not None:
                 generator = np.random.default_rng(seed)
-                sides, driven, walked = sides_of(driver, shown, self.built_share, generator)
-                stood = few(*stand(sides, driven, walked, (), below.compute_heights_m, self.roadside, generator))
-            ground, driver, shown = below.build_mesh(), tilted(driver, below), [tilted(other, below) for other in shown]
+                sides, driven, walked = find_visible_sides(driver, shown, self.built_share, generator)
+                stood = merge_by_kind(
+                    *place_scenery(sides, driven, walked, (), below.compute_heights_m, self.roadside_density, generator)
+                )
+            ground, driver, shown = (
+                below.build_mesh(),
+                apply_ground_tilt(driver, below),
+                [apply_ground_tilt(other, below) for other in shown],
+            )
         else:
             ground = self._read(self.ground)
         return Scene(
@@ -151,11 +164,13 @@ class RecordedTraffic(Traffic):
             if self.ego_id is not None:
                 raise ValueError("ego_id and ego_trajectory exclude each other: the ego is one of them")
             drive = read_trajectory(self.ego_trajectory)
-            driven = Ego(self.ego_trajectory.name, drive.times_s, poses_at_all(drive), np.eye(4))
+            driven = Ego(self.ego_trajectory.name, drive.times_s, build_pose_matrices(drive), np.eye(4))
             recording = RecordedObjects(recording.tracks, (driven,))
         frame = None if self.ego_T_vehicle is None else self.ego_T_vehicle.to_matrix()
         try:
-            return excerpt_of(cast_of(recording, self.ego_id, frame), self.begin_s, self.duration_s, self.max_gap_s)
+            return choose_time_span(
+                choose_ego(recording, self.ego_id, frame), self.begin_s, self.duration_s, self.max_gap_s
+            )
         except ValueError as error:
             raise ValueError(f"{self.path}: {error}") from error
 
@@ -171,11 +186,11 @@ class RecordedTraffic(Traffic):
         """(T,) the instants."""
         return self.time_step_s * np.arange(self.num_time_steps, dtype=np.float64)
 
-    def _actors(self, drive: Trajectory, bodies: Bodies) -> Iterator[Actor]:
+    def _actors(self, drive: Trajectory, bodies: BodyLibrary) -> Iterator[Actor]:
         """Everybody who is there during the run and ever comes within the range of sensors."""
-        for track in self._run.others:
-            category, mesh = bodies.of(track)
-            for number, piece in enumerate(pieces(track.trajectory, self.max_gap_s), 1):
+        for track in self._run.other_tracks:
+            category, mesh = bodies.get_category_and_mesh(track)
+            for number, piece in enumerate(split_at_gaps(track.trajectory, self.max_gap_s), 1):
                 shown = self._shown(piece)
                 there = not shown.is_transient or (
                     shown.times_s[0] <= self._run.duration_s and shown.times_s[-1] >= 0.0

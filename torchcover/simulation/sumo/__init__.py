@@ -1,5 +1,5 @@
 """Traffic and road networks of SUMO."""
 
-from torchcover.simulation.sumo.traffic import Sumo
+from torchcover.simulation.sumo.traffic import SumoTraffic
 
-__all__ = ["Sumo"]
+__all__ = ["SumoTraffic"]

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 
 from torchcover.files import guard_reader
-from torchcover.simulation.sumo.floating import Recorded, SumoTrack
+from torchcover.simulation.sumo.floating import FloatingCarData, SumoTrack
 from torchcover.simulation.sumo.motion import RoadUser
-from torchcover.simulation.sumo.network import feed_xml, pair_attributes, read_pieces
+from torchcover.simulation.sumo.network import pair_attributes, parse_xml_stream, read_chunks
 from torchcover.simulation.traffic.assemble import HORIZON_M
 from torchcover.simulation.traffic.fleet import CATEGORIES, EGO, Fleet, VehicleType
 
@@ -27,21 +27,21 @@ WORDS = (
 )  # fmt: skip
 
 
-def type_of(name: str, known: Mapping[str, VehicleType]) -> VehicleType:
+def get_vehicle_type(name: str, known_types: Mapping[str, VehicleType]) -> VehicleType:
     """A type by its name: one that is known, else what its name says.
 
     Example:
-        >>> type_of("DEFAULT_BIKETYPE", {}).vehicle_class
+        >>> get_vehicle_type("DEFAULT_BIKETYPE", {}).vehicle_class
         'bicycle'
     """
-    if name in known:
-        return known[name]
+    if name in known_types:
+        return known_types[name]
     vehicle_class = next((found for word, found in WORDS if word in name.lower()), "passenger")
     return VehicleType(vehicle_class, USUAL_LENGTH_M.get(vehicle_class, CAR_LENGTH_M))
 
 
 @guard_reader("routes of SUMO")
-def read_types(path: Path) -> dict[str, VehicleType]:
+def read_vehicle_types(path: Path) -> dict[str, VehicleType]:
     """The types that a file of routes declares."""
     found: dict[str, VehicleType] = {}
 
@@ -54,15 +54,15 @@ def read_types(path: Path) -> dict[str, VehicleType]:
                 raise ValueError(f"type {attributes['id']!r}: a positive length is needed; got {length_m:g}")
             found[attributes["id"]] = VehicleType(vehicle_class, length_m)
 
-    feed_xml(read_pieces(path), start)
+    parse_xml_stream(read_chunks(path), start)
     return found
 
 
-def crowd(
-    recorded: Recorded,
-    known: Mapping[str, VehicleType],
+def select_road_users(
+    floating_car_data: FloatingCarData,
+    known_types: Mapping[str, VehicleType],
     fleet: Fleet,
-    ego_name: str | None,
+    ego_id: str | None,
     ego_type: str | None,
     duration_s: float,
     generator: np.random.Generator,
@@ -74,24 +74,24 @@ def crowd(
 
     ValueError: nobody who may be the ego is there for the whole run.
     """
-    lengths_m = {kind: fleet.length_m(kind) for kind in CATEGORIES}
+    lengths_m = {kind: fleet.get_length_m(kind) for kind in CATEGORIES}
     users: list[RoadUser] = []
-    for track in recorded.tracks:
-        found = type_of(track.kind, known)
-        kind = found.body(lengths_m)
-        if track.on_foot:  # all have one length; those that were drawn are called as their bodies are
-            named = "child" if "child" in track.kind.lower() else "adult"
-            kind = track.kind if CATEGORIES.get(track.kind) == "pedestrian" else named
+    for track in floating_car_data.tracks:
+        found = get_vehicle_type(track.type_name, known_types)
+        kind = found.find_body(lengths_m)
+        if track.is_pedestrian:  # all have one length; those that were drawn are called as their bodies are
+            named = "child" if "child" in track.type_name.lower() else "adult"
+            kind = track.type_name if CATEGORIES.get(track.type_name) == "pedestrian" else named
         if kind is not None:
-            users.append(RoadUser(track, kind, found.length_m, fleet.sizes_m(kind)))
-    ego = _ego(users, recorded, ego_name, ego_type, duration_s, generator)
+            users.append(RoadUser(track, kind, found.length_m, fleet.get_sizes_m(kind)))
+    ego = _ego(users, floating_car_data, ego_id, ego_type, duration_s, generator)
     others = [other for other in users if other is not ego and _comes_near(other.track, ego.track)]
-    return ego._replace(kind=EGO, sizes_m=fleet.sizes_m(EGO)), others
+    return ego._replace(kind=EGO, part_sizes_m=fleet.get_sizes_m(EGO)), others
 
 
 def _ego(
     users: Sequence[RoadUser],
-    recorded: Recorded,
+    recorded: FloatingCarData,
     name: str | None,
     kind: str | None,
     duration_s: float,
@@ -101,36 +101,36 @@ def _ego(
     begin_s, end_s = recorded.begin_s, recorded.begin_s + duration_s
     when = f"from t = {begin_s:g} to {end_s:g} s"
     if name is not None:
-        own = [user for user in users if user.track.name == name and not user.track.on_foot]
-        there = [user for user in own if user.track.covers(duration_s)]
+        own = [user for user in users if user.track.name == name and not user.track.is_pedestrian]
+        there = [user for user in own if user.track.is_present_for(duration_s)]
         if there:
             return there[0]
         if not own:
-            raise ValueError(f"ego_id: no vehicle {name!r} up to t = {recorded.last_s:g} s, where the data end")
+            raise ValueError(f"ego_id: no vehicle {name!r} up to t = {recorded.last_time_s:g} s, where the data end")
         gone_s = begin_s + float(own[0].track.times_s[-1])
         raise ValueError(
             f"ego_id: {name!r} is not there all the time {when}: it leaves the network, teleports or has a gap after "
             f"t = {gone_s:g} s; shorten duration_s to {max(gone_s - begin_s, 0.0):g}, or take another ego"
         )
     drivers = [
-        user for user in users if (user.track.kind == kind if kind is not None else CATEGORIES[user.kind] == "car")
+        user for user in users if (user.track.type_name == kind if kind is not None else CATEGORIES[user.kind] == "car")
     ]
-    there = [user for user in drivers if user.track.covers(duration_s) and not user.track.on_foot]
+    there = [user for user in drivers if user.track.is_present_for(duration_s) and not user.track.is_pedestrian]
     if not there:
         longest = max((float(np.ptp(user.track.times_s)) for user in drivers), default=0.0)
         who = f"vehicle of type {kind!r}" if kind is not None else "car"
         raise ValueError(
             f"no {who} that could be the ego is there all the time {when}: of {len(drivers)}, the longest drives "
-            f"for {longest:g} s (data end at t = {recorded.last_s:g} s); change duration_s or begin_s"
+            f"for {longest:g} s (data end at t = {recorded.last_time_s:g} s); change duration_s or begin_s"
         )
-    ways_m = [np.linalg.norm(np.diff(user.track.places_m[:, :2], axis=0), axis=1).sum() for user in there]
+    ways_m = [np.linalg.norm(np.diff(user.track.front_positions_m[:, :2], axis=0), axis=1).sum() for user in there]
     shares = np.array(ways_m) + 1e-3
     return there[int(generator.choice(len(there), p=shares / shares.sum()))]
 
 
 def _comes_near(other: SumoTrack, ego: SumoTrack) -> bool:
     """Whether the two are ever within the range of sensors, at the times of the other."""
-    ego_m = ego.places_m[:, :2]
+    ego_m = ego.front_positions_m[:, :2]
     if other.times_s is not ego.times_s:
         ego_m = np.stack([np.interp(other.times_s, ego.times_s, axis, np.nan, np.nan) for axis in ego_m.T], axis=1)
-    return bool((np.linalg.norm(other.places_m[:, :2] - ego_m, axis=1) < HORIZON_M).any())
+    return bool((np.linalg.norm(other.front_positions_m[:, :2] - ego_m, axis=1) < HORIZON_M).any())

@@ -10,7 +10,7 @@ import numpy as np
 
 from torchcover.files import guard_reader
 from torchcover.geometry.arrays import Float64
-from torchcover.simulation.sumo.network import feed_xml, read_pieces
+from torchcover.simulation.sumo.network import parse_xml_stream, read_chunks
 
 ATTRIBUTES = "id,x,y,z,angle,slope,type"
 # Who is not heard of for longer than this many usual steps, or moves faster than this from one to the next, is gone in
@@ -27,31 +27,31 @@ MIN_DRIVEN_M = 2.0
 
 
 class SumoTrack(NamedTuple):
-    """One vehicle or person, for as long as it was there without a gap; `kind` is the name of its type.
+    """One vehicle or person, for as long as it was there without a gap; `type_name` is the name of its type.
 
     At (K,) times from the first of the run: (K, 3) the middle of its front, float64, for they may be of UTM size; its
     heading, counter-clockwise from x, where SUMO's own angles are clockwise from north; and its slope upwards.
     """
 
     name: str
-    kind: str
-    on_foot: bool
+    type_name: str
+    is_pedestrian: bool
     times_s: Float64
-    places_m: Float64
+    front_positions_m: Float64
     yaw_deg: Float64
     slope_deg: Float64
 
-    def covers(self, duration_s: float) -> bool:
+    def is_present_for(self, duration_s: float) -> bool:
         """Whether it is there from the first time to so much later."""
         return bool(self.times_s[0] <= TIME_SLACK_S and self.times_s[-1] >= duration_s - TIME_SLACK_S)
 
 
 class TimeWindow(NamedTuple):
-    """What of the data is meant: from `begin_s` of the simulation, or from when `from_name` is heard of, if later."""
+    """What of the data is meant: from `begin_s` of the simulation, or from when `start_vehicle_id` is heard of, if later."""
 
     begin_s: float
     duration_s: float
-    from_name: str | None = None
+    start_vehicle_id: str | None = None
 
 
 class _Enough(Exception):  # noqa: N818  (no error: the window is over)
@@ -75,7 +75,7 @@ class _Collector:
         self.counts: list[int] = []
 
     def start(self, name: str, attributes: list[str]) -> None:
-        """A tag; see `feed_xml`."""
+        """A tag; see `parse_xml_stream`."""
         if name in self._now:
             self._now[name].append(attributes)
         elif name == "timestep":
@@ -92,8 +92,8 @@ class _Collector:
         now = {name: rows for name, rows in self._now.items() if rows}
         self._now = {"vehicle": [], "person": []}
         if np.isnan(self.begin_s):
-            waits = self._window.from_name is not None and not any(
-                ("id", self._window.from_name) in zip(row[::2], row[1::2], strict=True)
+            waits = self._window.start_vehicle_id is not None and not any(
+                ("id", self._window.start_vehicle_id) in zip(row[::2], row[1::2], strict=True)
                 for row in now.get("vehicle", ())
             )
             if waits or self.last_s < self._window.begin_s - TIME_SLACK_S or not np.isfinite(self.last_s):
@@ -141,34 +141,34 @@ class _Collector:
         return dict(zip(names, list(zip(*rows, strict=True))[1::2], strict=True))
 
 
-class Recorded(NamedTuple):
-    """What there is in a window that begins at `begin_s` of the simulation; `last_s` is the last time read, or -inf.
+class FloatingCarData(NamedTuple):
+    """What there is in a window that begins at `begin_s` of the simulation; `last_time_s` is the last time read, or -inf.
 
     The tracks are in the order of their first appearance; somebody who was gone in between has several.
     """
 
     tracks: tuple[SumoTrack, ...]
     begin_s: float
-    last_s: float
+    last_time_s: float
 
 
-def record(pieces: Iterable[bytes], window: TimeWindow) -> Recorded:
+def parse_floating_car_data(chunks: Iterable[bytes], window: TimeWindow) -> FloatingCarData:
     """Read floating car data from pieces of XML, no more of which are asked for than the window needs.
 
     ValueError: not such data, or without angles.
     """
     collector = _Collector(window)
     with suppress(_Enough):
-        feed_xml(pieces, collector.start)
+        parse_xml_stream(chunks, collector.start)
         collector.end_step()
-    return Recorded(tuple(_tracks(collector)), collector.begin_s, collector.last_s)
+    return FloatingCarData(tuple(_tracks(collector)), collector.begin_s, collector.last_s)
 
 
 @guard_reader("floating car data of SUMO")
-def read_floating(path: Path, window: TimeWindow) -> Recorded:
+def read_floating_car_data(path: Path, window: TimeWindow) -> FloatingCarData:
     """Read it from a file; see `record`."""
-    recorded = record(read_pieces(path), window)
-    if not np.isfinite(recorded.last_s):
+    recorded = parse_floating_car_data(read_chunks(path), window)
+    if not np.isfinite(recorded.last_time_s):
         raise ValueError("floating car data of SUMO with at least one <timestep> is needed")
     return recorded
 
@@ -226,10 +226,10 @@ def _tracks(collector: _Collector) -> Iterator[SumoTrack]:
             x_m, y_m, angle_deg, z_m, slope_deg = rows[own[first:end]].T
             yield SumoTrack(
                 name=name,
-                kind=collector.kinds[number],
-                on_foot=on_foot,
+                type_name=collector.kinds[number],
+                is_pedestrian=on_foot,
                 times_s=own_s if end - first == len(own) else own_s[first:end],
-                places_m=np.stack([x_m, y_m, z_m], axis=1),
+                front_positions_m=np.stack([x_m, y_m, z_m], axis=1),
                 yaw_deg=90.0 - angle_deg,
                 slope_deg=slope_deg,
             )

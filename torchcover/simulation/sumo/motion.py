@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from torchcover.geometry.arrays import Bools, Float64, Int64
 from torchcover.simulation.sumo.floating import TIME_SLACK_S, SumoTrack
-from torchcover.simulation.traffic.fleet import DRAWS, rears_of, together, tractrix
+from torchcover.simulation.traffic.fleet import DRAWS, compute_tractrix_yaw_rad, compute_trailer_poses, stack_paths
 
 # Bodies have a pose this often, and places are means over so much time before and after.
 FINE_S, SMOOTH_S = 0.1, 1.0
@@ -34,80 +34,84 @@ BODIES_AT_ONCE = 256
 class RoadUser(NamedTuple):
     """Somebody, where their front is, the length that the simulation takes them for, and the body that stands for them.
 
-    `sizes_m` are lengths and widths of the body, and of what it draws along.
+    `part_sizes_m` are lengths and widths of the body, and of what it draws along.
     """
 
     track: SumoTrack
     kind: str
     length_m: float
-    sizes_m: tuple[tuple[float, float], ...]
+    part_sizes_m: tuple[tuple[float, float], ...]
 
     @property
-    def ahead_m(self) -> float:
+    def lead_offset_m(self) -> float:
         """How far the point that leads is before the middle."""
-        return 0.0 if self.track.on_foot else AXLE_SHARE * self.sizes_m[0][0]
+        return 0.0 if self.track.is_pedestrian else AXLE_SHARE * self.part_sizes_m[0][0]
 
     @property
-    def lag_m(self) -> float:
+    def trailer_axle_distance_m(self) -> float:
         """How far the axles of what it draws along are behind the point that leads, on a straight."""
-        return self.ahead_m - DRAWS[self.kind].hitch_m + DRAWS[self.kind].rod_m if self.kind in DRAWS else 0.0
+        return (
+            self.lead_offset_m - DRAWS[self.kind].hitch_offset_m + DRAWS[self.kind].hitch_to_axle_m
+            if self.kind in DRAWS
+            else 0.0
+        )
 
     @property
-    def drawn_m(self) -> float:
+    def trailing_distance_m(self) -> float:
         """How far the point that is drawn along is behind the one that leads."""
-        return HEELS_M if self.track.on_foot else 2 * self.ahead_m
+        return HEELS_M if self.track.is_pedestrian else 2 * self.lead_offset_m
 
 
 class Motion(NamedTuple):
     """Where a body is, at (K,) evenly spaced times; those who are there all the time share them.
 
     `poses` are (K, 3) x and y of its middle, of its front if it is in two parts, and its heading in radians, without
-    leaps; `rear` is likewise what it draws along; `over_kerb_m` how far its outline reaches over a kerb at the worst.
+    leaps; `trailer_poses` is likewise what it draws along; `curb_overlap_m` how far its outline reaches over a kerb at the worst.
     """
 
-    user: RoadUser
+    road_user: RoadUser
     times_s: Float64
     poses: Float64
-    over_kerb_m: float = 0.0
-    rear: Float64 | None = None
+    curb_overlap_m: float = 0.0
+    trailer_poses: Float64 | None = None
 
     @property
     def parts(self) -> list[tuple[Float64, tuple[float, float]]]:
         """Poses of its parts, one or two, and their lengths and widths."""
-        poses = [self.poses] if self.rear is None else [self.poses, self.rear]
-        return list(zip(poses, self.user.sizes_m, strict=True))
+        poses = [self.poses] if self.trailer_poses is None else [self.poses, self.trailer_poses]
+        return list(zip(poses, self.road_user.part_sizes_m, strict=True))
 
     @property
-    def can_be(self) -> bool:
+    def is_plausible(self) -> bool:
         """Whether it walks as people do, or stays off the kerbs."""
-        if self.user.track.on_foot:
+        if self.road_user.track.is_pedestrian:
             return bool((_lengths(np.diff(self.poses, axis=0)) < FASTEST_ON_FOOT_MPS * np.diff(self.times_s)).all())
-        return self.over_kerb_m < RUBS_M
+        return self.curb_overlap_m < RUBS_M
 
 
-def motions(
-    users: Sequence[RoadUser],
+def compute_motions(
+    road_users: Sequence[RoadUser],
     duration_s: float,
     origin_m: Float64,
     obstacles: NDArray[np.object_] | None = None,
-    walked: shapely.Geometry | None = None,
+    walkable_area: shapely.Geometry | None = None,
 ) -> list[Motion]:
     """Move bodies along their tracks, without those who are there for no time; `origin_m` is subtracted of all places.
 
     Vehicles swing out for `obstacles`, polygons in plan of pavements and what is parked, where they can. Who is beside
     what people walk on goes along its edge instead, where there is time to.
     """
-    shapely.prepare(walked)
+    shapely.prepare(walkable_area)
     times_s = np.linspace(0.0, duration_s, int(np.ceil(duration_s / FINE_S - TIME_SLACK_S)) + 1)
     there: list[tuple[RoadUser, Float64]] = []
-    for user in users:
+    for user in road_users:
         first, end = np.searchsorted(times_s, user.track.times_s[[0, -1]] + [-TIME_SLACK_S, TIME_SLACK_S]).tolist()
         if end - first > 1:
             there.append((user, times_s if end - first == len(times_s) else times_s[first:end]))
     found: list[Motion] = []
     for start in range(0, len(there), BODIES_AT_ONCE):
         some, own_s = zip(*there[start : start + BODIES_AT_ONCE], strict=True)
-        ways_m = [_lead_m(user, at_s, origin_m, walked) for user, at_s in zip(some, own_s, strict=True)]
+        ways_m = [_lead_m(user, at_s, origin_m, walkable_area) for user, at_s in zip(some, own_s, strict=True)]
         poses = _poses(some, ways_m)
         over_m = np.zeros(len(some)) if obstacles is None else _keep_off(some, ways_m, poses, obstacles)
         rears = _rears(some, poses)
@@ -118,23 +122,23 @@ def motions(
 def _lead_m(user: RoadUser, times_s: Float64, origin_m: Float64, walked: shapely.Geometry | None) -> Float64:
     """(K, 2) where the point goes that leads, at (K,) times."""
     track = user.track
-    told_m = (_without_jumps(track) if track.on_foot else track.places_m[:, :2]) - origin_m
+    told_m = (_without_jumps(track) if track.is_pedestrian else track.front_positions_m[:, :2]) - origin_m
     even_m = np.stack([np.interp(times_s, track.times_s, axis) for axis in told_m.T], axis=1)
-    if track.on_foot and walked is not None and not walked.is_empty:
+    if track.is_pedestrian and walked is not None and not walked.is_empty:
         even_m = _along_edges(even_m, times_s[1] - times_s[0], walked)
     half_s = max(SMOOTH_S, float(np.median(np.diff(track.times_s))))
-    smooth_m = rounded(even_m, int(np.ceil(half_s / (times_s[1] - times_s[0]))))
-    before_middle_m = user.ahead_m + (DRAWS[user.kind].ahead_m if user.kind in DRAWS else 0.0)
-    behind_m = 0.0 if track.on_foot else max(user.length_m / 2 - before_middle_m, 0.0)
+    smooth_m = smooth_positions(even_m, int(np.ceil(half_s / (times_s[1] - times_s[0]))))
+    before_middle_m = user.lead_offset_m + (DRAWS[user.kind].center_offset_m if user.kind in DRAWS else 0.0)
+    behind_m = 0.0 if track.is_pedestrian else max(user.length_m / 2 - before_middle_m, 0.0)
     return _behind(smooth_m, behind_m, np.deg2rad(track.yaw_deg[0]))
 
 
 def _poses(users: Sequence[RoadUser], ways_m: Sequence[Float64]) -> list[Float64]:
     """(K, 3) of each, along the (K, 2) way of its point that leads."""
-    lead_m = together(ways_m)
+    lead_m = stack_paths(ways_m)
     start = np.deg2rad([user.track.yaw_deg[0] for user in users])
-    yaw = tractrix(lead_m, np.array([user.drawn_m for user in users]), start)
-    ahead_m = np.array([user.ahead_m for user in users])[:, None] * np.stack([np.cos(yaw), np.sin(yaw)], axis=2)
+    yaw = compute_tractrix_yaw_rad(lead_m, np.array([user.trailing_distance_m for user in users]), start)
+    ahead_m = np.array([user.lead_offset_m for user in users])[:, None] * np.stack([np.cos(yaw), np.sin(yaw)], axis=2)
     poses = np.concatenate([lead_m - ahead_m, yaw[..., None]], axis=2)
     return [poses[: len(way_m), number].copy() for number, way_m in enumerate(ways_m)]
 
@@ -142,7 +146,7 @@ def _poses(users: Sequence[RoadUser], ways_m: Sequence[Float64]) -> list[Float64
 def _rears(users: Sequence[RoadUser], poses: Sequence[Float64]) -> dict[int, Float64]:
     """(K, 3) poses of what some draw along, by their numbers, along those of fronts."""
     fronts = [number for number, user in enumerate(users) if user.kind in DRAWS]
-    rears = rears_of([users[number].kind for number in fronts], [poses[number] for number in fronts])
+    rears = compute_trailer_poses([users[number].kind for number in fronts], [poses[number] for number in fronts])
     return dict(zip(fronts, rears, strict=True))
 
 
@@ -156,7 +160,7 @@ def _keep_off(
     # When bodies are looked at, and what they draw along.
     look: dict[tuple[int, bool], Int64] = {}
     for number, (user, way_m) in enumerate(zip(users, ways_m, strict=True)):
-        if not user.track.on_foot:
+        if not user.track.is_pedestrian:
             steps = np.diff((_along_m(way_m) / LOOK_M).astype(np.int64), prepend=-1)
             look[number, False] = np.flatnonzero(steps)
             if number in rears:
@@ -167,7 +171,7 @@ def _keep_off(
         rear = np.repeat(np.array([is_rear for _, is_rear in look], dtype=bool), counts)
         when = np.concatenate([np.empty(0, dtype=np.int64), *look.values()])
         size_m = np.repeat(
-            np.array([users[number].sizes_m[is_rear] for number, is_rear in look]).reshape(-1, 2), counts, axis=0
+            np.array([users[number].part_sizes_m[is_rear] for number, is_rear in look]).reshape(-1, 2), counts, axis=0
         )
         looked_at = [(rears if is_rear else poses)[number][at] for (number, is_rear), at in look.items()]
         sides_m = _push_m(obstacles, np.concatenate([np.empty((0, 3)), *looked_at]), size_m)
@@ -194,26 +198,29 @@ def _keep_off(
     return over_m
 
 
-def possible(bodies: Sequence[Motion]) -> list[Motion]:
+def drop_colliding_users(motions: Sequence[Motion]) -> list[Motion]:
     """Those that can be, and are never where another one is: of two that meet the one stays that meets fewer.
 
     The first is there all the time, and stays.
     """
-    bodies = [bodies[0], *(body for body in bodies[1:] if body.can_be)]
-    meets = np.zeros((len(bodies), len(bodies)), dtype=bool)
-    step_s = float(bodies[0].times_s[1])
+    motions = [motions[0], *(body for body in motions[1:] if body.is_plausible)]
+    meets = np.zeros((len(motions), len(motions)), dtype=bool)
+    step_s = float(motions[0].times_s[1])
     # With the height at which it is told to be: who is on a bridge meets nobody below.
-    heights_m = [np.interp(body.times_s, body.user.track.times_s, body.user.track.places_m[:, 2]) for body in bodies]
+    heights_m = [
+        np.interp(body.times_s, body.road_user.track.times_s, body.road_user.track.front_positions_m[:, 2])
+        for body in motions
+    ]
     parts = [
         (number, np.column_stack([poses, heights_m[number]]), size_m)
-        for number, body in enumerate(bodies)
+        for number, body in enumerate(motions)
         for poses, size_m in body.parts
     ]
     of = np.array([number for number, _, _ in parts])
-    first = [round(float(bodies[number].times_s[0]) / step_s) for number in of.tolist()]
+    first = [round(float(motions[number].times_s[0]) / step_s) for number in of.tolist()]
     size_m = np.array([size_m for _, _, size_m in parts]) + APART_M
     reach_m = np.linalg.norm(size_m, axis=1)[:, None] / 2
-    for begin in range(0, len(bodies[0].times_s), PIECE_STEPS):
+    for begin in range(0, len(motions[0].times_s), PIECE_STEPS):
         poses = np.full((PIECE_STEPS, len(parts), 4), np.nan)
         for number, (_, own, _) in enumerate(parts):
             start = begin - first[number]
@@ -232,11 +239,11 @@ def possible(bodies: Sequence[Motion]) -> list[Motion]:
         meets[one, other] = meets[other, one] = True
     number_met = meets.sum(axis=1)
     number_met[0] = -1
-    stays = np.ones(len(bodies), dtype=bool)
+    stays = np.ones(len(motions), dtype=bool)
     for number in np.argsort(number_met, kind="stable").tolist():
         if stays[number]:
             stays[meets[number]] = False
-    return [body for body, kept in zip(bodies, stays.tolist(), strict=True) if kept]
+    return [body for body, kept in zip(motions, stays.tolist(), strict=True) if kept]
 
 
 def _overlap(one: Float64, size_m: Float64, other: Float64, other_size_m: Float64) -> Bools:
@@ -254,7 +261,7 @@ def _overlap(one: Float64, size_m: Float64, other: Float64, other_size_m: Float6
 
 def _push_m(obstacles: NDArray[np.object_], poses: Float64, size_m: Float64) -> Float64:
     """(2, K) how far K rectangles have to go to their right, negative, and to their left to be off obstacles."""
-    outlines = shapely.polygons(corners_m(poses, size_m))
+    outlines = shapely.polygons(compute_rectangle_corners_m(poses, size_m))
     part, body = shapely.STRtree(outlines).query(obstacles, predicate="intersects")
     common = shapely.intersection(outlines[body], obstacles[part])
     places_m, of_pair = shapely.get_coordinates(common, return_index=True)
@@ -272,12 +279,12 @@ def _push_m(obstacles: NDArray[np.object_], poses: Float64, size_m: Float64) -> 
     return pushed
 
 
-def corners_m(poses: Float64, size_m: Float64) -> Float64:
+def compute_rectangle_corners_m(poses: Float64, sizes_m: Float64) -> Float64:
     """(K, 4, 2) corners of K rectangles with poses x, y and a heading in radians, and a length and width."""
     forward = np.stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])], axis=1)
     left = np.stack([-forward[:, 1], forward[:, 0]], axis=1)
     half = np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]]) / 2
-    along_m, aside_m = (half[:, k] * size_m[:, k, None] for k in (0, 1))
+    along_m, aside_m = (half[:, k] * sizes_m[:, k, None] for k in (0, 1))
     return np.asarray(poses[:, None, :2] + along_m[..., None] * forward[:, None] + aside_m[..., None] * left[:, None])
 
 
@@ -291,10 +298,10 @@ def _along_m(way_m: Float64) -> Float64:
     return np.concatenate([[0.0], _lengths(np.diff(way_m, axis=0)).cumsum()])
 
 
-def rounded(places_m: Float64, half: int) -> Float64:
+def smooth_positions(positions_m: Float64, half_window: int) -> Float64:
     """(K, 2) means over so many places before and after; beyond the ends it goes on as it came."""
-    weights = np.hanning(2 * half + 3)[1:-1] / np.hanning(2 * half + 3).sum()
-    padded_m = np.pad(places_m, ((half, half), (0, 0)), "reflect", reflect_type="odd")
+    weights = np.hanning(2 * half_window + 3)[1:-1] / np.hanning(2 * half_window + 3).sum()
+    padded_m = np.pad(positions_m, ((half_window, half_window), (0, 0)), "reflect", reflect_type="odd")
     return np.stack([np.convolve(axis, weights, "valid") for axis in padded_m.T], axis=1)
 
 
@@ -305,13 +312,13 @@ def _behind(way_m: Float64, behind_m: float, yaw: float) -> Float64:
     way_m = np.concatenate([way_m[:1] - behind_m * np.array([np.cos(yaw), np.sin(yaw)]), way_m])
     at_m = np.linspace(-behind_m, along_m[-1], 2 + int((along_m[-1] + behind_m) / ALONG_M))
     even_m = np.stack([np.interp(at_m, told_m, axis) for axis in way_m.T], axis=1)
-    round_m = rounded(even_m, round(CORNER_M / ALONG_M))
+    round_m = smooth_positions(even_m, round(CORNER_M / ALONG_M))
     return np.stack([np.interp(along_m - behind_m, at_m, axis) for axis in round_m.T], axis=1)
 
 
 def _without_jumps(track: SumoTrack) -> Float64:
     """(K, 2) places of somebody on foot; what was jumped is walked before and after, a little faster."""
-    times_s, places_m = track.times_s, track.places_m[:, :2]
+    times_s, places_m = track.times_s, track.front_positions_m[:, :2]
     steps_m = np.diff(places_m, axis=0)
     lengths_m = _lengths(steps_m)
     walked_m = places_m.copy()

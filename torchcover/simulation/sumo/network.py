@@ -25,28 +25,30 @@ SAME_PLACE_M = 1e-3
 # What is kept of a file takes about so many times its bytes.
 KEPT_PER_BYTE = 5
 
-Use = Literal["road", "turn", "bay", "shoulder", "sidewalk", "crossing", "corner"]
+LaneUse = Literal["road", "turn", "bay", "shoulder", "sidewalk", "crossing", "corner"]
 
 
 class NetworkLane(NamedTuple):
-    """A lane of a street in one direction, the `edge`: classes of vehicles may use it, or are barred, or "all".
+    """A lane of a street in one direction, the `edge_id`: classes of vehicles may use it, or are barred, or "all".
 
     "road" and "turn" (on a junction) are for vehicles, a "bay" for those who park, a "shoulder" for nobody; a
     "sidewalk", a "crossing" and a "corner", which joins these two, are for those on foot. `line_m` (K, 3) is its
     middle, in the direction of travel, K >= 2; of a corner its outline instead, K >= 3.
     """
 
-    edge: str
-    use: Use
+    edge_id: str
+    use: LaneUse
     width_m: float
     line_m: Float64
     speed_mps: float
-    classes: frozenset[str]
-    barred: frozenset[str]
+    allowed_classes: frozenset[str]
+    disallowed_classes: frozenset[str]
 
-    def allows(self, vehicle_class: str) -> bool:
+    def is_allowed(self, vehicle_class: str) -> bool:
         """Whether vehicles of a class may use it."""
-        return not {"all", vehicle_class} & self.barred and bool({"all", vehicle_class} & self.classes)
+        return not {"all", vehicle_class} & self.disallowed_classes and bool(
+            {"all", vehicle_class} & self.allowed_classes
+        )
 
 
 class Network(NamedTuple):
@@ -59,13 +61,13 @@ class Network(NamedTuple):
     junctions: tuple[Float64, ...]
     connections: tuple[tuple[int, int], ...]
 
-    def follow(self, vehicle_class: str) -> dict[str, tuple[str, ...]]:
+    def find_successors(self, vehicle_class: str) -> dict[str, tuple[str, ...]]:
         """Of each edge that vehicles of a class may use, the names of those on which they may go on from there."""
-        roads = [lane.use == "road" and lane.allows(vehicle_class) for lane in self.lanes]
-        found: dict[str, set[str]] = {lane.edge: set() for lane, may in zip(self.lanes, roads, strict=True) if may}
+        roads = [lane.use == "road" and lane.is_allowed(vehicle_class) for lane in self.lanes]
+        found: dict[str, set[str]] = {lane.edge_id: set() for lane, may in zip(self.lanes, roads, strict=True) if may}
         for source, target in self.connections:
             if roads[source] and roads[target]:
-                found[self.lanes[source].edge].add(self.lanes[target].edge)
+                found[self.lanes[source].edge_id].add(self.lanes[target].edge_id)
         return {edge: tuple(sorted(found[edge])) for edge in sorted(found)}
 
 
@@ -84,7 +86,7 @@ def _read_again(path: Path, _version: tuple[int, int] | None) -> Network:
 def _read(path: Path) -> Network:
     check_memory(KEPT_PER_BYTE * path.stat().st_size)
     collector = _Collector()
-    feed_xml(read_pieces(path), collector.start)
+    parse_xml_stream(read_chunks(path), collector.start)
     lanes = tuple(collector.lanes.values())
     if not any(lane.use == "road" for lane in lanes):
         raise ValueError(f"a network with a street for vehicles is needed; it has {len(lanes)} lanes, none of which is")
@@ -98,22 +100,22 @@ def _read(path: Path) -> Network:
 
 
 # A lane by the name of its edge and its number there.
-LaneName = tuple[str, str]
-Attributes = dict[str, str]
+LaneId = tuple[str, str]
+XmlAttributes = dict[str, str]
 
 
 class _Collector:
     """Keeps what is needed of a network, as start tags come in: its file may be larger than a tree of it could be."""
 
     def __init__(self) -> None:
-        self.lanes: dict[LaneName, NetworkLane] = {}
+        self.lanes: dict[LaneId, NetworkLane] = {}
         self.junctions: list[Float64] = []
-        self.connections: list[tuple[LaneName, LaneName]] = []
-        self._edge: Attributes = {}
+        self.connections: list[tuple[LaneId, LaneId]] = []
+        self._edge: XmlAttributes = {}
         self._began = False
 
     def start(self, name: str, attributes: list[str]) -> None:
-        """A tag; see `feed_xml`."""
+        """A tag; see `parse_xml_stream`."""
         if not self._began:
             if name != "net":
                 raise ValueError(f"a network of SUMO begins with <net>; got <{name}>")
@@ -121,12 +123,12 @@ class _Collector:
         elif name in ("edge", "lane", "junction", "connection"):
             self._keep(name, pair_attributes(attributes))
 
-    def _keep(self, name: str, item: Attributes) -> None:
+    def _keep(self, name: str, item: XmlAttributes) -> None:
         if name == "edge":
             self._edge = item
         elif name == "lane":
             if lane := _lane(self._edge, item):
-                self.lanes[lane.edge, item.get("index", "")] = lane
+                self.lanes[lane.edge_id, item.get("index", "")] = lane
         elif name == "connection":
             source, source_lane, target, target_lane = (item.get(k, "") for k in ("from", "fromLane", "to", "toLane"))
             self.connections.append(((source, source_lane), (target, target_lane)))
@@ -136,12 +138,12 @@ class _Collector:
                 self.junctions.append(outline_m)
 
 
-def pair_attributes(attributes: list[str]) -> Attributes:
-    """Return the names and values of `feed_xml`, which follow each other in turn, as a dict."""
+def pair_attributes(attributes: list[str]) -> XmlAttributes:
+    """Return the names and values of `parse_xml_stream`, which follow each other in turn, as a dict."""
     return dict(zip(attributes[::2], attributes[1::2], strict=True))
 
 
-def _lane(edge: Attributes, item: Attributes) -> NetworkLane | None:
+def _lane(edge: XmlAttributes, item: XmlAttributes) -> NetworkLane | None:
     name = item.get("id", "")
     width_m, speed_mps = _number(item, "width", LANE_WIDTH_M), _number(item, "speed", 0.0)
     if not 0.0 < width_m <= MAX_WIDTH_M:
@@ -160,7 +162,7 @@ def _lane(edge: Attributes, item: Attributes) -> NetworkLane | None:
     return NetworkLane(edge.get("id", ""), use, width_m, line_m, speed_mps, classes, barred)
 
 
-def _use(function: str, kind: str, classes: frozenset[str], barred: frozenset[str]) -> Use | None:
+def _use(function: str, kind: str, classes: frozenset[str], barred: frozenset[str]) -> LaneUse | None:
     if function == "walkingarea":
         return "corner"
     if function == "crossing":
@@ -186,7 +188,7 @@ def _places(shape: str) -> Float64:
     return np.array([row if len(row) == 3 else [*row, 0.0] for row in rows], dtype=np.float64).reshape(-1, 3)
 
 
-def _number(item: Attributes, key: str, otherwise: float) -> float:
+def _number(item: XmlAttributes, key: str, otherwise: float) -> float:
     text = item.get(key)
     try:
         return otherwise if text is None else float(text)
@@ -215,19 +217,21 @@ OFF_STREET_M = 10.0
 class Vicinity:
     """A piece of a network, near the ego's (T, 2) way, of whose places `origin_m` (2,) was subtracted in float64.
 
-    `samples_m` are (N, 3) places along all lanes, and `of_lane` (N,) the numbers of their lanes.
+    `lane_points_m` are (N, 3) places along all lanes, and `lane_indices` (N,) the numbers of their lanes.
     """
 
-    def __init__(self, network: Network, way_m: Float64, origin_m: Float64) -> None:
-        self.way = shapely.LineString(way_m if len(way_m) > 1 else np.repeat(way_m, 2, axis=0)).simplify(WAY_WITHIN_M)
-        shapely.prepare(self.way)
-        self.lower_m, self.upper_m = way_m.min(axis=0) - HORIZON_M, way_m.max(axis=0) + HORIZON_M
+    def __init__(self, network: Network, ego_path_m: Float64, origin_m: Float64) -> None:
+        self.ego_path = shapely.LineString(
+            ego_path_m if len(ego_path_m) > 1 else np.repeat(ego_path_m, 2, axis=0)
+        ).simplify(WAY_WITHIN_M)
+        shapely.prepare(self.ego_path)
+        self.lower_m, self.upper_m = ego_path_m.min(axis=0) - HORIZON_M, ego_path_m.max(axis=0) + HORIZON_M
         shift_m = np.array([*origin_m, 0.0])
         near = self._near([lane.line_m for lane in network.lanes], shift_m)
         lanes = (network.lanes[number] for number in near.tolist())
         self.lanes = tuple(lane._replace(line_m=lane.line_m - shift_m) for lane in lanes)
         lines = shapely.segmentize(_lines([lane.line_m for lane in self.lanes]), SAMPLE_M)
-        self.samples_m, self.of_lane = shapely.get_coordinates(lines, include_z=True, return_index=True)
+        self.lane_points_m, self.lane_indices = shapely.get_coordinates(lines, include_z=True, return_index=True)
         near = self._near(network.junctions, shift_m)
         self.junctions = tuple(network.junctions[number] - shift_m for number in near.tolist())
 
@@ -241,47 +245,47 @@ class Vicinity:
         meet = (low_m <= self.upper_m + BEYOND_M) & (high_m >= self.lower_m - BEYOND_M)
         near = np.flatnonzero(meet.all(axis=1))
         boxes = shapely.box(*low_m[near].T, *high_m[near].T)
-        return np.asarray(near[shapely.dwithin(boxes, self.way, HORIZON_M + BEYOND_M)])
+        return np.asarray(near[shapely.dwithin(boxes, self.ego_path, HORIZON_M + BEYOND_M)])
 
-    def sees(self, places_m: Float64) -> Bools:
+    def is_visible(self, positions_m: Float64) -> Bools:
         """(N,) whether (N, 2) places may be seen from the way."""
-        return np.asarray(shapely.dwithin(shapely.points(places_m), self.way, HORIZON_M + BEYOND_M))
+        return np.asarray(shapely.dwithin(shapely.points(positions_m), self.ego_path, HORIZON_M + BEYOND_M))
 
-    def on_streets(self, places_m: Float64) -> Bools:
+    def is_on_street(self, positions_m: Float64) -> Bools:
         """(N,) whether (N, 2) places are on a street, or at least near to one."""
-        on = np.zeros(len(places_m), dtype=bool)
+        on = np.zeros(len(positions_m), dtype=bool)
         if self.lanes:
-            near = shapely.STRtree(self.covered).query(shapely.points(places_m), "dwithin", OFF_STREET_M)
+            near = shapely.STRtree(self.street_polygons).query(shapely.points(positions_m), "dwithin", OFF_STREET_M)
             on[near[0]] = True
         return on
 
-    def surfaces(self, *uses: Use) -> NDArray[np.object_]:
+    def build_surfaces(self, *uses: LaneUse) -> NDArray[np.object_]:
         """The polygons in plan of all lanes of some uses that lie on the ground."""
-        lanes = [lane for k, lane in enumerate(self.lanes) if lane.use in uses and k not in self.decks]
+        lanes = [lane for k, lane in enumerate(self.lanes) if lane.use in uses and k not in self.bridge_lane_indices]
         return _outlines(lanes, [lane.line_m for lane in lanes if lane.use == "corner"])
 
     @cached_property
-    def decks(self) -> frozenset[int]:
+    def bridge_lane_indices(self) -> frozenset[int]:
         """Numbers of the lanes that lie on bridges, at least in part."""
-        return frozenset(self.of_lane[self.on_deck].tolist())
+        return frozenset(self.lane_indices[self.on_bridge_mask].tolist())
 
-    def bridges(self, beside_m: float) -> shapely.Geometry:
+    def build_bridge_area(self, margin_m: float) -> shapely.Geometry:
         """What is no farther in plan from the middle of a lane on a bridge."""
-        lines = _lines([self.lanes[number].line_m[:, :2] for number in sorted(self.decks)])
-        return shapely.union_all(shapely.buffer(lines, beside_m))
+        lines = _lines([self.lanes[number].line_m[:, :2] for number in sorted(self.bridge_lane_indices)])
+        return shapely.union_all(shapely.buffer(lines, margin_m))
 
     @cached_property
-    def covered(self) -> NDArray[np.object_]:
+    def street_polygons(self) -> NDArray[np.object_]:
         """The polygons in plan of all that is street, be it on a bridge or not."""
         corners = (lane.line_m for lane in self.lanes if lane.use == "corner")
-        return np.concatenate([_outlines(self.lanes, [*self.junctions, *corners]), self.medians])
+        return np.concatenate([_outlines(self.lanes, [*self.junctions, *corners]), self.median_polygons])
 
     @cached_property
-    def medians(self) -> NDArray[np.object_]:
+    def median_polygons(self) -> NDArray[np.object_]:
         """The polygons in plan of what lies between carriageways."""
-        driven = shapely.union_all([*self.surfaces("road", "turn", "shoulder"), *map(_polygon, self.junctions)])
+        driven = shapely.union_all([*self.build_surfaces("road", "turn", "shoulder"), *map(_polygon, self.junctions)])
         closed = shapely.buffer(shapely.buffer(driven, MEDIAN_M / 2, quad_segs=2), -MEDIAN_M / 2, quad_segs=2)
-        others = shapely.union_all(self.surfaces("bay", "sidewalk", "corner", "crossing"))
+        others = shapely.union_all(self.build_surfaces("bay", "sidewalk", "corner", "crossing"))
         pieces = shapely.get_parts(shapely.difference(shapely.difference(closed, driven), others))
         pieces = pieces[(shapely.get_type_id(pieces) == 3) & (shapely.area(pieces) > SMALLEST_MEDIAN_M2)]
         outlines = shapely.get_exterior_ring(pieces)
@@ -289,14 +293,14 @@ class Vicinity:
         return np.asarray(pieces[shapely.length(shared) > ENCLOSED * shapely.length(outlines)])
 
     @cached_property
-    def on_deck(self) -> Bools:
+    def on_bridge_mask(self) -> Bools:
         """(N,) which samples lie on bridges: there is a street below."""
-        square = ((self.samples_m[:, :2] - self.samples_m[:, :2].min(axis=0)) / SQUARE_M).astype(np.int64) + 1
+        square = ((self.lane_points_m[:, :2] - self.lane_points_m[:, :2].min(axis=0)) / SQUARE_M).astype(np.int64) + 1
         lowest = np.full(square.max(axis=0) + 2, np.inf)
-        np.minimum.at(lowest, tuple(square.T), self.samples_m[:, 2])
+        np.minimum.at(lowest, tuple(square.T), self.lane_points_m[:, 2])
         for axis in (0, 1):
             lowest = np.minimum.reduce([lowest, np.roll(lowest, 1, axis), np.roll(lowest, -1, axis)])
-        return np.asarray(self.samples_m[:, 2] > lowest[tuple(square.T)] + BRIDGE_M)
+        return np.asarray(self.lane_points_m[:, 2] > lowest[tuple(square.T)] + BRIDGE_M)
 
 
 def _lines(lines_m: Sequence[Float64]) -> NDArray[np.object_]:
@@ -320,22 +324,22 @@ def _polygon(outline_m: Float64) -> shapely.Geometry:
     return shapely.make_valid(shapely.Polygon(outline_m[:, :2]))
 
 
-def read_pieces(path: Path) -> Iterator[bytes]:
-    """Yield a file in pieces of 256 KiB, for `feed_xml`."""
+def read_chunks(path: Path) -> Iterator[bytes]:
+    """Yield a file in pieces of 256 KiB, for `parse_xml_stream`."""
     with path.open("rb") as file:
         yield from iter(lambda: file.read(PIECE_BYTES), b"")
 
 
-def feed_xml(
-    pieces: Iterable[bytes], start: Callable[[str, list[str]], None], end: Callable[[str], None] | None = None
+def parse_xml_stream(
+    chunks: Iterable[bytes], on_start: Callable[[str, list[str]], None], on_end: Callable[[str], None] | None = None
 ) -> None:
     """Read XML that may be of any length, one tag after the other; nothing of it is kept.
 
-    `start`: called with the name of each element, and with the names and values of its attributes in turn; what it
-    raises ends the reading. `end`: called with the name at its end. ValueError: not XML, or it declares entities.
+    `on_start`: called with the name of each element, and with the names and values of its attributes in turn; what it
+    raises ends the reading. `on_end`: called with the name at its end. ValueError: not XML, or it declares entities.
 
     Example:
-        >>> feed_xml([b"<a x='1'", b"><b/></a>"], lambda name, attributes: print(name, attributes))
+        >>> parse_xml_stream([b"<a x='1'", b"><b/></a>"], lambda name, attributes: print(name, attributes))
         a ['x', '1']
         b []
     """
@@ -346,10 +350,10 @@ def feed_xml(
     parser = expat.ParserCreate()
     parser.ordered_attributes = True
     parser.EntityDeclHandler = refuse
-    parser.StartElementHandler = start
-    parser.EndElementHandler = end
+    parser.StartElementHandler = on_start
+    parser.EndElementHandler = on_end
     try:
-        for piece in pieces:
+        for piece in chunks:
             parser.Parse(piece)
         parser.Parse(b"", True)
     except expat.ExpatError as error:

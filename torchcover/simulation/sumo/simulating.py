@@ -21,7 +21,7 @@ from xml.sax.saxutils import quoteattr
 from torchcover.files import end_with_parent, find_memory_limit_gb, guard_reader, parse_xml, report_stopped_processes
 from torchcover.files.bad_file import VARIABLE
 from torchcover.simulation.sumo.floating import ATTRIBUTES
-from torchcover.simulation.sumo.network import feed_xml, read_pieces
+from torchcover.simulation.sumo.network import parse_xml_stream, read_chunks
 from torchcover.simulation.traffic.assemble import HORIZON_M
 
 # The elements of a network and of traffic demand. SUMO would take detectors, calibrators, rerouters, timed events and
@@ -55,22 +55,22 @@ LEFT_OUT = frozenset({"imgFile", "osgFile", "emissionClass"})
 
 
 @guard_reader("a file of SUMO")
-def copy_checked(path: Path, target: Path, kind: Literal["network", "routes"]) -> Path:
+def copy_checked(path: Path, target_path: Path, kind: Literal["network", "routes"]) -> Path:
     """Copy a network or routes, as the parser understands them, if nothing in them names an output or an address.
 
     Args:
         path: The file.
-        target: Where the copy goes. Text between the elements, pictures and emission classes are left out.
+        target_path: Where the copy goes. Text between the elements, pictures and emission classes are left out.
         kind: Which elements are allowed.
 
     Returns:
-        `target`.
+        `target_path`.
 
     Raises:
         BadFileError: Another element, parameter or attribute than SUMO needs for traffic, or not XML.
     """
     parents: list[str] = []
-    with target.open("w", encoding="utf-8") as copy:
+    with target_path.open("w", encoding="utf-8") as copy:
 
         def start(name: str, names_and_values: list[str]) -> None:
             attributes = list(zip(names_and_values[::2], names_and_values[1::2], strict=True))
@@ -83,8 +83,8 @@ def copy_checked(path: Path, target: Path, kind: Literal["network", "routes"]) -
             parents.pop()
             copy.write(f"</{name}>\n")
 
-        feed_xml(read_pieces(path), start, end)
-    return target
+        parse_xml_stream(read_chunks(path), start, end)
+    return target_path
 
 
 def _check_element(kind: str, name: str, attributes: Sequence[tuple[str, str]], parent: str) -> None:
@@ -138,27 +138,29 @@ MOST_S = 600.0
 ALWAYS = ("--xml-validation", "never")
 
 
-def run(program: str, *options: str | Path) -> None:
+def run_program(program: str, *options: str | Path) -> None:
     """Run a program on inputs of our own, which writes its outputs into files.
 
     Raises:
         ImportError: SUMO is not installed.
         ValueError: The program fails; with its own message.
     """
-    for _ in output_of(program, *options, cpu_s=MOST_S, writes=True):
+    for _ in stream_output(program, *options, max_cpu_s=MOST_S, can_write=True):
         pass
 
 
-def output_of(program: str, *options: str | Path, cpu_s: float = math.inf, writes: bool = False) -> Iterator[bytes]:
+def stream_output(
+    program: str, *options: str | Path, max_cpu_s: float = math.inf, can_write: bool = False
+) -> Iterator[bytes]:
     """Yield what a program writes to its standard output, piece by piece; closing the iterator ends the program.
 
     Args:
         program: One of SUMO's programs.
         options: Its command line.
-        cpu_s: Processor time after which it is ended.
-        writes: Whether it may write files. Programs that read what users give must not.
+        max_cpu_s: Processor time after which it is ended.
+        can_write: Whether it may write files. Programs that read what users give must not.
     """
-    folder = home()
+    folder = find_sumo_home()
     command = [str(folder / "bin" / program), *ALWAYS, *map(str, options)]
     with TemporaryDirectory() as working_folder:
         process = subprocess.Popen(
@@ -168,7 +170,7 @@ def output_of(program: str, *options: str | Path, cpu_s: float = math.inf, write
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             env={**os.environ, "SUMO_HOME": str(folder), "PROJ_NETWORK": "OFF"},
-            preexec_fn=end_with_parent(find_memory_limit_gb(), cpu_s, can_write=writes),  # noqa: PLW1509  (system calls, no lock)
+            preexec_fn=end_with_parent(find_memory_limit_gb(), max_cpu_s, can_write=can_write),  # noqa: PLW1509  (system calls, no lock)
         )
         assert process.stdout is not None  # as asked for
         assert process.stderr is not None
@@ -189,7 +191,7 @@ def output_of(program: str, *options: str | Path, cpu_s: float = math.inf, write
             process.wait()
             messages.join()
         if ended == -signal.SIGXCPU:
-            raise ValueError(f"SUMO's {program} took more than {cpu_s:g} s of processor time; is the file damaged?")
+            raise ValueError(f"SUMO's {program} took more than {max_cpu_s:g} s of processor time; is the file damaged?")
         if ended == -signal.SIGXFSZ:
             raise ValueError(f"SUMO's {program} tried to write a file, which what it reads must not make it do")
         if ended:
@@ -218,7 +220,7 @@ def _errors(lines: Sequence[str]) -> str:
     return " ".join(told or lines[-1:] or ["it says nothing"])[:MAX_TOLD_CHARS]
 
 
-def home() -> Path:
+def find_sumo_home() -> Path:
     """The folder of the installed package, else of the programs that the shell finds; ImportError if neither is."""
     found = find_spec("sumo")
     if found is not None and found.origin is not None:
@@ -230,21 +232,27 @@ def home() -> Path:
 
 
 def simulate(
-    network: Path, routes: Sequence[Path], begin_s: float, seed: int, *, around: str | None, drawn: bool
+    network_file: Path,
+    route_files: Sequence[Path],
+    begin_s: float,
+    seed: int,
+    *,
+    around_vehicle: str | None,
+    is_sampled: bool,
 ) -> Iterator[bytes]:
-    """Floating car data of a simulation from `begin_s` on, of those near to the vehicle `around` if one is given.
+    """Floating car data of a simulation from `begin_s` on, of those near to the vehicle `around_vehicle` if one is given.
 
-    Traffic that was `drawn` is not taken out of a jam, and its ways may end anywhere.
+    Traffic that was `is_sampled` is not taken out of a jam, and its ways may end anywhere.
     """
-    options = ["--time-to-teleport", "-1", "--ignore-route-errors"] if drawn else []
-    if around is not None:
-        options += ["--device.fcd.explicit", around, "--person-device.fcd.explicit", around]
+    options = ["--time-to-teleport", "-1", "--ignore-route-errors"] if is_sampled else []
+    if around_vehicle is not None:
+        options += ["--device.fcd.explicit", around_vehicle, "--person-device.fcd.explicit", around_vehicle]
         options += ["--device.fcd.radius", str(HORIZON_M + BEYOND_M)]
     with TemporaryDirectory() as folder:
         # Copies, whose names hold no comma either, at which SUMO would split them.
-        net = copy_checked(network, Path(folder) / "checked.net.xml", "network")
-        demand = [copy_checked(path, Path(folder) / f"{k}.rou.xml", "routes") for k, path in enumerate(routes)]
-        yield from output_of(
+        net = copy_checked(network_file, Path(folder) / "checked.net.xml", "network")
+        demand = [copy_checked(path, Path(folder) / f"{k}.rou.xml", "routes") for k, path in enumerate(route_files)]
+        yield from stream_output(
             "sumo", "--net-file", net, "--route-files", ",".join(map(str, demand)), "--seed", str(seed),
             "--step-length", str(STEP_S), "--device.fcd.begin", str(begin_s), "--fcd-output", "stdout",
             "--fcd-output.attributes", ATTRIBUTES, "--precision", "4", "--lanechange.duration", str(LANE_CHANGE_S),
@@ -253,7 +261,7 @@ def simulate(
 
 
 @guard_reader("an OpenDRIVE road")
-def from_opendrive(path: Path, folder: Path, *, leave_out_links: bool) -> Path:
+def convert_opendrive(path: Path, folder: Path, *, omit_missing_links: bool) -> Path:
     """Let SUMO turn an OpenDRIVE file into a network in a folder; links to what is not there may be left out."""
     root = parse_xml(path)
     if root.tag != "OpenDRIVE":
@@ -264,19 +272,19 @@ def from_opendrive(path: Path, folder: Path, *, leave_out_links: bool) -> Path:
         if element.tag == "geoReference":
             _check_projection(element.text or "")
     network, lost = folder / "converted.net.xml", list(_lost_links(root))
-    if lost and leave_out_links:
+    if lost and omit_missing_links:
         for parent, link, _ in lost:
             parent.remove(link)
     copy = folder / "checked.xodr"  # as the parser understands it: without declarations, under a name without a comma
     ElementTree.ElementTree(root).write(copy, encoding="utf-8")
     try:
-        written = b"".join(output_of(
+        written = b"".join(stream_output(
             "netconvert", "--opendrive-files", copy, "--output-file", "stdout", "--precision", "3",
             "--opendrive.import-all-lanes", "--opendrive.curve-resolution", "2", "--walkingareas", "--crossings.guess",
-            cpu_s=MOST_S,
+            max_cpu_s=MOST_S,
         ))  # fmt: skip
     except ValueError as error:
-        if not lost or leave_out_links:
+        if not lost or omit_missing_links:
             raise
         told = "; ".join(words for *_, words in lost[:SHOWN]) + (
             f"; and {len(lost) - SHOWN} more" * (len(lost) > SHOWN)

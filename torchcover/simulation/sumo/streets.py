@@ -14,12 +14,12 @@ from torchcover.files import parse_xml
 from torchcover.geometry.arrays import Float64
 from torchcover.simulation.documents import Document
 from torchcover.simulation.sumo.network import Network
-from torchcover.simulation.sumo.simulating import run
+from torchcover.simulation.sumo.simulating import run_program
 from torchcover.simulation.traffic.fleet import CATEGORIES, Fleet
 from torchcover.simulation.traffic.hills import Hills
-from torchcover.simulation.traffic.kind import MostPeople, MostVehicles
+from torchcover.simulation.traffic.kind import PeoplePerKm, VehiclesPerKm
 
-Plan = Literal["rand", "grid", "spider"]
+NetworkLayout = Literal["rand", "grid", "spider"]
 
 LANE_M, BICYCLE_LANE_M, BAY_M = 3.25, 1.8, 2.3
 SIDEWALK_M = (2.4, 3.4)
@@ -34,51 +34,53 @@ BEND_PIECES = 10
 CORNER_M, TURN_MPS2, CURVE_M = 6.0, 2.0, 5.0
 
 
-class DrawnStreets(Document):
+class RandomStreets(Document):
     """Streets and traffic that are drawn from a seed.
 
     Args:
-        network: Their plan; one of the three is drawn if not given.
-        lanes: The most of a street, each way.
-        speed_mps: What is allowed.
-        bend: How far the middle of a street may lie aside of the straight line, as a share of its length.
-        hills_m: Height of the hills, as a standard deviation; 0 is a plain.
+        layout: Their plan; one of the three is drawn if not given.
+        max_lanes_per_direction: The most of a street, each way.
+        speed_limit_mps: What is allowed.
+        max_bend_ratio: How far the middle of a street may lie aside of the straight line, as a share of its length.
+        hill_height_std_m: Height of the hills, as a standard deviation; 0 is a plain.
         traffic_per_km: Vehicles to a kilometre of lane.
         buses_per_km: Buses among them.
         cyclists_per_km: Likewise, beside them.
         people_per_km: To a kilometre of sidewalk.
     """
 
-    network: Plan | None = None
-    lanes: Annotated[int, Field(ge=1, le=3)] = 2
-    speed_mps: Annotated[float, Field(ge=5.0, le=35.0)] = 13.9
-    bend: Annotated[float, Field(ge=0.0, le=0.1)] = 0.06
-    hills_m: Annotated[float, Field(ge=0.0, le=5.0)] = 0.5
-    traffic_per_km: MostVehicles = 14.0
-    buses_per_km: MostVehicles = 1.0
-    cyclists_per_km: MostPeople = 1.5
-    people_per_km: MostPeople = 16.0
+    layout: NetworkLayout | None = None
+    max_lanes_per_direction: Annotated[int, Field(ge=1, le=3)] = 2
+    speed_limit_mps: Annotated[float, Field(ge=5.0, le=35.0)] = 13.9
+    max_bend_ratio: Annotated[float, Field(ge=0.0, le=0.1)] = 0.06
+    hill_height_std_m: Annotated[float, Field(ge=0.0, le=5.0)] = 0.5
+    traffic_per_km: VehiclesPerKm = 14.0
+    buses_per_km: VehiclesPerKm = 1.0
+    cyclists_per_km: PeoplePerKm = 1.5
+    people_per_km: PeoplePerKm = 16.0
 
-    def build(self, folder: Path, generator: np.random.Generator) -> Path:
+    def build_network(self, folder: Path, generator: np.random.Generator) -> Path:
         """Draw a network, and write it into a folder."""
-        plan = self.network or str(generator.choice(["rand", "grid", "spider"]))
+        plan = self.layout or str(generator.choice(["rand", "grid", "spider"]))
         prefix = folder / "plan"
         seed = str(generator.integers(1 << 31))
-        run("netgenerate", *_options(plan, generator), "--seed", seed, "--plain-output-prefix", prefix)
+        run_program("netgenerate", *_options(plan, generator), "--seed", seed, "--plain-output-prefix", prefix)
         nodes = {
             node.get("id", ""): (float(node.get("x", "")), float(node.get("y", "")))
             for node in parse_xml(prefix.with_suffix(".nod.xml")).iter("node")
         }
         edges = list(parse_xml(prefix.with_suffix(".edg.xml")).iter("edge"))
-        hills = Hills(self.hills_m, generator)
+        hills = Hills(self.hill_height_std_m, generator)
         node_file, edge_file, network = folder / "nodes.xml", folder / "edges.xml", folder / "drawn.net.xml"
         edge_file.write_text(self._edges(nodes, edges, hills, generator), encoding="utf-8")
         rows = [
             f'<node id={quoteattr(name)} x="{x:.3f}" y="{y:.3f}" z="{z:.3f}"/>'
-            for (name, (x, y)), z in zip(nodes.items(), hills.heights_m(np.array(list(nodes.values()))), strict=True)
+            for (name, (x, y)), z in zip(
+                nodes.items(), hills.compute_heights_m(np.array(list(nodes.values()))), strict=True
+            )
         ]
         node_file.write_text(f"<nodes>{''.join(rows)}</nodes>", encoding="utf-8")
-        run(
+        run_program(
             "netconvert", "--node-files", node_file, "--edge-files", edge_file, "--output-file", network,
             "--precision", "3", "--tls.guess", "--walkingareas", "--crossings.guess",
             "--no-turnarounds.except-deadend",
@@ -87,7 +89,7 @@ class DrawnStreets(Document):
         drawn = parse_xml(network)
         for lane in drawn.iterfind("edge[@function='internal']/lane"):
             line_m = np.array([place.split(",")[:2] for place in lane.get("shape", "").split()], dtype=np.float64)
-            lane.set("speed", f"{min(self.speed_mps, turning_mps(line_m)):.2f}")
+            lane.set("speed", f"{min(self.speed_limit_mps, compute_turning_speed_mps(line_m)):.2f}")
         ElementTree.ElementTree(drawn).write(network)
         return network
 
@@ -113,14 +115,14 @@ class DrawnStreets(Document):
             way_m, lanes = shapely.get_coordinates(ways[ends]), self._lanes(generator)
             # Junctions are level: so are the ends of all that meet there.
             share = np.linspace(0.0, 1.0, BEND_PIECES + 1)
-            from_m, to_m = hills.heights_m(way_m[[0, -1]])
+            from_m, to_m = hills.compute_heights_m(way_m[[0, -1]])
             climb_m = from_m + (to_m - from_m) * share**2 * (3 - 2 * share)
             places = [f"{x:.3f},{y:.3f},{z:.3f}" for (x, y), z in zip(way_m, climb_m, strict=True)]
             for name, start, end in streets[ends]:
                 shape = " ".join(places if start == ends[0] else places[::-1])
                 rows.append(
                     f"<edge id={quoteattr(name)} from={quoteattr(start)} to={quoteattr(end)} "
-                    f'numLanes="{lanes.count("<lane")}" speed="{self.speed_mps:.2f}" shape="{shape}">{lanes}</edge>'
+                    f'numLanes="{lanes.count("<lane")}" speed="{self.speed_limit_mps:.2f}" shape="{shape}">{lanes}</edge>'
                 )
         return f"<edges>{''.join(rows)}</edges>"
 
@@ -128,7 +130,7 @@ class DrawnStreets(Document):
         """(K, 2) a way that leaves both ends straight."""
         share = np.linspace(0.0, 1.0, BEND_PIECES + 1)[:, None]
         along = end_m - start_m
-        aside = generator.uniform(-self.bend, self.bend) * np.sin(np.pi * share) ** 2
+        aside = generator.uniform(-self.max_bend_ratio, self.max_bend_ratio) * np.sin(np.pi * share) ** 2
         return np.asarray(start_m + share * along + aside * np.array([-along[1], along[0]]))
 
     def _lanes(self, generator: np.random.Generator) -> str:
@@ -138,13 +140,13 @@ class DrawnStreets(Document):
             lanes.append(('type="parking" disallow="all"', BAY_M))
         if self.cyclists_per_km > 0 and generator.random() < WITH_BICYCLE_LANES:
             lanes.append(('allow="bicycle"', BICYCLE_LANE_M))
-        lanes += [('disallow="pedestrian"', LANE_M)] * int(generator.integers(1, self.lanes + 1))
+        lanes += [('disallow="pedestrian"', LANE_M)] * int(generator.integers(1, self.max_lanes_per_direction + 1))
         if generator.random() < WITH_MEDIAN:
             lanes.append(('type="median" disallow="all"', generator.uniform(*MEDIAN_M)))
         return "".join(f'<lane index="{k}" {who} width="{width:.2f}"/>' for k, (who, width) in enumerate(lanes))
 
 
-def turning_mps(line_m: Float64) -> float:
+def compute_turning_speed_mps(line_m: Float64) -> float:
     """How fast a turn, (K, 2) places of its lane, may be driven: where it is tightest, not on its average."""
     steps_m = np.diff(line_m, axis=0)
     lengths_m = np.hypot(*steps_m.T)
@@ -199,7 +201,12 @@ CLASSES = {"truck": "truck", "bus": "bus", "motorcycle": "motorcycle", "cyclist"
 
 
 def write_routes(
-    path: Path, network: Network, streets: DrawnStreets, fleet: Fleet, duration_s: float, generator: np.random.Generator
+    path: Path,
+    network: Network,
+    random_streets: RandomStreets,
+    fleet: Fleet,
+    duration_s: float,
+    generator: np.random.Generator,
 ) -> None:
     """Write vehicles and people, all of whom set off at 0.
 
@@ -208,8 +215,8 @@ def write_routes(
     rows = [
         f'<vType id="{kind}" vClass="pedestrian"/>'
         if category == "pedestrian"
-        else f'<vType id="{kind}" vClass="{CLASSES.get(category, "passenger")}" length="{fleet.length_m(kind):.2f}" '
-        f'width="{fleet.width_m(kind):.2f}" {DRIVERS}/>'
+        else f'<vType id="{kind}" vClass="{CLASSES.get(category, "passenger")}" length="{fleet.get_length_m(kind):.2f}" '
+        f'width="{fleet.get_width_m(kind):.2f}" {DRIVERS}/>'
         for kind, category in {**CATEGORIES, EGO_TYPE: "car"}.items()
     ]
     roads = _Ways(network, "passenger", "road")
@@ -221,10 +228,10 @@ def write_routes(
     cycling, walking = _Ways(network, "bicycle", "road"), _Ways(network, "passenger", "sidewalk")
     groups = [
         ({EGO_TYPE: 1.0}, roads, float(EGOS)),
-        (TRAFFIC, roads, streets.traffic_per_km * roads.lanes_km - EGOS),
-        ({"bus": 1.0}, _Ways(network, "bus", "road"), streets.buses_per_km * roads.lanes_km),
-        ({"cyclist": 1.0}, cycling, streets.cyclists_per_km * cycling.lanes_km),
-        (PEOPLE, walking, streets.people_per_km * walking.lanes_km),
+        (TRAFFIC, roads, random_streets.traffic_per_km * roads.lanes_km - EGOS),
+        ({"bus": 1.0}, _Ways(network, "bus", "road"), random_streets.buses_per_km * roads.lanes_km),
+        ({"cyclist": 1.0}, cycling, random_streets.cyclists_per_km * cycling.lanes_km),
+        (PEOPLE, walking, random_streets.people_per_km * walking.lanes_km),
     ]
     if (everybody := sum(number for _, _, number in groups)) > MAX_AGENTS:
         raise ValueError(
@@ -235,7 +242,7 @@ def write_routes(
         on_foot = mix is PEOPLE
         speed_mps = WALKING_MPS if on_foot else FASTER * max(ways.speed_mps, SLOWEST_MPS)
         for k in range(round(number) if ways.length_m.any() else 0):
-            kind = EGO_TYPE if EGO_TYPE in mix else fleet.draw_kind(mix)
+            kind = EGO_TYPE if EGO_TYPE in mix else fleet.sample_kind(mix)
             way = ways.draw(speed_mps * duration_s, generator)
             if on_foot and generator.random() < 0.5:
                 way = way[::-1]
@@ -252,15 +259,17 @@ class _Ways:
     """Draws ways of vehicles of a class, or of those who walk beside them."""
 
     def __init__(self, network: Network, vehicle_class: str, use: str) -> None:
-        follow = network.follow(vehicle_class)
+        follow = network.find_successors(vehicle_class)
         if use == "sidewalk":
-            walked = {lane.edge for lane in network.lanes if lane.use == use}
+            walked = {lane.edge_id for lane in network.lanes if lane.use == use}
             follow = {edge: tuple(walked & set(after)) for edge, after in follow.items() if edge in walked}
         self._follow = {edge: tuple(sorted(after)) for edge, after in follow.items()}
         lanes = [
             lane
             for lane in network.lanes
-            if lane.use == use and lane.edge in self._follow and (use == "sidewalk" or lane.allows(vehicle_class))
+            if lane.use == use
+            and lane.edge_id in self._follow
+            and (use == "sidewalk" or lane.is_allowed(vehicle_class))
         ]
         self._edges = list(self._follow)
         number = {edge: k for k, edge in enumerate(self._edges)}
@@ -268,8 +277,8 @@ class _Ways:
         self.length_m = np.zeros(len(self._edges))  # of its lanes together, if one may begin there
         for lane in lanes:
             long_m = float(np.linalg.norm(np.diff(lane.line_m, axis=0), axis=1).sum())
-            self._long_m[number[lane.edge]] = long_m
-            self.length_m[number[lane.edge]] += long_m * bool(self._follow[lane.edge])
+            self._long_m[number[lane.edge_id]] = long_m
+            self.length_m[number[lane.edge_id]] += long_m * bool(self._follow[lane.edge_id])
         self._number = number
         self.lanes_km = float(self.length_m.sum()) / 1000
         self.speed_mps = max((lane.speed_mps for lane in lanes), default=0.0)

@@ -13,17 +13,22 @@ from torchcover.files import BadFileError
 from torchcover.geometry.arrays import Bools, Float64
 from torchcover.recordings.unsupported_formats import find_remedy
 from torchcover.simulation.documents import RelativePath
-from torchcover.simulation.sumo.crowd import crowd, read_types
-from torchcover.simulation.sumo.floating import Recorded, TimeWindow, read_floating, record
-from torchcover.simulation.sumo.ground import Pavement, Placing, decks, ground_of, park
-from torchcover.simulation.sumo.motion import motions, possible
+from torchcover.simulation.sumo.crowd import read_vehicle_types, select_road_users
+from torchcover.simulation.sumo.floating import (
+    FloatingCarData,
+    TimeWindow,
+    parse_floating_car_data,
+    read_floating_car_data,
+)
+from torchcover.simulation.sumo.ground import BodyPlacer, Sidewalks, build_bridges, build_ground, place_parked_vehicles
+from torchcover.simulation.sumo.motion import compute_motions, drop_colliding_users
 from torchcover.simulation.sumo.network import OFF_STREET_M, SAME_PLACE_M, Vicinity, read_network
-from torchcover.simulation.sumo.simulating import from_opendrive, home, simulate
-from torchcover.simulation.sumo.streets import EGO_TYPE, DrawnStreets, write_routes
+from torchcover.simulation.sumo.simulating import convert_opendrive, find_sumo_home, simulate
+from torchcover.simulation.sumo.streets import EGO_TYPE, RandomStreets, write_routes
 from torchcover.simulation.traffic.fleet import EGO, Fleet
-from torchcover.simulation.traffic.frontage import Side, Times, sides_around, stand
-from torchcover.simulation.traffic.kind import Built, Procedural
-from torchcover.simulation.traffic.scenery import Scenery, few
+from torchcover.simulation.traffic.frontage import RoadsideDensity, StreetSide, find_street_sides, place_scenery
+from torchcover.simulation.traffic.kind import ProceduralTraffic, SceneParts
+from torchcover.simulation.traffic.scenery import Scenery, merge_by_kind
 
 # Nothing stands nearer to a lane than this; furniture and houses keep off by more, so that no crown hangs over it.
 CLEAR_M, KERB_M, BEHIND_M = 0.4, 1.0, 2.2
@@ -38,27 +43,27 @@ USUALLY_LEFT_OUT = 0.15
 BELOW_M = 3.0
 
 
-def sides_of(
+def find_visible_sides(
     vicinity: Vicinity, built_share: float, generator: np.random.Generator
-) -> tuple[list[Side], list[shapely.Geometry]]:
+) -> tuple[list[StreetSide], list[shapely.Geometry]]:
     """What can be seen of the sides of streets, and where nothing may stand."""
-    street = shapely.union_all(shapely.buffer(vicinity.covered, GAP_M, join_style="mitre")).buffer(-GAP_M)
-    bridges = vicinity.bridges(BRIDGE_M)
+    street = shapely.union_all(shapely.buffer(vicinity.street_polygons, GAP_M, join_style="mitre")).buffer(-GAP_M)
+    bridges = vicinity.build_bridge_area(BRIDGE_M)
     shapely.prepare(bridges)
 
     def sees(places_m: Float64) -> Bools:
-        return np.asarray(vicinity.sees(places_m) & ~shapely.contains_xy(bridges, *places_m.T))
+        return np.asarray(vicinity.is_visible(places_m) & ~shapely.contains_xy(bridges, *places_m.T))
 
-    taken = shapely.buffer(vicinity.covered, CLEAR_M).tolist()
-    return sides_around(street, (KERB_M, BEHIND_M), sees, built_share, generator), taken
+    taken = shapely.buffer(vicinity.street_polygons, CLEAR_M).tolist()
+    return find_street_sides(street, (KERB_M, BEHIND_M), sees, built_share, generator), taken
 
 
-class Sumo(Procedural):
+class SumoTraffic(ProceduralTraffic):
     """Traffic of SUMO, on a network of the user's own or on one that is drawn anew for each run.
 
     Args:
         net: A road network: `.net.xml`, or `.xodr` (OpenDRIVE).
-        leave_out_links: Whether links of an `.xodr` to roads and junctions that are not there are left out.
+        omit_missing_links: Whether links of an `.xodr` to roads and junctions that are not there are left out.
         routes: Files of routes for it, which SUMO drives; relative to the document.
         fcd: Floating car data, which SUMO wrote before, instead of driving now.
         random: Streets and traffic that are drawn; with a net, its traffic only.
@@ -67,22 +72,22 @@ class Sumo(Procedural):
         begin_s: Time of the simulation at which the run begins, at the earliest: the ego has to be there. After a
             minute if not given, or with the floating car data.
         built_share: Share of the streets' sides that have houses.
-        roadside: How many times as much of what stands beside streets, but houses, there is than usually; or of some
+        roadside_density: How many times as much of what stands beside streets, but houses, there is than usually; or of some
             kinds of it, such as `{hedge: 2, lamp: 0}`.
         parked_share: Share of the parking bays that are taken: lanes that nobody may use.
     """
 
     type: Literal["sumo"] = "sumo"
     net: RelativePath | None = None
-    leave_out_links: bool = False
+    omit_missing_links: bool = False
     routes: tuple[RelativePath, ...] = ()
     fcd: RelativePath | None = None
-    random: DrawnStreets | None = None
+    random: RandomStreets | None = None
     ego_id: str | None = None
     ego_type: str | None = None
     begin_s: Annotated[float, Field(ge=0.0)] | None = None
     built_share: float = Field(default=0.8, ge=0.0, le=1.0)
-    roadside: Times = 1.0
+    roadside_density: RoadsideDensity = 1.0
     parked_share: float = Field(default=0.75, ge=0.0, le=1.0)
 
     @model_validator(mode="after")
@@ -93,7 +98,9 @@ class Sumo(Procedural):
             given = [key for key in ("routes", "fcd", "ego_id", "ego_type", "begin_s") if getattr(self, key)]
             if given:
                 raise ValueError(f"random draws all traffic; leave out {', '.join(given)}, or random")
-            of_streets = sorted({"network", "lanes", "speed_mps", "bend", "hills_m"} & self.random.model_fields_set)
+            of_streets = sorted(
+                {"network", "lanes", "speed_mps", "bend", "hill_height_std_m"} & self.random.model_fields_set
+            )
             if self.net is not None and of_streets:
                 raise ValueError(f"random: {', '.join(of_streets)} are for streets that are drawn; there is a net")
         return self
@@ -101,9 +108,9 @@ class Sumo(Procedural):
     def check(self) -> None:
         """Refuse where SUMO is needed, but not installed."""
         if self.fcd is None or (self.net is not None and self.net.suffix == ".xodr"):
-            home()  # or an ImportError
+            find_sumo_home()  # or an ImportError
 
-    def _build(self, fleet: Fleet, times_s: Float64, generator: np.random.Generator) -> Built:
+    def _build(self, fleet: Fleet, times_s: Float64, generator: np.random.Generator) -> SceneParts:
         with TemporaryDirectory() as folder:
             network_file = self._network_file(Path(folder), generator)
             network = read_network(network_file)
@@ -111,68 +118,68 @@ class Sumo(Procedural):
             if self.random is not None:
                 routes = (Path(folder) / "drawn.rou.xml",)
                 write_routes(*routes, network, self.random, fleet, WARM_UP_S + float(times_s[-1]), generator)
-            known = {name: found for path in routes for name, found in read_types(path).items()}
+            known = {name: found for path in routes for name, found in read_vehicle_types(path).items()}
             recorded = self._recorded(network_file, routes, float(times_s[-1]), generator)
         ego_type = EGO_TYPE if self.random is not None else self.ego_type
         duration_s = float(times_s[-1])
-        ego, others = crowd(recorded, known, fleet, self.ego_id, ego_type, duration_s, generator)
-        near_m = np.floor(ego.track.places_m[0, :2])
-        (alone,) = motions([ego], duration_s, near_m)
+        ego, others = select_road_users(recorded, known, fleet, self.ego_id, ego_type, duration_s, generator)
+        near_m = np.floor(ego.track.front_positions_m[0, :2])
+        (alone,) = compute_motions([ego], duration_s, near_m)
         begin_m = np.floor(alone.poses[0, :2] + SAME_PLACE_M)
         origin_m, way_m = near_m + begin_m, alone.poses[:, :2] - begin_m
         vicinity = Vicinity(network, way_m, origin_m)
-        gone = np.flatnonzero(~vicinity.on_streets(way_m))
+        gone = np.flatnonzero(~vicinity.is_on_street(way_m))
         if len(gone):
             raise ValueError(
                 f"the ego is farther than {OFF_STREET_M:g} m from all streets of the network at t = "
                 f"{recorded.begin_s + alone.times_s[gone[0]]:g} s: it leaves them, or the data are those of another "
                 "network"
             )
-        ground = ground_of(vicinity)
-        pavement = Pavement(vicinity, ground)
-        sides, taken = sides_of(vicinity, self.built_share, generator)
-        stood = stand(sides, taken, taken, (), ground.compute_heights_m, self.roadside, generator)
-        raised = few(pavement.meshes(), decks(vicinity))
-        static = (ground.build_mesh(), *raised, *few(*stood))
-        parked = park(vicinity, ground, fleet, self.parked_share, generator)
-        obstacles = shapely.difference(np.concatenate([pavement.parts, parked]), vicinity.bridges(BELOW_M))
-        moved = motions([ego, *others], duration_s, origin_m, obstacles, pavement.walked)
-        shown = possible(moved)
-        fleet.left_out = len(moved) - len(shown)
-        if fleet.left_out > (0.0 if self.random is None else USUALLY_LEFT_OUT) * len(others):
-            there = {motion.user.track.name for motion in shown}
-            missing = sorted({motion.user.track.name for motion in moved} - there)
+        ground = build_ground(vicinity)
+        pavement = Sidewalks(vicinity, ground)
+        sides, taken = find_visible_sides(vicinity, self.built_share, generator)
+        stood = place_scenery(sides, taken, taken, (), ground.compute_heights_m, self.roadside_density, generator)
+        raised = merge_by_kind(pavement.build_meshes(), build_bridges(vicinity))
+        static = (ground.build_mesh(), *raised, *merge_by_kind(*stood))
+        parked = place_parked_vehicles(vicinity, ground, fleet, self.parked_share, generator)
+        obstacles = shapely.difference(np.concatenate([pavement.polygons, parked]), vicinity.build_bridge_area(BELOW_M))
+        moved = compute_motions([ego, *others], duration_s, origin_m, obstacles, pavement.walkable_area)
+        shown = drop_colliding_users(moved)
+        fleet.omitted_count = len(moved) - len(shown)
+        if fleet.omitted_count > (0.0 if self.random is None else USUALLY_LEFT_OUT) * len(others):
+            there = {motion.road_user.track.name for motion in shown}
+            missing = sorted({motion.road_user.track.name for motion in moved} - there)
             warnings.warn(
-                f"the simulation has {fleet.left_out} of {len(others)} road users where another one is, over a kerb or "
+                f"the simulation has {fleet.omitted_count} of {len(others)} road users where another one is, over a kerb or "
                 f"faster than people are ({', '.join(map(repr, missing[:3]))}); they are left out",
                 stacklevel=2,
             )
-        placing = Placing(ground, pavement)
-        driver = placing.ego(shown[0], times_s, fleet.meshes[EGO], generator)
+        placing = BodyPlacer(ground, pavement)
+        driver = placing.build_ego(shown[0], times_s, fleet.meshes[EGO], generator)
         scenery = Scenery(static, tuple(range(1 + len(raised))))
-        return scenery, driver, placing.actors(shown[1:], fleet, duration_s)
+        return scenery, driver, placing.build_actors(shown[1:], fleet, duration_s)
 
     def _network_file(self, folder: Path, generator: np.random.Generator) -> Path:
         """The network in SUMO's own format."""
         if self.net is None:
             assert self.random is not None  # checked in _check_sources
-            return self.random.build(folder, generator)
+            return self.random.build_network(folder, generator)
         if self.net.suffix not in (".xml", ".xodr") and (remedy := find_remedy(self.net)):
             raise BadFileError(f"{self.net}: a network is a .net.xml or .xodr file; {remedy}")
         if self.net.suffix != ".xodr":
             return self.net
-        return from_opendrive(self.net, folder, leave_out_links=self.leave_out_links)
+        return convert_opendrive(self.net, folder, omit_missing_links=self.omit_missing_links)
 
     def _recorded(
         self, network_file: Path, routes: tuple[Path, ...], duration_s: float, generator: np.random.Generator
-    ) -> Recorded:
+    ) -> FloatingCarData:
         if self.fcd is not None:
-            return read_floating(self.fcd, TimeWindow(self.begin_s or -np.inf, duration_s, self.ego_id))
+            return read_floating_car_data(self.fcd, TimeWindow(self.begin_s or -np.inf, duration_s, self.ego_id))
         begin_s = WARM_UP_S if self.random is not None else USUAL_BEGIN_S if self.begin_s is None else self.begin_s
         seed, drawn = int(generator.integers(1 << 31)), self.random is not None
-        pieces = simulate(network_file, routes, begin_s, seed, around=self.ego_id, drawn=drawn)
-        recorded = record(pieces, TimeWindow(begin_s, duration_s, self.ego_id))
-        if not np.isfinite(recorded.last_s):
+        pieces = simulate(network_file, routes, begin_s, seed, around_vehicle=self.ego_id, is_sampled=drawn)
+        recorded = parse_floating_car_data(pieces, TimeWindow(begin_s, duration_s, self.ego_id))
+        if not np.isfinite(recorded.last_time_s):
             raise ValueError(
                 f"the simulation is over before t = {begin_s:g} s, where the run begins: everybody has arrived, "
                 "or nobody sets off; change begin_s, or the routes"

@@ -1,7 +1,7 @@
 """Worlds with traffic, made from a few parameters and a seed."""
 
-from torchcover.simulation.traffic.highway import Highway
-from torchcover.simulation.traffic.parking import Parking
-from torchcover.simulation.traffic.urban import Urban
+from torchcover.simulation.traffic.highway import HighwayTraffic
+from torchcover.simulation.traffic.parking import ParkingTraffic
+from torchcover.simulation.traffic.urban import UrbanTraffic
 
-__all__ = ["Highway", "Parking", "Urban"]
+__all__ = ["HighwayTraffic", "ParkingTraffic", "UrbanTraffic"]

@@ -18,26 +18,26 @@ class Polyline:
     """
 
     points_m: Float64
-    closed: bool = False
+    is_closed: bool = False
 
     @cached_property
-    def arc_m(self) -> Float64:
+    def arc_lengths_m(self) -> Float64:
         """(K,) way along the line at each corner."""
         return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(self.points_m, axis=0), axis=1))])
 
     @property
     def length_m(self) -> float:
         """Length, of a loop once around."""
-        return float(self.arc_m[-1])
+        return float(self.arc_lengths_m[-1])
 
-    def poses(self, place_m: ArrayLike) -> Float64:
+    def compute_poses(self, distances_m: ArrayLike) -> Float64:
         """(..., 3) x and y in metres, and yaw in degrees, after (...) ways along the line; on a loop of any size."""
-        place = np.asarray(place_m, dtype=np.float64)
-        place = np.mod(place, self.length_m) if self.closed else place
-        segment = np.clip(np.searchsorted(self.arc_m, place, side="right") - 1, 0, len(self.arc_m) - 2)
-        along = (place - self.arc_m[segment])[..., None]
+        place = np.asarray(distances_m, dtype=np.float64)
+        place = np.mod(place, self.length_m) if self.is_closed else place
+        segment = np.clip(np.searchsorted(self.arc_lengths_m, place, side="right") - 1, 0, len(self.arc_lengths_m) - 2)
+        along = (place - self.arc_lengths_m[segment])[..., None]
         position = self.points_m[segment] + along * self._directions[segment]
-        yaw = np.rad2deg(np.interp(place, self.arc_m, self.headings))
+        yaw = np.rad2deg(np.interp(place, self.arc_lengths_m, self.headings_rad))
         return np.concatenate([position, yaw[..., None]], axis=-1)
 
     @cached_property
@@ -46,20 +46,20 @@ class Polyline:
         return np.asarray(steps / np.linalg.norm(steps, axis=1, keepdims=True))
 
     @cached_property
-    def headings(self) -> Float64:
+    def headings_rad(self) -> Float64:
         """(K,) heading at each corner in radians, halfway between the pieces that meet there, without jumps."""
         pieces = np.unwrap(np.arctan2(self._directions[:, 1], self._directions[:, 0]))
         return np.concatenate([pieces[:1], (pieces[:-1] + pieces[1:]) / 2, pieces[-1:]])
 
 
-def loop(length_m: float, width_m: float, corner_radius_m: float) -> Polyline:
+def build_rounded_rectangle(length_m: float, width_m: float, corner_radius_m: float) -> Polyline:
     """A rounded rectangle about the origin, run counter-clockwise from the middle of its lower side."""
     across, up = length_m / 2 - corner_radius_m, width_m / 2 - corner_radius_m
     points = [np.array([[0.0, -width_m / 2]])]
     for quarter, (x, y) in enumerate([(across, -up), (across, up), (-across, up), (-across, -up)]):
         angle = np.linspace(quarter - 1, quarter, 17) * np.pi / 2
         points.append(np.array([x, y]) + corner_radius_m * np.stack([np.cos(angle), np.sin(angle)], axis=1))
-    return Polyline(np.concatenate([*points, points[0]]), closed=True)
+    return Polyline(np.concatenate([*points, points[0]]), is_closed=True)
 
 
 KNOT_EVERY_M = 1.0
@@ -106,15 +106,15 @@ class Alignment:
         """Whether it never turns."""
         return not self.curvatures_per_m.any()
 
-    def headings(self, stations_m: ArrayLike) -> Float64:
+    def compute_headings_rad(self, stations_m: ArrayLike) -> Float64:
         """(...) headings in radians, without jumps."""
         return self._heading(*self._knot(np.asarray(stations_m, dtype=np.float64)))
 
-    def curvatures(self, stations_m: ArrayLike) -> Float64:
+    def compute_curvatures_per_m(self, stations_m: ArrayLike) -> Float64:
         """(...) curvatures in 1/m."""
         return np.asarray(np.interp(np.asarray(stations_m, dtype=np.float64), self.stations_m, self.curvatures_per_m))
 
-    def poses(self, stations_m: ArrayLike, left_m: ArrayLike) -> Float64:
+    def compute_poses(self, stations_m: ArrayLike, left_m: ArrayLike) -> Float64:
         """(..., 3) x and y in metres and yaw in degrees of places beside the line."""
         stations, left = np.broadcast_arrays(np.asarray(stations_m, dtype=np.float64), left_m)
         knot, beyond_m = self._knot(stations)
@@ -126,9 +126,9 @@ class Alignment:
         poses[..., 2] = np.rad2deg(heading)
         return poses
 
-    def lengths_m(self, stations_m: ArrayLike, left_m: ArrayLike) -> Float64:
+    def compute_offset_lengths_m(self, stations_m: ArrayLike, left_m: ArrayLike) -> Float64:
         """(...) ways from station 0 along the line that keeps to the left by so much; exact."""
-        turned = self.headings(stations_m) - self.headings(0.0)
+        turned = self.compute_headings_rad(stations_m) - self.compute_headings_rad(0.0)
         return np.asarray(stations_m, dtype=np.float64) - np.asarray(left_m, dtype=np.float64) * turned
 
     def _knot(self, stations_m: Float64) -> tuple[Int64, Float64]:
@@ -150,36 +150,36 @@ class Alignment:
         return np.asarray(np.stack(mean, axis=-1) * beyond_m[..., None])
 
 
-def squared_distances(places_m: Float64, others_m: Float64) -> Float64:
+def compute_squared_distances_m2(points_m: Float64, other_points_m: Float64) -> Float64:
     """(N, M) squared distances between (N, 2) and (M, 2) places."""
-    squares: Float64 = (places_m**2).sum(axis=1)[:, None] + (others_m**2).sum(axis=1)
-    squares -= 2 * places_m @ others_m.T
+    squares: Float64 = (points_m**2).sum(axis=1)[:, None] + (other_points_m**2).sum(axis=1)
+    squares -= 2 * points_m @ other_points_m.T
     np.maximum(squares, 0.0, out=squares)
     return squares
 
 
-class Beside:
-    """A line `left_m` to the left of the middle of a street, that follows it (`way` 1) or runs against it (-1).
+class OffsetPath:
+    """A line `left_m` to the left of the middle of a street, that follows it (`direction` 1) or runs against it (-1).
 
     It begins `reach_m` before station 0, and ends as far behind.
     """
 
-    closed = False
+    is_closed = False
 
-    def __init__(self, street: Alignment, left_m: float, way: int, reach_m: float) -> None:
+    def __init__(self, street: Alignment, left_m: float, direction: int, half_length_m: float) -> None:
         self.street = street
         self.left_m = left_m
-        self.way = way
-        self._reach_m = reach_m
+        self.direction = direction
+        self._reach_m = half_length_m
 
     @cached_property
     def _knots_m(self) -> Float64:
-        return self.street.lengths_m(self.street.stations_m, self.left_m)
+        return self.street.compute_offset_lengths_m(self.street.stations_m, self.left_m)
 
     @cached_property
     def _cubics(self) -> Float64:
         steps_m = np.where(np.diff(self.street.stations_m) > 0, np.diff(self._knots_m), np.inf)
-        return _cubics(self.street.poses(self.street.stations_m, self.left_m), steps_m)
+        return _cubics(self.street.compute_poses(self.street.stations_m, self.left_m), steps_m)
 
     @cached_property
     def _stations_per_m(self) -> Float64:
@@ -191,42 +191,42 @@ class Beside:
         """From its beginning to its end."""
         return 2 * self._reach_m
 
-    def places_at(self, stations_m: ArrayLike) -> Float64:
+    def convert_stations_to_distances_m(self, stations_m: ArrayLike) -> Float64:
         """(...) ways along the line at stations of the street."""
-        return self.way * self.street.lengths_m(stations_m, self.left_m) + self._reach_m
+        return self.direction * self.street.compute_offset_lengths_m(stations_m, self.left_m) + self._reach_m
 
-    def stations(self, place_m: ArrayLike) -> Float64:
+    def convert_distances_to_stations_m(self, distances_m: ArrayLike) -> Float64:
         """(...) stations of the street after ways along the line."""
-        knot, beyond_m = self._knot(np.asarray(place_m, dtype=np.float64))
+        knot, beyond_m = self._knot(np.asarray(distances_m, dtype=np.float64))
         return np.asarray(self.street.stations_m[knot] + beyond_m * self._stations_per_m[knot])
 
-    def poses(self, place_m: ArrayLike) -> Float64:
+    def compute_poses(self, distances_m: ArrayLike) -> Float64:
         """(..., 3) x and y in metres, and yaw in degrees, after ways along the line; to a hundredth of a millimetre."""
-        place_m = np.asarray(place_m, dtype=np.float64)
+        distances_m = np.asarray(distances_m, dtype=np.float64)
         if self.street.is_straight:
-            return self._poses_on_a_straight(place_m)
-        knot, beyond_m = self._knot(place_m)
+            return self._poses_on_a_straight(distances_m)
+        knot, beyond_m = self._knot(distances_m)
         beyond_m = beyond_m[..., None]
         poses: Float64 = self._cubics[3].take(knot, axis=0)
         for power in (2, 1, 0):
             poses *= beyond_m
             poses += self._cubics[power].take(knot, axis=0)
-        if self.way < 0:
+        if self.direction < 0:
             poses[..., 2] += 180.0
         return poses
 
     def _poses_on_a_straight(self, place_m: Float64) -> Float64:
-        x, y, yaw_deg = self.street.poses(0.0, self.left_m)
-        along_m, yaw = self.way * (place_m - self._reach_m), np.deg2rad(yaw_deg)
+        x, y, yaw_deg = self.street.compute_poses(0.0, self.left_m)
+        along_m, yaw = self.direction * (place_m - self._reach_m), np.deg2rad(yaw_deg)
         poses = np.empty((*place_m.shape, 3))
         poses[..., 0] = x + np.cos(yaw) * along_m
         poses[..., 1] = y + np.sin(yaw) * along_m
-        poses[..., 2] = yaw_deg if self.way > 0 else yaw_deg + 180.0
+        poses[..., 2] = yaw_deg if self.direction > 0 else yaw_deg + 180.0
         return poses
 
     def _knot(self, place_m: Float64) -> tuple[Int64, Float64]:
         """(...) numbers of the last knots before places, and how far along the line these are beyond them."""
-        length_m = self.way * (place_m - self._reach_m)
+        length_m = self.direction * (place_m - self._reach_m)
         # One body after the other: the search is fast where the next place is near the last.
         knot = np.searchsorted(self._knots_m, np.ascontiguousarray(length_m.T), side="right").T - 1
         knot = np.maximum(knot, 0)
@@ -251,7 +251,7 @@ def _cubics(poses: Float64, steps_m: Float64) -> Float64:
     )
 
 
-class Territory:
+class StreetCorridor:
     """The places that are nearest to the stretch of the street that they were measured from.
 
     No two stretches share any of it: what is built within cannot lie on another street, nor on what belongs to it.
@@ -261,31 +261,31 @@ class Territory:
         self._street = street
         self._span_m = span_m
         self._samples_m = np.arange(*span_m, SAMPLE_EVERY_M)
-        self._places_m = street.poses(self._samples_m, 0.0)[:, :2]
+        self._places_m = street.compute_poses(self._samples_m, 0.0)[:, :2]
 
-    def stations_m(self, every_m: float) -> Float64:
+    def sample_stations_m(self, spacing_m: float) -> Float64:
         """(N,) stations of its street, at even distances."""
-        return np.arange(*self._span_m, every_m)
+        return np.arange(*self._span_m, spacing_m)
 
-    def owns(self, stations_m: Float64, left_m: Float64) -> Bools:
+    def is_inside(self, stations_m: Float64, left_m: Float64) -> Bools:
         """(N,) whether places beside the street are their own stretch's."""
         if self._street.is_straight:
             return np.ones(len(stations_m), dtype=bool)
-        nearest = self.nearest(self._street.poses(stations_m, left_m)[:, :2])
+        nearest = self.find_nearest_stations_m(self._street.compute_poses(stations_m, left_m)[:, :2])
         return np.asarray(np.abs(nearest - stations_m) <= SAMPLE_EVERY_M)
 
-    def nearest(self, places_m: Float64) -> Float64:
+    def find_nearest_stations_m(self, positions_m: Float64) -> Float64:
         """(N,) stations of the nearest samples."""
-        return np.asarray(self._samples_m[squared_distances(places_m, self._places_m).argmin(axis=1)])
+        return np.asarray(self._samples_m[compute_squared_distances_m2(positions_m, self._places_m).argmin(axis=1)])
 
-    def reaches_m(self, stations_m: Float64, side: int, near_m: float, far_m: float) -> Float64:
+    def find_half_widths_m(self, stations_m: Float64, side: int, min_m: float, max_m: float) -> Float64:
         """(N,) how far from the middle it goes, on the left (1) or on the right (-1), from near to far."""
-        least, most = np.full(len(stations_m), near_m), np.full(len(stations_m), far_m)
+        least, most = np.full(len(stations_m), min_m), np.full(len(stations_m), max_m)
         if self._street.is_straight:
             return most
-        least[self.owns(stations_m, side * most)] = far_m
+        least[self.is_inside(stations_m, side * most)] = max_m
         for _ in range(HALVINGS):
             middle = (least + most) / 2
-            owned = self.owns(stations_m, side * middle)
+            owned = self.is_inside(stations_m, side * middle)
             least, most = np.where(owned, np.maximum(least, middle), least), np.where(owned, most, middle)
         return least

@@ -9,12 +9,12 @@ import shapely
 
 from torchcover.geometry.arrays import Float64
 from torchcover.simulation.shapes import Mesh
-from torchcover.simulation.traffic.alignment import SAMPLE_EVERY_M, Alignment, Territory
+from torchcover.simulation.traffic.alignment import SAMPLE_EVERY_M, Alignment, StreetCorridor
 from torchcover.simulation.traffic.fleet import Fleet
-from torchcover.simulation.traffic.frontage import Side, Times, Zone, stand
+from torchcover.simulation.traffic.frontage import RoadsideDensity, StreetSide, Zone, place_scenery
 from torchcover.simulation.traffic.hills import PIECE_M, Bounds, BuildingSite, Hills
-from torchcover.simulation.traffic.scenery import Scenery, few, ground, plateau
-from torchcover.simulation.traffic.streets import LONGEST_HALF_M, Streets
+from torchcover.simulation.traffic.scenery import Scenery, build_ground_plane, build_sidewalk, merge_by_kind
+from torchcover.simulation.traffic.streets import LONGEST_HALF_M, StreetPlan
 
 BLOCK_DEPTH_M = 95.0
 # Crossings and the sight of those who wait there stay free: of parked cars, and of furniture.
@@ -37,96 +37,114 @@ WAY_EVERY_M = 40.0
 class Frontage(NamedTuple):
     """A side of a street, the left (1) or the right (-1), from one station to another, behind the kerb.
 
-    `turns_m` are stations between which the street turns, towards this side. `junctions` are the numbers of those at
+    `turn_spans_m` are stations between which the street turns, towards this side. `junction_indices` are the numbers of those at
     its ends; none if it is the block between two streets that meet the main street in a turn.
     """
 
-    x_m: Bounds
+    span_m: Bounds
     side: int
-    kerb_m: float
-    turns_m: tuple[Bounds, ...] = ()
-    junctions: tuple[int, ...] = ()
+    curb_offset_m: float
+    turn_spans_m: tuple[Bounds, ...] = ()
+    junction_indices: tuple[int, ...] = ()
 
 
-class City(NamedTuple):
+class CityBuilder(NamedTuple):
     """Builds the part of a city that the ego gets to see, and parks cars in it."""
 
-    streets: Streets
-    territory: Territory
+    streets: StreetPlan
+    corridor: StreetCorridor
     hills: Hills
     fleet: Fleet
     parked_share: float
     built_share: float
-    roadside: Times
+    roadside_density: RoadsideDensity
     generator: np.random.Generator
-    shapes: np.random.Generator
+    layout_generator: np.random.Generator
 
-    def static(self, seen_m: Bounds) -> Scenery:
+    def build_static_scenery(self, visible_span_m: Bounds) -> Scenery:
         """The ground, the blocks, buildings and furniture; cars are parked among them."""
         main = BuildingSite(
-            self.streets.main, self.territory, self.hills, self.streets.section.kerb_m + BLOCK_DEPTH_M + 10.0
+            self.streets.main_alignment,
+            self.corridor,
+            self.hills,
+            self.streets.cross_section.curb_offset_m + BLOCK_DEPTH_M + 10.0,
         )
-        fronts = [(main, front) for front in self._frontages(seen_m)]
-        turns = ~self.streets.has_lights & (np.abs(self.streets.junctions_m - np.mean(seen_m)) < np.ptp(seen_m) / 2)
+        fronts = [(main, front) for front in self._frontages(visible_span_m)]
+        turns = ~self.streets.has_lights & (
+            np.abs(self.streets.junction_stations_m - np.mean(visible_span_m)) < np.ptp(visible_span_m) / 2
+        )
         fronts += [self._corner(index) for index in np.flatnonzero(turns).tolist()]
-        blocks, outlines, aprons, sides = [], [], list[shapely.Geometry](), list[Side]()
+        blocks, outlines, aprons, sides = [], [], list[shapely.Geometry](), list[StreetSide]()
         for site, front in fronts:
-            is_built = self.built_share == 1.0 or self.shapes.random() < self.built_share
-            depth_m = BLOCK_DEPTH_M if front.junctions else CORNER_DEPTH_M
-            depth_m = depth_m if is_built else self.streets.section.sidewalk_m
-            block, outline = site.block(front.x_m, front.side, front.kerb_m, depth_m)
+            is_built = self.built_share == 1.0 or self.layout_generator.random() < self.built_share
+            depth_m = BLOCK_DEPTH_M if front.junction_indices else CORNER_DEPTH_M
+            depth_m = depth_m if is_built else self.streets.cross_section.sidewalk_width_m
+            block, outline = site.build_block(front.span_m, front.side, front.curb_offset_m, depth_m)
             blocks.append(block)
             outlines.append(outline)
             zone: Zone = "built" if is_built else "open"
             sides += self._sides(site.street, front, zone)
-            for end in range(len(front.junctions)):
+            for end in range(len(front.junction_indices)):
                 edge_m, apron = self._end(site, front, end, is_built)
                 aprons += apron
                 sides += _across(
-                    edge_m if front.side == 1 - 2 * end else edge_m[::-1], self.streets.section.sidewalk_m, zone
+                    edge_m if front.side == 1 - 2 * end else edge_m[::-1],
+                    self.streets.cross_section.sidewalk_width_m,
+                    zone,
                 )
         driven, walked = self._in_plan()
         nets, whole = shapely.union_all(outlines), shapely.union_all([*outlines, *aprons], grid_size=SNAPPED_M)
-        if not self.streets.main.is_straight:
+        if not self.streets.main_alignment.is_straight:
             aprons.append(self._between(whole, shapely.union_all(driven)))
             whole = shapely.union_all([whole, aprons[-1]], grid_size=SNAPPED_M)
         # A little apart, so that no outline meets itself.
         rest = shapely.union_all(aprons, grid_size=SNAPPED_M).difference(nets).buffer(-APART_M, join_style="bevel")
         rest = shapely.get_parts(shapely.set_precision(rest, SNAPPED_M))
-        blocks.append(plateau(shapely.segmentize(rest, PIECE_M), self.hills.heights_m))
+        blocks.append(build_sidewalk(shapely.segmentize(rest, PIECE_M), self.hills.compute_heights_m))
         self._park([(site, self._parked(front)) for site, front in fronts])
-        stood = stand(
-            sides, driven, walked, shapely.get_parts(whole), self.hills.heights_m, self.roadside, self.generator
+        stood = place_scenery(
+            sides,
+            driven,
+            walked,
+            shapely.get_parts(whole),
+            self.hills.compute_heights_m,
+            self.roadside_density,
+            self.generator,
         )
-        pavements = few(blocks)
-        return Scenery((self._ground(seen_m), *pavements, *few(*stood)), tuple(range(1 + len(pavements))))
+        pavements = merge_by_kind(blocks)
+        return Scenery(
+            (self._ground(visible_span_m), *pavements, *merge_by_kind(*stood)), tuple(range(1 + len(pavements)))
+        )
 
     def _in_plan(self) -> tuple[list[shapely.Geometry], list[shapely.Geometry]]:
         """All streets, without and with the sidewalks along them."""
-        stations_m = [self.territory.stations_m(STREET_EVERY_M)]
-        bodies_m = self.streets.cross_ends_m + np.array([-LONGEST_HALF_M, LONGEST_HALF_M])
-        for street, ends_m in zip(self.streets.crossing, bodies_m, strict=True):
+        stations_m = [self.corridor.sample_stations_m(STREET_EVERY_M)]
+        bodies_m = self.streets.cross_street_spans_m + np.array([-LONGEST_HALF_M, LONGEST_HALF_M])
+        for street, ends_m in zip(self.streets.cross_streets, bodies_m, strict=True):
             stations_m.append(ends_m if street.is_straight else np.arange(-LANES_M, LANES_M, STREET_EVERY_M))
-        streets = zip([self.streets.main, *self.streets.crossing], stations_m, strict=True)
-        lines = [shapely.LineString(street.poses(along_m, 0.0)[:, :2]) for street, along_m in streets]
+        streets = zip([self.streets.main_alignment, *self.streets.cross_streets], stations_m, strict=True)
+        lines = [shapely.LineString(street.compute_poses(along_m, 0.0)[:, :2]) for street, along_m in streets]
         lines = shapely.simplify(lines, WITHIN_M / 4)
-        half_m = [self.streets.section.kerb_m, *self.streets.carriageways_m.tolist()]
+        half_m = [self.streets.cross_section.curb_offset_m, *self.streets.cross_curb_offsets_m.tolist()]
         driven, walked = (
             shapely.buffer(lines, np.array(half_m) - WITHIN_M + wider_m, cap_style="flat").tolist()
-            for wider_m in (0.0, self.streets.section.sidewalk_m)
+            for wider_m in (0.0, self.streets.cross_section.sidewalk_width_m)
         )
         return driven, walked
 
-    def _sides(self, street: Alignment, front: Frontage, zone: Zone) -> Iterator[Side]:
+    def _sides(self, street: Alignment, front: Frontage, zone: Zone) -> Iterator[StreetSide]:
         """Along its street: at the kerb, and behind the sidewalk."""
-        (first, last), sidewalk_m = front.x_m, self.streets.section.sidewalk_m
-        yield Side("kerb", _beside(street, (first + FREE_AT_ENDS_M, last - FREE_AT_ENDS_M), front.side * front.kerb_m))
-        edges = [first + sidewalk_m, *(edge for turn_m in front.turns_m for edge in turn_m), last - sidewalk_m]
+        (first, last), sidewalk_m = front.span_m, self.streets.cross_section.sidewalk_width_m
+        yield StreetSide(
+            "kerb", _beside(street, (first + FREE_AT_ENDS_M, last - FREE_AT_ENDS_M), front.side * front.curb_offset_m)
+        )
+        edges = [first + sidewalk_m, *(edge for turn_m in front.turn_spans_m for edge in turn_m), last - sidewalk_m]
         for number, x_m in enumerate(pairwise(edges)):
-            if x_m[1] > x_m[0] and not (number % 2 and front.junctions):
+            if x_m[1] > x_m[0] and not (number % 2 and front.junction_indices):
                 # In a turn there is no room for houses.
-                yield Side(
-                    "open" if number % 2 else zone, _beside(street, x_m, front.side * (front.kerb_m + sidewalk_m))
+                yield StreetSide(
+                    "open" if number % 2 else zone,
+                    _beside(street, x_m, front.side * (front.curb_offset_m + sidewalk_m)),
                 )
 
     def _end(
@@ -137,17 +155,27 @@ class City(NamedTuple):
         Where the main street turns away, its sidewalk goes on around the turn, and the block as far as the street that
         goes straight on.
         """
-        index, corner_m, inwards = front.junctions[end], front.x_m[end], 1 - 2 * end
-        deep_m = float(site.depth_m(np.array([corner_m]), front.side, front.kerb_m, BLOCK_DEPTH_M)[0])
-        y_m = front.side * (front.kerb_m + np.array([0.0, FREE_AT_CORNERS_M, max(deep_m, 2 * FREE_AT_CORNERS_M)]))
-        face_m, sidewalk_m = site.street.poses(corner_m, y_m)[:, :2], self.streets.section.sidewalk_m
+        index, corner_m, inwards = front.junction_indices[end], front.span_m[end], 1 - 2 * end
+        deep_m = float(site.compute_depths_m(np.array([corner_m]), front.side, front.curb_offset_m, BLOCK_DEPTH_M)[0])
+        y_m = front.side * (
+            front.curb_offset_m + np.array([0.0, FREE_AT_CORNERS_M, max(deep_m, 2 * FREE_AT_CORNERS_M)])
+        )
+        face_m, sidewalk_m = (
+            site.street.compute_poses(corner_m, y_m)[:, :2],
+            self.streets.cross_section.sidewalk_width_m,
+        )
         inside_m = -inwards * front.side * sidewalk_m
-        if not self.streets.course.turns[index]:
+        if not self.streets.main_street.turn_directions[index]:
             return face_m[1:], [] if is_built else [_strip(face_m, inside_m)]
-        middle_m, half_m = float(self.streets.junctions_m[index]), float(self.streets.course.halves_m[index])
-        around_m = site.street.poses(np.linspace(corner_m, middle_m, 17), front.side * front.kerb_m)[:, :2]
-        way_m, kerb_m = np.linspace(-half_m, half_m + CORNER_M, 97), float(self.streets.carriageways_m[index])
-        line_m = self.streets.crossing[index].poses(-inwards * way_m, 0.0)[:, :2]
+        middle_m, half_m = (
+            float(self.streets.junction_stations_m[index]),
+            float(self.streets.main_street.junction_half_lengths_m[index]),
+        )
+        around_m = site.street.compute_poses(np.linspace(corner_m, middle_m, 17), front.side * front.curb_offset_m)[
+            :, :2
+        ]
+        way_m, kerb_m = np.linspace(-half_m, half_m + CORNER_M, 97), float(self.streets.cross_curb_offsets_m[index])
+        line_m = self.streets.cross_streets[index].compute_poses(-inwards * way_m, 0.0)[:, :2]
         ahead = (line_m[-1] - line_m[-2]) / np.linalg.norm(line_m[-1] - line_m[-2])
         onto_m = line_m[-1] + ((face_m[1:] - line_m[-1]) @ ahead)[:, None] * ahead
         opposite_m = line_m[(way_m >= 0.0) & ((line_m - onto_m[-1]) @ ahead < 0.0)]
@@ -156,7 +184,7 @@ class City(NamedTuple):
         area = area.difference(street.buffer(kerb_m, cap_style="flat"))
         if not is_built:
             area = area.intersection(street.buffer(kerb_m + sidewalk_m))
-        left_m = inwards * int(self.streets.course.turns[index]) * kerb_m
+        left_m = inwards * int(self.streets.main_street.turn_directions[index]) * kerb_m
         return onto_m + left_m * np.array([-ahead[1], ahead[0]]), [area, _strip(around_m, inside_m)]
 
     def _between(self, whole: shapely.Geometry, streets: shapely.Geometry) -> shapely.Geometry:
@@ -168,15 +196,19 @@ class City(NamedTuple):
 
     def _ground(self, seen_m: Bounds) -> Mesh:
         """Under everything: as far as lanes go, or as far as it can be seen."""
-        if self.hills.are_flat:
-            reach = self.streets.reach_m + 200.0
-            return ground((-reach, -reach), (reach, reach))
-        way_m = self.streets.main.poses(np.arange(*seen_m, WAY_EVERY_M), 0.0)[:, :2]
-        return self.hills.mesh(way_m, GROUND_M)
+        if self.hills.is_flat:
+            reach = self.streets.half_length_m + 200.0
+            return build_ground_plane((-reach, -reach), (reach, reach))
+        way_m = self.streets.main_alignment.compute_poses(np.arange(*seen_m, WAY_EVERY_M), 0.0)[:, :2]
+        return self.hills.build_mesh(way_m, GROUND_M)
 
     def _frontages(self, seen_m: Bounds) -> Iterator[Frontage]:
         """Both sides of the main street from kerb to kerb."""
-        turns, middles, halves = self.streets.course.turns, self.streets.junctions_m, self.streets.course.halves_m
+        turns, middles, halves = (
+            self.streets.main_street.turn_directions,
+            self.streets.junction_stations_m,
+            self.streets.main_street.junction_half_lengths_m,
+        )
         starts, ends = (middles - halves).tolist(), (middles + halves).tolist()
         for west in range(len(turns) - 1):
             for side in (1, -1):
@@ -186,20 +218,32 @@ class City(NamedTuple):
                     east += 1
                 if turns[west] != side and starts[east] > seen_m[0] and ends[west] < seen_m[1]:
                     turns_m = tuple((starts[k], ends[k]) for k in range(west + 1, east))
-                    yield Frontage((ends[west], starts[east]), side, self.streets.section.kerb_m, turns_m, (west, east))
+                    yield Frontage(
+                        (ends[west], starts[east]),
+                        side,
+                        self.streets.cross_section.curb_offset_m,
+                        turns_m,
+                        (west, east),
+                    )
 
     def _corner(self, index: int) -> tuple[BuildingSite, Frontage]:
         """The block between the two streets that meet the main street in a turn."""
-        street, half_m = self.streets.crossing[index], float(self.streets.course.halves_m[index])
-        kerb_m = float(self.streets.carriageways_m[index])
-        side, middle_m = int(self.streets.course.turns[index]), float(self.streets.junctions_m[index])
+        street, half_m = (
+            self.streets.cross_streets[index],
+            float(self.streets.main_street.junction_half_lengths_m[index]),
+        )
+        kerb_m = float(self.streets.cross_curb_offsets_m[index])
+        side, middle_m = (
+            int(self.streets.main_street.turn_directions[index]),
+            float(self.streets.junction_stations_m[index]),
+        )
         span_m = (-half_m - CORNER_M, half_m + CORNER_M)
-        site = BuildingSite(street, Territory(street, span_m), self.hills, kerb_m + CORNER_DEPTH_M + 10.0)
+        site = BuildingSite(street, StreetCorridor(street, span_m), self.hills, kerb_m + CORNER_DEPTH_M + 10.0)
         # As far as it is opposite of the turn, and not of another one.
         x = np.arange(*span_m, 5.0)
         foreign = np.zeros(len(x), dtype=bool)
         for y in (kerb_m, kerb_m + CORNER_DEPTH_M):
-            nearest_m = self.territory.nearest(street.poses(x, side * y)[:, :2])
+            nearest_m = self.corridor.find_nearest_stations_m(street.compute_poses(x, side * y)[:, :2])
             foreign |= np.abs(nearest_m - middle_m) > half_m + SAMPLE_EVERY_M
         foreign &= np.abs(x) > half_m
         before, behind = x[foreign & (x < 0.0)], x[foreign & (x > 0.0)]
@@ -213,16 +257,16 @@ class City(NamedTuple):
         """
         cars: list[tuple[str, float, float, float]] = []
         uniform, free_m = self.generator.uniform, FREE_AT_CORNERS_M
-        bay_m = self.streets.section.bay_m if front.junctions else LANE_SIDE_M
-        x, end = front.x_m[0] + FREE_AT_CORNERS_M, front.x_m[1] - FREE_AT_CORNERS_M
+        bay_m = self.streets.cross_section.bay_width_m if front.junction_indices else LANE_SIDE_M
+        x, end = front.span_m[0] + FREE_AT_CORNERS_M, front.span_m[1] - FREE_AT_CORNERS_M
         while x < end and bay_m:
-            kind = self.fleet.draw_kind(PARKED)
-            length = self.fleet.length_m(kind) + PARKED_GAP_M + uniform(0.0, 0.5)
+            kind = self.fleet.sample_kind(PARKED)
+            length = self.fleet.get_length_m(kind) + PARKED_GAP_M + uniform(0.0, 0.5)
             if self.generator.random() < self.parked_share and x + length < end:
-                slack = max((bay_m - self.fleet.width_m(kind)) / 2 - 0.08, 0.0)
-                y = front.side * (front.kerb_m - bay_m / 2 + uniform(0.0, slack))
+                slack = max((bay_m - self.fleet.get_width_m(kind)) / 2 - 0.08, 0.0)
+                y = front.side * (front.curb_offset_m - bay_m / 2 + uniform(0.0, slack))
                 yaw = (0.0 if front.side == -1 else 180.0) + uniform(-0.4, 0.4)
-                if all(x >= last + free_m or x + length <= first - free_m for first, last in front.turns_m):
+                if all(x >= last + free_m or x + length <= first - free_m for first, last in front.turn_spans_m):
                     cars.append((kind, x + length / 2, y, yaw))
             x += length
         return cars
@@ -234,13 +278,13 @@ class City(NamedTuple):
             if of_front:
                 names, x_m, y_m, yaw_deg = zip(*of_front, strict=True)
                 kinds += names
-                found.append(site.street.poses(x_m, np.array(y_m)) + np.outer(yaw_deg, (0.0, 0.0, 1.0)))
+                found.append(site.street.compute_poses(x_m, np.array(y_m)) + np.outer(yaw_deg, (0.0, 0.0, 1.0)))
         if not kinds:
             return
         poses = np.concatenate(found)
-        stances = self.hills.stances(poses[:, :2], poses[:, 2])
+        stances = self.hills.compute_heights_and_tilts(poses[:, :2], poses[:, 2])
         for kind, (x, y, yaw), (height_m, *tilt_deg) in zip(kinds, poses.tolist(), stances.tolist(), strict=True):
-            self.fleet.park(kind, (x, y, yaw), height_m, (tilt_deg[0], tilt_deg[1]))
+            self.fleet.add_parked_vehicle(kind, (x, y, yaw), height_m, (tilt_deg[0], tilt_deg[1]))
 
 
 def _strip(line_m: Float64, left_m: float) -> shapely.Geometry:
@@ -248,15 +292,15 @@ def _strip(line_m: Float64, left_m: float) -> shapely.Geometry:
     return shapely.buffer(shapely.LineString(line_m), left_m, single_sided=True, join_style="mitre")
 
 
-def _across(kerb_m: Float64, sidewalk_m: float, zone: Zone) -> Iterator[Side]:
+def _across(kerb_m: Float64, sidewalk_m: float, zone: Zone) -> Iterator[StreetSide]:
     """Along a cross street, whose kerb has the street on its left: at the kerb, and behind the sidewalk."""
     ahead = (kerb_m[1] - kerb_m[0]) / np.linalg.norm(kerb_m[1] - kerb_m[0])
-    yield Side("kerb", kerb_m)
-    yield Side(zone, kerb_m + sidewalk_m * np.array([ahead[1], -ahead[0]]))
+    yield StreetSide("kerb", kerb_m)
+    yield StreetSide(zone, kerb_m + sidewalk_m * np.array([ahead[1], -ahead[0]]))
 
 
 def _beside(street: Alignment, x_m: Bounds, left_m: float) -> Float64:
     """(K, 2) places beside a street, with the street on their left."""
     pieces = 1 if street.is_straight else int(np.ceil((x_m[1] - x_m[0]) / STREET_EVERY_M))
-    points_m: Float64 = street.poses(np.linspace(*x_m, pieces + 1), left_m)[:, :2]
+    points_m: Float64 = street.compute_poses(np.linspace(*x_m, pieces + 1), left_m)[:, :2]
     return points_m if left_m < 0 else points_m[::-1]

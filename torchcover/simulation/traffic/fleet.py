@@ -13,27 +13,27 @@ from torchcover.geometry.arrays import Float64
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation.bodies import Vehicle
 from torchcover.simulation.shapes import Mesh
-from torchcover.simulation.traffic.flow import Agent, Gate
+from torchcover.simulation.traffic.flow import Agent, JunctionPassage
 from torchcover.simulation.traffic.idm import Driver
 from torchcover.simulation.world import Actor
 
 
 class Hitch(NamedTuple):
-    """How a body draws another one along, of kind `rear`, whose axles never slip sideways.
+    """How a body draws another one along, of kind `trailer_kind`, whose axles never slip sideways.
 
-    The middle of the front is `ahead_m` before that of both, on a straight, and the hitch `hitch_m` before the middle
-    of the front, negative behind it. From the hitch, the axles of the rear are `rod_m` back, and its middle `middle_m`.
+    The middle of the front is `center_offset_m` before that of both, on a straight, and the hitch `hitch_offset_m` before the middle
+    of the front, negative behind it. From the hitch, the axles of the rear are `hitch_to_axle_m` back, and its middle `hitch_to_center_m`.
     """
 
-    rear: str
-    ahead_m: float
-    hitch_m: float
-    rod_m: float
-    middle_m: float
+    trailer_kind: str
+    center_offset_m: float
+    hitch_offset_m: float
+    hitch_to_axle_m: float
+    hitch_to_center_m: float
 
-    def hitches_m(self, poses: Float64) -> Float64:
+    def compute_hitch_positions_m(self, poses: Float64) -> Float64:
         """(T, 2) where the hitch is, at (T, 3) poses x, y and heading in radians of the front."""
-        return _shifted_m(poses, self.hitch_m)[:, :2]
+        return _shifted_m(poses, self.hitch_offset_m)[:, :2]
 
 
 # At the limits of EU Directive 96/53/EC the kingpin is 12 m before the rear end, and the front of the trailer turns
@@ -41,40 +41,44 @@ class Hitch(NamedTuple):
 DRAWS: Mapping[str, Hitch] = {"truck": Hitch("trailer", 4.925, -1.175, 8.41, 5.2)}
 
 
-def rears_of(kinds: Sequence[str], poses: Sequence[Float64], start: Sequence[float] | None = None) -> list[Float64]:
+def compute_trailer_poses(
+    kinds: Sequence[str], front_poses: Sequence[Float64], initial_yaw_rad: Sequence[float] | None = None
+) -> list[Float64]:
     """(T, 3) poses x, y and heading in radians of what N bodies of these kinds draw along, whose own are likewise.
 
-    T may differ. `start` are headings of the rears at first; straight behind if not given.
+    T may differ. `initial_yaw_rad` are headings of the rears at first; straight behind if not given.
     """
     if not kinds:
         return []
     hitches = [DRAWS[kind] for kind in kinds]
-    leads_m = [hitch.hitches_m(own) for hitch, own in zip(hitches, poses, strict=True)]
-    first = np.array([own[0, 2] for own in poses] if start is None else start)
-    yaws = tractrix(together(leads_m), np.array([hitch.rod_m for hitch in hitches]), first).T
+    leads_m = [hitch.compute_hitch_positions_m(own) for hitch, own in zip(hitches, front_poses, strict=True)]
+    first = np.array([own[0, 2] for own in front_poses] if initial_yaw_rad is None else initial_yaw_rad)
+    yaws = compute_tractrix_yaw_rad(
+        stack_paths(leads_m), np.array([hitch.hitch_to_axle_m for hitch in hitches]), first
+    ).T
     return [
-        _shifted_m(np.column_stack([lead_m, yaw[: len(lead_m)]]), -hitch.middle_m)
+        _shifted_m(np.column_stack([lead_m, yaw[: len(lead_m)]]), -hitch.hitch_to_center_m)
         for hitch, lead_m, yaw in zip(hitches, leads_m, yaws, strict=True)
     ]
 
 
-def together(ways_m: Sequence[Float64]) -> Float64:
+def stack_paths(paths_m: Sequence[Float64]) -> Float64:
     """(T, N, 2) N ways, of which each stays at its end until the longest is there."""
-    longest = max(map(len, ways_m))
-    return np.stack([np.pad(way_m, ((0, longest - len(way_m)), (0, 0)), "edge") for way_m in ways_m], axis=1)
+    longest = max(map(len, paths_m))
+    return np.stack([np.pad(way_m, ((0, longest - len(way_m)), (0, 0)), "edge") for way_m in paths_m], axis=1)
 
 
-def tractrix(lead_m: Float64, length_m: Float64, yaw: Float64) -> Float64:
+def compute_tractrix_yaw_rad(lead_positions_m: Float64, rod_lengths_m: Float64, initial_yaw_rad: Float64) -> Float64:
     """(T, N) headings in radians, without leaps, of N rods that are drawn along at their front ends, (T, N, 2).
 
     Their rear ends never slip sideways. Exact for ways of straight pieces: with the angle a between rod and way, tan(a
     / 2) falls by exp(-way / length).
     """
-    ways_m = np.diff(lead_m, axis=0)
+    ways_m = np.diff(lead_positions_m, axis=0)
     towards = np.arctan2(ways_m[..., 1], ways_m[..., 0])
-    falls = np.exp(-np.hypot(ways_m[..., 0], ways_m[..., 1]) / length_m)
-    found = np.empty(lead_m.shape[:2])
-    found[0] = yaw
+    falls = np.exp(-np.hypot(ways_m[..., 0], ways_m[..., 1]) / rod_lengths_m)
+    found = np.empty(lead_positions_m.shape[:2])
+    found[0] = initial_yaw_rad
     for k, (toward, fall) in enumerate(zip(towards, falls, strict=True)):
         half = np.tan((toward - found[k]) / 2)
         found[k + 1] = found[k] + 2 * (np.arctan(half) - np.arctan(half * fall))
@@ -99,7 +103,7 @@ class VehicleType(NamedTuple):
     vehicle_class: str
     length_m: float
 
-    def body(self, lengths_m: Mapping[str, float]) -> str | None:
+    def find_body(self, lengths_m: Mapping[str, float]) -> str | None:
         """The body whose length is nearest among those of the class; None if there is none of this class."""
         if self.vehicle_class in LEFT_OUT:
             return None
@@ -165,51 +169,63 @@ def load_bodies() -> Mapping[str, Mesh]:
 class Fleet:
     """The bodies of a world, and the drivers drawn for them. ValueError: a kind has no body."""
 
-    def __init__(self, bodies: Mapping[str, Mesh], ego: Mesh | None, generator: np.random.Generator) -> None:
-        missing = sorted(CATEGORIES.keys() - bodies.keys())
+    def __init__(self, body_meshes: Mapping[str, Mesh], ego_mesh: Mesh | None, generator: np.random.Generator) -> None:
+        missing = sorted(CATEGORIES.keys() - body_meshes.keys())
         if missing:
             raise ValueError(f"traffic needs a body for each kind; there is none for {', '.join(missing)}")
-        self.meshes = {EGO: bodies["suv"] if ego is None else ego, **{kind: bodies[kind] for kind in CATEGORIES}}
+        self.meshes = {
+            EGO: body_meshes["suv"] if ego_mesh is None else ego_mesh,
+            **{kind: body_meshes[kind] for kind in CATEGORIES},
+        }
         self._sizes = {kind: BoundingBox.from_points(mesh.vertices_m).size_m for kind, mesh in self.meshes.items()}
         self._lengths_m = {kind: self._length_m(kind) for kind in self.meshes}  # asked thousands of times a world
         self._generator = generator
         self.parked: list[Actor] = []
-        self.left_out = 0
+        self.omitted_count = 0
 
-    def length_m(self, kind: str) -> float:
+    def get_length_m(self, kind: str) -> float:
         """Extent along x, on a straight with all that it draws along."""
         return self._lengths_m[kind]
 
     def _length_m(self, kind: str) -> float:
-        parts_m = [length_m for length_m, _ in self.sizes_m(kind)]
-        return sum(parts_m) / 2 - DRAWS[kind].hitch_m + DRAWS[kind].middle_m if kind in DRAWS else parts_m[0]
+        parts_m = [length_m for length_m, _ in self.get_sizes_m(kind)]
+        return (
+            sum(parts_m) / 2 - DRAWS[kind].hitch_offset_m + DRAWS[kind].hitch_to_center_m
+            if kind in DRAWS
+            else parts_m[0]
+        )
 
-    def sizes_m(self, kind: str) -> tuple[tuple[float, float], ...]:
+    def get_sizes_m(self, kind: str) -> tuple[tuple[float, float], ...]:
         """Lengths and widths of the body and of what it draws along."""
-        return tuple(self._sizes[part][:2] for part in parts_of(kind))
+        return tuple(self._sizes[part][:2] for part in get_part_kinds(kind))
 
-    def width_m(self, kind: str) -> float:
+    def get_width_m(self, kind: str) -> float:
         """Extent along y."""
         return self._sizes[kind][1]
 
-    def draw_kind(self, mix: Mapping[str, float]) -> str:
+    def sample_kind(self, weights: Mapping[str, float]) -> str:
         """One kind, each with a probability in proportion to its weight, in one of its sizes."""
-        names, up_to = _bodies_of(tuple(mix), tuple(mix.values()))
+        names, up_to = _bodies_of(tuple(weights), tuple(weights.values()))
         return names[bisect_right(up_to, self._generator.random())]
 
-    def draw_driver(self, typical: Driver, spread: float) -> Driver:
-        """A driver whose desired speed differs from the typical one by up to `spread`, a share of it."""
+    def sample_driver(self, typical_driver: Driver, speed_spread: float) -> Driver:
+        """A driver whose desired speed differs from the typical one by up to `speed_spread`, a share of it."""
         # As `uniform` would, which takes thrice as long.
-        share = 1 - spread + (1 + spread - (1 - spread)) * self._generator.random()
-        desired_mps = float(typical.desired_speed_mps * share)
-        rest = typical.headway_s, typical.standstill_gap_m, typical.acceleration_mps2, typical.deceleration_mps2
+        share = 1 - speed_spread + (1 + speed_spread - (1 - speed_spread)) * self._generator.random()
+        desired_mps = float(typical_driver.desired_speed_mps * share)
+        rest = (
+            typical_driver.headway_s,
+            typical_driver.standstill_gap_m,
+            typical_driver.acceleration_mps2,
+            typical_driver.deceleration_mps2,
+        )
         return Driver(desired_mps, *rest)  # by hand: there are thousands of them in a world
 
-    def agent(self, kind: str, lane: int, place_m: float, driver: Driver) -> Agent:
+    def create_agent(self, kind: str, lane_index: int, lane_position_m: float, driver: Driver) -> Agent:
         """Somebody of a kind on a lane."""
-        return Agent(kind, self.length_m(kind), lane, place_m, driver)
+        return Agent(kind, self.get_length_m(kind), lane_index, lane_position_m, driver)
 
-    def park(
+    def add_parked_vehicle(
         self,
         kind: str,
         pose: tuple[float, float, float],
@@ -221,47 +237,49 @@ class Fleet:
         place = Trajectory.create_static((x_m, y_m, height_m), (yaw_deg, *tilt_deg))
         self.parked.append(Actor(f"parked {kind} {len(self.parked)}", CATEGORIES[kind], self.meshes[kind], place))
 
-    def fill(
+    def fill_lane(
         self,
-        lane: int,
+        lane_index: int,
         span_m: tuple[float, float],
-        per_km: float,
+        density_per_km: float,
         drivers: Mapping[str, tuple[float, Driver]],
         *,
-        gates: Sequence[Gate] = (),
-        keep_free: Sequence[Agent] = (),
-        spread: float = 0.12,
-        heavy_spread: float = 0.12,
+        passages: Sequence[JunctionPassage] = (),
+        existing_agents: Sequence[Agent] = (),
+        speed_spread: float = 0.12,
+        heavy_speed_spread: float = 0.12,
     ) -> list[Agent]:
-        """Fill a lane with agents at random gaps, `per_km` as far as they fit at full speed; nobody on a junction.
+        """Fill a lane with agents at random gaps, `density_per_km` as far as they fit at full speed; nobody on a junction.
 
-        The fronts and rears of all lie in `span_m` on it, clear of `keep_free`, who are there already. `drivers` are
-        the weight and the typical driver of each kind that uses the lane, `gates` the junctions on it; speeds spread by
-        `spread`, those of lorries and buses by `heavy_spread`.
+        The fronts and rears of all lie in `span_m` on it, clear of `existing_agents`, who are there already. `drivers` are
+        the weight and the typical driver of each kind that uses the lane, `passages` the junctions on it; speeds spread by
+        `speed_spread`, those of lorries and buses by `heavy_speed_spread`.
         """
         mix = {kind: weight for kind, (weight, _) in drivers.items()}
         agents: list[Agent] = []
-        others = [other for other in keep_free if other.lane == lane]
+        others = [other for other in existing_agents if other.lane_index == lane_index]
         rear = span_m[0]
-        while per_km > 0:
-            kind = self.draw_kind(mix)
-            driver = self.draw_driver(drivers[KIND_OF[kind]][1], heavy_spread if KIND_OF[kind] in HEAVY else spread)
+        while density_per_km > 0:
+            kind = self.sample_kind(mix)
+            driver = self.sample_driver(
+                drivers[KIND_OF[kind]][1], heavy_speed_spread if KIND_OF[kind] in HEAVY else speed_spread
+            )
             # What one keeps at full speed, so that nobody has to brake at first.
             gap = float(driver.standstill_gap_m + driver.headway_s * driver.desired_speed_mps)
-            length = self.length_m(kind)
-            rear += gap + self._generator.exponential(max(1000.0 / per_km - gap - length, 0.1))
+            length = self.get_length_m(kind)
+            rear += gap + self._generator.exponential(max(1000.0 / density_per_km - gap - length, 0.1))
             if rear + length > span_m[1]:
                 break
-            agent = self.agent(kind, lane, rear + length / 2, driver)
-            if not _in_the_way(agent, gates, gap, others):
+            agent = self.create_agent(kind, lane_index, rear + length / 2, driver)
+            if not _in_the_way(agent, passages, gap, others):
                 agents.append(agent)
             rear += length
         return agents
 
 
-def parts_of(kind: str) -> tuple[str, ...]:
+def get_part_kinds(kind: str) -> tuple[str, ...]:
     """A kind, and that of what it draws along."""
-    return (kind, DRAWS[kind].rear) if kind in DRAWS else (kind,)
+    return (kind, DRAWS[kind].trailer_kind) if kind in DRAWS else (kind,)
 
 
 @lru_cache(maxsize=64)
@@ -273,10 +291,13 @@ def _bodies_of(kinds: tuple[str, ...], weights: tuple[float, ...]) -> tuple[list
     return [name for names in sizes for name in names], (up_to / up_to[-1]).tolist()
 
 
-def _in_the_way(agent: Agent, gates: Sequence[Gate], gap_m: float, others: Sequence[Agent]) -> bool:
-    rear, front = agent.place_m - agent.length_m / 2, agent.place_m + agent.length_m / 2
+def _in_the_way(agent: Agent, gates: Sequence[JunctionPassage], gap_m: float, others: Sequence[Agent]) -> bool:
+    rear, front = agent.lane_position_m - agent.length_m / 2, agent.lane_position_m + agent.length_m / 2
     # Gates follow each other: of those that are not behind, the first is the nearest.
     gate = bisect_right(gates, rear, key=lambda gate: gate.exit_m)
-    if gate < len(gates) and front > gates[gate].enter_m - gap_m:
+    if gate < len(gates) and front > gates[gate].stop_line_m - gap_m:
         return True
-    return any(abs(agent.place_m - other.place_m) < (agent.length_m + other.length_m) / 2 + gap_m for other in others)
+    return any(
+        abs(agent.lane_position_m - other.lane_position_m) < (agent.length_m + other.length_m) / 2 + gap_m
+        for other in others
+    )

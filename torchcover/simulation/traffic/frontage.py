@@ -15,7 +15,7 @@ from pydantic import AfterValidator
 from torchcover.geometry.arrays import Bools, Float64, Int64
 from torchcover.simulation.bodies import merge_meshes
 from torchcover.simulation.shapes import Mesh, compute_circle_points
-from torchcover.simulation.traffic.scenery import PAVEMENT_M, block, prism
+from torchcover.simulation.traffic.scenery import PAVEMENT_M, build_box_from_bounds, build_prism
 
 Bounds = tuple[float, float]
 Zone = Literal["kerb", "built", "open"]
@@ -91,68 +91,74 @@ def _known(times: float | Mapping[str, float]) -> float | Mapping[str, float]:
 
 
 # How many times as much there is as usually of all kinds but houses, or of some of them.
-Times = Annotated[float | dict[str, float], AfterValidator(_known)]
+RoadsideDensity = Annotated[float | dict[str, float], AfterValidator(_known)]
 
 
-class Side(NamedTuple):
+class StreetSide(NamedTuple):
     """A side of a street in a zone: a line of (K, 2) places that has the street on its left."""
 
     zone: Zone
     line_m: Float64
 
 
-def sides_around(
-    street: shapely.Geometry,
-    off_m: tuple[float, float],
-    sees: Callable[[Float64], Bools],
+def find_street_sides(
+    street_area: shapely.Geometry,
+    offsets_m: tuple[float, float],
+    is_visible: Callable[[Float64], Bools],
     built_share: float,
     generator: np.random.Generator,
-) -> list[Side]:
+) -> list[StreetSide]:
     """The sides of all streets that are known in plan only, a drawn share of them built up.
 
-    `off_m` is how far beyond its edge kerb furniture begins, and what stands behind it; `sees` which (N, 2) places
+    `offsets_m` is how far beyond its edge kerb furniture begins, and what stands behind it; `is_visible` which (N, 2) places
     matter.
     """
-    sides: list[Side] = []
-    for number, away_m in enumerate(off_m):
-        area = shapely.orient_polygons(shapely.buffer(street, away_m, quad_segs=4))
+    sides: list[StreetSide] = []
+    for number, away_m in enumerate(offsets_m):
+        area = shapely.orient_polygons(shapely.buffer(street_area, away_m, quad_segs=4))
         for ring in shapely.get_parts(shapely.boundary(area)):
             line_m = shapely.get_coordinates(shapely.segmentize(ring.simplify(SMOOTH_M), CORNER_EVERY_M))
             for side_m in (
                 np.array_split(line_m, max(round(ring.length / SIDE_M), 1)) if ring.length > SHORTEST_M else ()
             ):
                 zone: Zone = "built" if generator.random() < built_share else "open"
-                if len(side_m) > 1 and sees(side_m).all():
-                    sides.append(Side(zone if number else "kerb", side_m))
+                if len(side_m) > 1 and is_visible(side_m).all():
+                    sides.append(StreetSide(zone if number else "kerb", side_m))
     return sides
 
 
-def stand(
-    sides: Sequence[Side],
-    driven: Sequence[shapely.Geometry],
-    walked: Sequence[shapely.Geometry],
-    pavements: Sequence[shapely.Geometry],
-    heights_m: Callable[[Float64], Float64],
-    times: float | Mapping[str, float],
+def place_scenery(
+    sides: Sequence[StreetSide],
+    drivable_areas: Sequence[shapely.Geometry],
+    walkable_areas: Sequence[shapely.Geometry],
+    sidewalk_areas: Sequence[shapely.Geometry],
+    compute_ground_heights_m: Callable[[Float64], Float64],
+    density_factors: float | Mapping[str, float],
     generator: np.random.Generator,
 ) -> tuple[list[Mesh], list[Mesh]]:
     """Draw what stands along the sides of streets: houses and all else, each kind in one mesh; see `Times`.
 
-    In plan, nothing at kerbs may stand on what is `driven`, nor anything behind sidewalks on what is `walked`;
-    `pavements` are a kerb higher than the ground, whose heights `heights_m` gives at (N, 2) places.
+    In plan, nothing at kerbs may stand on what is `drivable_areas`, nor anything behind sidewalks on what is `walkable_areas`;
+    `sidewalk_areas` are a kerb higher than the ground, whose heights `compute_ground_heights_m` gives at (N, 2) places.
     """
     if not sides:
         return [], []
     lines = _Lines(sides)
     drawn = []
     for name, kind in KINDS.items():
-        factor = times.get(name, 1.0) if isinstance(times, Mapping) else 1.0 if name in HOUSES else times
+        factor = (
+            density_factors.get(name, 1.0)
+            if isinstance(density_factors, Mapping)
+            else 1.0
+            if name in HOUSES
+            else density_factors
+        )
         drawn.append(_drawn(kind, lines, factor, generator))
     kinds = np.repeat(np.arange(len(KINDS)), [len(run) for _, _, run in drawn])
     outlines_m, high_m, run = (np.concatenate(column) for column in zip(*drawn, strict=True))
-    kept, raised_m = _free(outlines_m, kinds, run, driven, walked, pavements)
+    kept, raised_m = _free(outlines_m, kinds, run, drivable_areas, walkable_areas, sidewalk_areas)
     outlines_m, high_m, kinds, raised_m = outlines_m[kept], high_m[kept], kinds[kept], raised_m[kept]
-    corners_m = heights_m(outlines_m.reshape(-1, 2)).reshape(-1, 4)
+    corners_m = compute_ground_heights_m(outlines_m.reshape(-1, 2)).reshape(-1, 4)
     low_m, base_m = corners_m.min(axis=1) + raised_m, corners_m.max(axis=1) + raised_m
     bottom_m = np.where(base_m > low_m, low_m - SUNK_M, low_m)
     houses: list[Mesh] = []
@@ -168,7 +174,7 @@ def stand(
 class _Lines:
     """The lines of sides on one axis: each begins where the last one ended."""
 
-    def __init__(self, sides: Sequence[Side]) -> None:
+    def __init__(self, sides: Sequence[StreetSide]) -> None:
         self.zones = [side.zone for side in sides]
         count = np.array([len(side.line_m) for side in sides])
         self._first = np.cumsum(count) - count
@@ -312,32 +318,32 @@ def _form(name: str) -> Mesh:
     middle = np.array([0.5, 0.5])
 
     def turned(levels: Sequence[float], sizes: Sequence[float]) -> Mesh:
-        return prism([middle + size * ring for size in sizes], levels)
+        return build_prism([middle + size * ring for size in sizes], levels)
 
     def wheel(x: float) -> Mesh:
         around = np.array([x, 0.0]) + np.array([0.4, 0.65]) * (ring / np.array([1.0, np.sqrt(0.75)]) + 0.5)
-        disc = prism([around, around], [0.46, 0.54])
+        disc = build_prism([around, around], [0.46, 0.54])
         return Mesh(disc.vertices_m[:, [0, 2, 1]], disc.faces[:, ::-1])
 
     parts = {
-        "house": [block(*whole)],
-        "hedge": [block(*whole).assign_material("vegetation")],
-        "fence": [block(*whole).assign_material("wood")],
-        "bin": [block(*whole).assign_material("metal")],
+        "house": [build_box_from_bounds(*whole)],
+        "hedge": [build_box_from_bounds(*whole).assign_material("vegetation")],
+        "fence": [build_box_from_bounds(*whole).assign_material("wood")],
+        "bin": [build_box_from_bounds(*whole).assign_material("metal")],
         "bollard": [turned([0.0, 1.0], [1.0, 1.0]).assign_material("metal")],
-        "lamp": [turned([0.0, 0.97], [1.0, 0.7]).assign_material("metal"), block((0.2, 0.8), (0.0, 11.0), (0.975, 1.0))],
+        "lamp": [turned([0.0, 0.97], [1.0, 0.7]).assign_material("metal"), build_box_from_bounds((0.2, 0.8), (0.0, 11.0), (0.975, 1.0))],
         "tree": [
             turned([0.0, 0.42], [TRUNK, TRUNK]).assign_material("wood"),
             turned([0.42, 0.6, 0.8, 1.0], [0.45, 1.0, 0.9, 0.3]).assign_material("vegetation"),
         ],
         "bush": [turned([0.0, 0.4, 0.8, 1.0], [0.7, 1.0, 0.9, 0.4]).assign_material("vegetation")],
         "sign": [
-            block((0.0, 1.0), (0.45, 0.55), (0.0, 0.75)).assign_material("metal"),
-            block((0.2, 0.8), (0.0, 1.0), (0.755, 1.0)).assign_material("sign"),
+            build_box_from_bounds((0.0, 1.0), (0.45, 0.55), (0.0, 0.75)).assign_material("metal"),
+            build_box_from_bounds((0.2, 0.8), (0.0, 1.0), (0.755, 1.0)).assign_material("sign"),
         ],
         "bicycle": [
-            wheel(0.0), wheel(0.6), block((0.42, 0.58), (0.44, 0.56), (0.25, 0.88)),
-            block((0.66, 0.7), (0.0, 1.0), (0.94, 1.0)),
+            wheel(0.0), wheel(0.6), build_box_from_bounds((0.42, 0.58), (0.44, 0.56), (0.25, 0.88)),
+            build_box_from_bounds((0.66, 0.7), (0.0, 1.0), (0.94, 1.0)),
         ],
     }  # fmt: skip
     return merge_meshes(parts[name])

@@ -30,7 +30,7 @@ class Traffic(Document):
     time_step_s: Annotated[float, Field(ge=MIN_TIME_STEP_S)] = 0.1
 
     @property
-    def drawn_words(self) -> str:
+    def sampling_note(self) -> str:
         """What of a recording was not recorded, for results; no words where all is drawn, or nothing."""
         return ""
 
@@ -50,13 +50,13 @@ class Traffic(Document):
 # Streets are as long as the ego's way: what moves on them grows with the square of the duration.
 MAX_DURATION_S = 3600.0
 # To a kilometre of a lane; more have no room.
-MostVehicles = Annotated[float, Field(ge=0.0, le=200.0)]
-MostPeople = Annotated[float, Field(ge=0.0, le=1000.0)]
+VehiclesPerKm = Annotated[float, Field(ge=0.0, le=200.0)]
+PeoplePerKm = Annotated[float, Field(ge=0.0, le=1000.0)]
 # What rests, the ego, and who else moves.
-Built = tuple[Scenery, Actor, tuple[Actor, ...]]
+SceneParts = tuple[Scenery, Actor, tuple[Actor, ...]]
 
 
-class Procedural(Traffic):
+class ProceduralTraffic(Traffic):
     """Traffic that is made from parameters and a seed.
 
     Args:
@@ -80,14 +80,14 @@ class Procedural(Traffic):
         times_s = self.time_step_s * np.arange(steps + 1, dtype=np.float64)
         scenery, driver, others = self._build(fleet, times_s, generator)
         return Scene(
-            static_meshes=scenery.static,
+            static_meshes=scenery.static_meshes,
             ego=driver,
             actors=others,
             time_step_s=self.time_step_s,
             duration_s=self.duration_s,
             static_actors=tuple(fleet.parked),
-            ground_mesh_indices=scenery.ground,
-            num_omitted_road_users=fleet.left_out,
+            ground_mesh_indices=scenery.ground_indices,
+            num_omitted_road_users=fleet.omitted_count,
         )
 
     def collect_content(self) -> dict[str, Any]:
@@ -100,5 +100,5 @@ class Procedural(Traffic):
         return count_time_steps(self.duration_s, self.time_step_s)
 
     @abstractmethod
-    def _build(self, fleet: Fleet, times_s: Float64, generator: np.random.Generator) -> Built:
+    def _build(self, fleet: Fleet, times_s: Float64, generator: np.random.Generator) -> SceneParts:
         """What rests, the ego, and who else moves, at (T,) times from 0 to the end, T >= 2."""

@@ -14,8 +14,14 @@ import numpy as np
 
 from torchcover.geometry.arrays import Bools, Float64, Int64
 from torchcover.simulation.traffic.fleet import KIND_OF
-from torchcover.simulation.traffic.flow import MAX_STEP_S, Agent, Flow
-from torchcover.simulation.traffic.idm import Driver, acceleration_in, advance, laden_mps2, tightness
+from torchcover.simulation.traffic.flow import MAX_STEP_S, Agent, TrafficHistory
+from torchcover.simulation.traffic.idm import (
+    Driver,
+    compute_acceleration_mps2,
+    compute_gap_ratio,
+    compute_max_truck_acceleration_mps2,
+    integrate_motion,
+)
 
 # Of a direction, from the median outwards; on the last one enters and exits.
 LANES = 4
@@ -43,22 +49,22 @@ UNEVEN, UNEVEN_S = 0.03, (15.0, 40.0)
 NEXT_LANE_M = 1e7
 
 
-class Change(NamedTuple):
-    """Agent number `agent` goes from lane `old` to lane `new`, from a place on over a way."""
+class LaneChange(NamedTuple):
+    """Agent number `agent_index` goes from lane `old_lane_index` to lane `new_lane_index`, from a place on over a way."""
 
-    agent: int
-    old: int
-    new: int
-    place_m: float
-    way_m: float
+    agent_index: int
+    old_lane_index: int
+    new_lane_index: int
+    start_m: float
+    length_m: float
 
-    def share(self, place_m: Float64) -> tuple[Float64, Float64]:
+    def compute_progress(self, lane_positions_m: Float64) -> tuple[Float64, Float64]:
         """(...) how much of it is done at places, from 0 to 1, and how much more after each metre."""
-        part = np.clip((place_m - self.place_m) / self.way_m, 0.0, 1.0)
-        return part**3 * (10 - 15 * part + 6 * part**2), 30 * (part * (1 - part)) ** 2 / self.way_m
+        part = np.clip((lane_positions_m - self.start_m) / self.length_m, 0.0, 1.0)
+        return part**3 * (10 - 15 * part + 6 * part**2), 30 * (part * (1 - part)) ** 2 / self.length_m
 
 
-class Overtaking:
+class LaneChangeSimulation:
     """N agents on the lanes of both directions: 0 to 3 of the first, 4 to 7 of the other. They must not overlap.
 
     Who is `heavy` keeps out of the lane at the median; who `exits` takes the exit, from the lane beside it. The side
@@ -69,60 +75,60 @@ class Overtaking:
     def __init__(
         self,
         agents: Sequence[Agent],
-        heavy: Bools,
-        exits: Bools,
-        side_m: Float64,
+        is_heavy: Bools,
+        is_exiting: Bools,
+        auxiliary_spans_m: Float64,
         generator: np.random.Generator,
-        climb: Float64,
+        slope_profile: Float64,
     ) -> None:
-        self.place_m = np.array([agent.place_m for agent in agents], dtype=np.float64)
-        self.lane = np.array([agent.lane for agent in agents], dtype=np.int64)
-        self.changes: list[Change] = []
+        self.lane_positions_m = np.array([agent.lane_position_m for agent in agents], dtype=np.float64)
+        self.lane_indices = np.array([agent.lane_index for agent in agents], dtype=np.int64)
+        self.lane_changes: list[LaneChange] = []
         self._length_m = np.array([agent.length_m for agent in agents], dtype=np.float64)
-        self._driver = Driver.together([agent.driver for agent in agents])
-        self._heavy, self._exits, self._side_m, self._climb = heavy, exits, side_m, climb
+        self._driver = Driver.stack([agent.driver for agent in agents])
+        self._heavy, self._exits, self._side_m, self._climb = is_heavy, is_exiting, auxiliary_spans_m, slope_profile
         self._laden = np.array([number for number, a in enumerate(agents) if KIND_OF.get(a.kind) in LADEN], np.int64)
         # Places of the other direction are those of the first with the sign turned, and slopes, too.
-        self._way = np.where(self.lane[self._laden] < LANES, 1.0, -1.0)
+        self._way = np.where(self.lane_indices[self._laden] < LANES, 1.0, -1.0)
         self._change_s = generator.uniform(*CHANGE_S, len(agents))
         self._waves = (
             2 * np.pi / generator.uniform(*UNEVEN_S, len(agents)),
             generator.uniform(0, 2 * np.pi, len(agents)),
         )
         self._may_change_m = np.full(len(agents), -np.inf)
-        self._leaving: list[Change] = []
+        self._leaving: list[LaneChange] = []
         self._turn, self._looks_s, self._time_s = 0, LOOKS_EVERY_S, 0.0
-        self.speed_mps = np.zeros(len(agents))
+        self.speeds_mps = np.zeros(len(agents))
         self._line_up()
         room_m = np.maximum(self._gaps_m()[: len(agents)] - self._driver.standstill_gap_m, 0.0)
         self._desired_mps = self._desired()
-        self.speed_mps = np.minimum(0.95 * self._desired_mps, room_m / self._driver.headway_s)
+        self.speeds_mps = np.minimum(0.95 * self._desired_mps, room_m / self._driver.headway_s)
         self._wanted_mps2 = np.zeros(len(agents))
 
-    def run(self, times_s: Float64, warm_up_s: float) -> Flow:
+    def run(self, times_s: Float64, warm_up_s: float) -> TrafficHistory:
         """Simulate, first the warm-up before the first time, and keep the state at each time."""
-        place_m, speed_mps = np.empty((2, len(times_s), len(self.place_m)))
+        place_m, speed_mps = np.empty((2, len(times_s), len(self.lane_positions_m)))
         spans_s = [warm_up_s, *(after - before for before, after in pairwise(times_s.tolist()))]
         for number, span_s in enumerate(spans_s):
             steps = int(np.ceil(span_s / MAX_STEP_S - 1e-9))
             for _ in range(steps):
                 self._step(span_s / steps)
-            place_m[number], speed_mps[number] = self.place_m, self.speed_mps
-        return Flow(place_m, speed_mps, np.zeros((len(times_s), 0, 2), dtype=bool))
+            place_m[number], speed_mps[number] = self.lane_positions_m, self.speeds_mps
+        return TrafficHistory(place_m, speed_mps, np.zeros((len(times_s), 0, 2), dtype=bool))
 
     def _step(self, step_s: float) -> None:
-        count, speed_mps = len(self.place_m), self.speed_mps
+        count, speed_mps = len(self.lane_positions_m), self.speeds_mps
         gap_m, own_mps = self._gaps_m(), speed_mps.take(self._who)
-        tight = tightness(self._drivers, own_mps, gap_m, own_mps - speed_mps.take(self._leader))
+        tight = compute_gap_ratio(self._drivers, own_mps, gap_m, own_mps - speed_mps.take(self._leader))
         twice = self._who[count:]
         tight[twice] = np.maximum(tight[twice], tight[count:])
         gap_m[twice] = np.minimum(gap_m[twice], gap_m[count:])
-        self._wanted_mps2 = acceleration_in(self._driver, speed_mps, tight[:count], self._desired_mps)
-        slope = self._way * np.interp(self._way * self.place_m[self._laden], *self._climb)
-        most_mps2 = laden_mps2(speed_mps[self._laden], slope)
+        self._wanted_mps2 = compute_acceleration_mps2(self._driver, speed_mps, tight[:count], self._desired_mps)
+        slope = self._way * np.interp(self._way * self.lane_positions_m[self._laden], *self._climb)
+        most_mps2 = compute_max_truck_acceleration_mps2(speed_mps[self._laden], slope)
         self._wanted_mps2[self._laden] = np.minimum(self._wanted_mps2[self._laden], most_mps2)
-        way_m, self.speed_mps = advance(speed_mps, self._wanted_mps2, gap_m[:count], step_s)
-        self.place_m += way_m
+        way_m, self.speeds_mps = integrate_motion(speed_mps, self._wanted_mps2, gap_m[:count], step_s)
+        self.lane_positions_m += way_m
         self._time_s += step_s
         if self._time_s > self._looks_s - 1e-9:
             self._looks_s += LOOKS_EVERY_S
@@ -131,9 +137,11 @@ class Overtaking:
     def _look(self) -> None:
         """Let some change lanes, and those who have changed be in one lane."""
         self._turn = (self._turn + 1) % TURNS
-        begun = self._begin(np.arange(self._turn, len(self.place_m), TURNS))
+        begun = self._begin(np.arange(self._turn, len(self.lane_positions_m), TURNS))
         leaving = [
-            change for change in self._leaving if self.place_m[change.agent] < change.place_m + IN_BOTH * change.way_m
+            change
+            for change in self._leaving
+            if self.lane_positions_m[change.agent_index] < change.start_m + IN_BOTH * change.length_m
         ]
         if begun or len(leaving) < len(self._leaving):
             self._leaving = leaving + begun
@@ -147,10 +155,12 @@ class Overtaking:
         of them, `_no_leader_m` (P,) infinite where nobody is; `_queue` (P,) those of `_who` lane by lane and one after
         the other, in the lanes `_queue_lane`, and `_rank` (N,) where everybody stands in it.
         """
-        count = len(self.place_m)
-        who = np.append(np.arange(count), np.array([change.agent for change in self._leaving], dtype=np.int64))
-        lane = np.append(self.lane, np.array([change.old for change in self._leaving], dtype=np.int64))
-        order = np.lexsort((self.place_m[who], lane))
+        count = len(self.lane_positions_m)
+        who = np.append(np.arange(count), np.array([change.agent_index for change in self._leaving], dtype=np.int64))
+        lane = np.append(
+            self.lane_indices, np.array([change.old_lane_index for change in self._leaving], dtype=np.int64)
+        )
+        order = np.lexsort((self.lane_positions_m[who], lane))
         self._who, self._queue, self._queue_lane = who, who[order], lane[order]
         is_first = np.append(np.diff(self._queue_lane) != 0, True)
         rank = np.argsort(order)
@@ -165,9 +175,9 @@ class Overtaking:
 
     def _gaps_m(self) -> Float64:
         """(P,) free road to the one ahead, bumper to bumper."""
-        gap_m = self.place_m.take(self._leader)
+        gap_m = self.lane_positions_m.take(self._leader)
         gap_m += self._no_leader_m
-        gap_m -= self.place_m.take(self._who)
+        gap_m -= self.lane_positions_m.take(self._who)
         gap_m -= self._between_m
         return gap_m
 
@@ -175,35 +185,35 @@ class Overtaking:
         """(N,) what everybody wants to drive now and here: on ramps less."""
         per_s, phase = self._waves
         desired_mps = self._driver.desired_speed_mps * (1 + UNEVEN * np.sin(per_s * self._time_s + phase))
-        beside = np.flatnonzero(self.lane % LANES == SIDE_LANE)
-        begin_m, end_m = self._side_m[self.lane[beside] // LANES].T
-        to_end_m = np.where(self.place_m[beside] < begin_m, 0.0, end_m - self.place_m[beside])
+        beside = np.flatnonzero(self.lane_indices % LANES == SIDE_LANE)
+        begin_m, end_m = self._side_m[self.lane_indices[beside] // LANES].T
+        to_end_m = np.where(self.lane_positions_m[beside] < begin_m, 0.0, end_m - self.lane_positions_m[beside])
         ramp_mps = np.sqrt(RAMP_MPS**2 + 2 * EXIT_BRAKING_MPS2 * np.maximum(to_end_m, 0.0))
         desired_mps[beside] = np.minimum(desired_mps[beside], ramp_mps)
         return desired_mps
 
-    def _begin(self, who: Int64) -> list[Change]:
+    def _begin(self, who: Int64) -> list[LaneChange]:
         """Let those of some agents change lanes who want to and may."""
-        who = who[self.place_m[who] >= self._may_change_m[who]]
+        who = who[self.lane_positions_m[who] >= self._may_change_m[who]]
         left, right = who[self._may(who, -1)], who[self._may(who, 1)]
         who, side = np.append(left, right), np.repeat([-1, 1], [len(left), len(right)])
         gain = self._gains(who, side)
-        begun: list[Change] = []
+        begun: list[LaneChange] = []
         for at in np.argsort(-gain)[: np.count_nonzero(gain > 0.0)].tolist():
             agent = int(who[at])
-            place_m, old = float(self.place_m[agent]), int(self.lane[agent])
-            if all(abs(place_m - other.place_m) > APART_M for other in begun):
-                way_m = max(float(self.speed_mps[agent] * self._change_s[agent]), SHORTEST_CHANGE_M)
-                begun.append(Change(agent, old, old + int(side[at]), place_m, way_m))
-                self.lane[agent], self._may_change_m[agent] = begun[-1].new, place_m + way_m
-        self.changes += begun
+            place_m, old = float(self.lane_positions_m[agent]), int(self.lane_indices[agent])
+            if all(abs(place_m - other.start_m) > APART_M for other in begun):
+                way_m = max(float(self.speeds_mps[agent] * self._change_s[agent]), SHORTEST_CHANGE_M)
+                begun.append(LaneChange(agent, old, old + int(side[at]), place_m, way_m))
+                self.lane_indices[agent], self._may_change_m[agent] = begun[-1].new_lane_index, place_m + way_m
+        self.lane_changes += begun
         return begun
 
     def _may(self, who: Int64, side: int) -> Bools:
         """(K,) who of them has a lane on their left (-1) or right (1) that is for them."""
-        lane, exits = self.lane[who] % LANES, self._exits[who]
-        begin_m, end_m = self._side_m[self.lane[who] // LANES].T
-        beside = (self.place_m[who] > begin_m) & (self.place_m[who] < end_m - NOT_BEFORE_END_M)
+        lane, exits = self.lane_indices[who] % LANES, self._exits[who]
+        begin_m, end_m = self._side_m[self.lane_indices[who] // LANES].T
+        beside = (self.lane_positions_m[who] > begin_m) & (self.lane_positions_m[who] < end_m - NOT_BEFORE_END_M)
         if side < 0:
             to_the_median = (lane == 1) & ~self._heavy[who]
             return np.asarray(~exits & (to_the_median | (lane == 2) | (beside & (lane == SIDE_LANE))))
@@ -211,9 +221,9 @@ class Overtaking:
 
     def _gains(self, who: Int64, side: Int64) -> Float64:
         """(K,) what agents gain by changes to their left (-1) or right (1), in m/s²; below 0 where it is not safe."""
-        lane, speed_mps = self.lane[who], self.speed_mps
-        queue_m = NEXT_LANE_M * self._queue_lane + self.place_m[self._queue]
-        at = np.searchsorted(queue_m, NEXT_LANE_M * (lane + side) + self.place_m[who])
+        lane, speed_mps = self.lane_indices[who], self.speeds_mps
+        queue_m = NEXT_LANE_M * self._queue_lane + self.lane_positions_m[self._queue]
+        at = np.searchsorted(queue_m, NEXT_LANE_M * (lane + side) + self.lane_positions_m[who])
         ahead, has_ahead = self._of_queue(at, lane + side)
         behind, has_behind = self._of_queue(at - 1, lane + side)
         left_behind, has_left = self._of_queue(self._rank[who] - 1, lane)
@@ -243,9 +253,13 @@ class Overtaking:
 
     def _behind(self, who: Int64, leader: Int64, has_leader: Bools) -> tuple[Float64, Bools]:
         """(K,) how hard agents would accelerate behind others, and whether their gap is long enough."""
-        gap_m = self.place_m[leader] - self.place_m[who] - (self._length_m[leader] + self._length_m[who]) / 2
+        gap_m = (
+            self.lane_positions_m[leader]
+            - self.lane_positions_m[who]
+            - (self._length_m[leader] + self._length_m[who]) / 2
+        )
         gap_m[~has_leader] = np.inf
-        driver, speed_mps = self._some(who), self.speed_mps[who]
-        tight = tightness(driver, speed_mps, gap_m, speed_mps - self.speed_mps[leader])
-        wanted = acceleration_in(driver, speed_mps, tight, driver.desired_speed_mps)
+        driver, speed_mps = self._some(who), self.speeds_mps[who]
+        tight = compute_gap_ratio(driver, speed_mps, gap_m, speed_mps - self.speeds_mps[leader])
+        wanted = compute_acceleration_mps2(driver, speed_mps, tight, driver.desired_speed_mps)
         return wanted, gap_m > SHORTEST_HEADWAY_S * speed_mps

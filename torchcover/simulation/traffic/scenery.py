@@ -22,20 +22,20 @@ CROWN_SIDES = 6
 
 
 class Scenery(NamedTuple):
-    """`static` meshes that never move, and the numbers of those that one drives or walks on: `ground`."""
+    """`static_meshes` meshes that never move, and the numbers of those that one drives or walks on: `ground_indices`."""
 
-    static: tuple[Mesh, ...]
-    ground: tuple[int, ...]
+    static_meshes: tuple[Mesh, ...]
+    ground_indices: tuple[int, ...]
 
 
-def ground(lower_m: ArrayLike, upper_m: ArrayLike) -> Mesh:
+def build_ground_plane(lower_m: ArrayLike, upper_m: ArrayLike) -> Mesh:
     """The one plane at z = 0 under everything: two triangles, so there is no seam for a ray to slip through."""
     (x0, y0), (x1, y1) = np.asarray(lower_m, dtype=np.float64), np.asarray(upper_m, dtype=np.float64)
     corners = np.array([[x0, y0, 0.0], [x1, y0, 0.0], [x1, y1, 0.0], [x0, y1, 0.0]])
     return Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]), is_outward=np.zeros(2, dtype=bool)).assign_material("road")
 
 
-def prism(outlines_m: Sequence[ArrayLike], heights_m: Sequence[float]) -> Mesh:
+def build_prism(outlines_m: Sequence[ArrayLike], heights_m: Sequence[float]) -> Mesh:
     """A closed body through convex (K, 2) outlines, counter-clockwise from above, at ascending heights."""
     outlines = np.array(outlines_m, dtype=np.float64)
     levels, corners, _ = outlines.shape
@@ -45,23 +45,23 @@ def prism(outlines_m: Sequence[ArrayLike], heights_m: Sequence[float]) -> Mesh:
     return Mesh(rings.reshape(-1, 3), build_prism_faces(levels, corners))
 
 
-def rectangle(x_m: tuple[float, float], y_m: tuple[float, float]) -> Float64:
+def build_rectangle(x_m: tuple[float, float], y_m: tuple[float, float]) -> Float64:
     """(4, 2) outline."""
     return np.array([[x_m[0], y_m[0]], [x_m[1], y_m[0]], [x_m[1], y_m[1]], [x_m[0], y_m[1]]])
 
 
-def block(x_m: tuple[float, float], y_m: tuple[float, float], z_m: tuple[float, float]) -> Mesh:
+def build_box_from_bounds(x_m: tuple[float, float], y_m: tuple[float, float], z_m: tuple[float, float]) -> Mesh:
     """A box between bounds."""
-    outline = rectangle(x_m, y_m)
-    return prism([outline, outline], z_m)
+    outline = build_rectangle(x_m, y_m)
+    return build_prism([outline, outline], z_m)
 
 
-def slab(corners_m: Float64, z_m: tuple[float, float]) -> Mesh:
+def build_slab(grid_corners_m: Float64, z_m: tuple[float, float]) -> Mesh:
     """A closed body between two heights over a net with (rows, columns, 2) corners, which may bend.
 
     Seen from above, columns are to the left of rows.
     """
-    rows, columns, _ = corners_m.shape
+    rows, columns, _ = grid_corners_m.shape
     number = np.arange(rows * columns).reshape(rows, columns)
     here, ahead, aside, across = number[:-1, :-1], number[1:, :-1], number[:-1, 1:], number[1:, 1:]
     over = np.concatenate(
@@ -69,14 +69,14 @@ def slab(corners_m: Float64, z_m: tuple[float, float]) -> Mesh:
     )
     around = np.concatenate([number[:-1, 0], number[-1, :-1], number[:0:-1, -1], number[0, :0:-1]])
     sides, up = build_band_faces(around, np.roll(around, -1), rows * columns), rows * columns
-    places_m = np.tile(corners_m.reshape(-1, 2), (2, 1))
+    places_m = np.tile(grid_corners_m.reshape(-1, 2), (2, 1))
     faces = np.concatenate([over[:, ::-1], over + up, sides])
     return Mesh(np.column_stack([places_m, np.repeat(z_m, up)]), faces, is_outward=np.ones(len(faces), dtype=bool))
 
 
-def plateau(pieces: ArrayLike, heights_m: Callable[[Float64], Float64]) -> Mesh:
+def build_sidewalk(outlines: ArrayLike, compute_heights_m: Callable[[Float64], Float64]) -> Mesh:
     """Pavement of one or several outlines: closed, from above the ground, whose heights are given, to below it."""
-    triangles = shapely.get_coordinates(shapely.get_parts(shapely.constrained_delaunay_triangles(pieces)))
+    triangles = shapely.get_coordinates(shapely.get_parts(shapely.constrained_delaunay_triangles(outlines)))
     corners_m = np.round(triangles.reshape(-1, 4, 2)[:, :3].reshape(-1, 2) / PLACES_ALIKE_M) * PLACES_ALIKE_M
     # Complex numbers are sorted in a fraction of the time that rows take.
     places, faces = np.unique(corners_m.view(np.complex128)[:, 0], return_inverse=True)
@@ -84,7 +84,7 @@ def plateau(pieces: ArrayLike, heights_m: Callable[[Float64], Float64]) -> Mesh:
     first, second, third = places[faces].T
     turns_left = ((second - first).conj() * (third - first)).imag > 0
     faces[~turns_left] = faces[~turns_left][:, ::-1]
-    above_m, count = heights_m(places_m), len(places_m)
+    above_m, count = compute_heights_m(places_m), len(places_m)
     edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     # Around the outline an edge has a triangle on one side only.
     key, back = edges[:, 0] * count + edges[:, 1], edges[:, 1] * count + edges[:, 0]
@@ -96,28 +96,30 @@ def plateau(pieces: ArrayLike, heights_m: Callable[[Float64], Float64]) -> Mesh:
     return mesh._replace(is_outward=find_outward_faces(mesh))
 
 
-def box(centre_m: ArrayLike, size_m: ArrayLike, bottom_m: float = 0.0, yaw_deg: float = 0.0) -> Mesh:
+def build_box(center_m: ArrayLike, size_m: ArrayLike, bottom_m: float = 0.0, yaw_deg: float = 0.0) -> Mesh:
     """A box about a point (x, y), turned."""
     length, width, height = np.asarray(size_m, dtype=np.float64)
-    shape = block((-length / 2, length / 2), (-width / 2, width / 2), (bottom_m, bottom_m + height))
-    return shape.transform(build_transform(convert_euler_to_rotation(yaw_deg, 0.0, 0.0), [*np.asarray(centre_m), 0.0]))
+    shape = build_box_from_bounds((-length / 2, length / 2), (-width / 2, width / 2), (bottom_m, bottom_m + height))
+    return shape.transform(build_transform(convert_euler_to_rotation(yaw_deg, 0.0, 0.0), [*np.asarray(center_m), 0.0]))
 
 
-def post(centre_m: ArrayLike, radius_m: float, bottom_m: float, height_m: float) -> Mesh:
+def build_post(center_m: ArrayLike, radius_m: float, bottom_m: float, height_m: float) -> Mesh:
     """An upright post."""
-    outline = np.asarray(centre_m) + radius_m * compute_circle_points(POST_SIDES)
-    return prism([outline, outline], [bottom_m, bottom_m + height_m]).assign_material("metal")
+    outline = np.asarray(center_m) + radius_m * compute_circle_points(POST_SIDES)
+    return build_prism([outline, outline], [bottom_m, bottom_m + height_m]).assign_material("metal")
 
 
-def tree(centre_m: ArrayLike, bottom_m: float, clear_m: float, height_m: float, crown_radius_m: float) -> list[Mesh]:
+def build_tree(
+    center_m: ArrayLike, bottom_m: float, trunk_height_m: float, height_m: float, crown_radius_m: float
+) -> list[Mesh]:
     """A trunk, and on it a crown as wide as given."""
-    shape, centre = compute_circle_points(CROWN_SIDES), np.asarray(centre_m)
+    shape, centre = compute_circle_points(CROWN_SIDES), np.asarray(center_m)
     outlines = [centre + share * crown_radius_m * shape for share in (0.45, 1.0, 0.9, 0.3)]
-    levels = bottom_m + clear_m + np.array([0.0, 0.3, 0.65, 1.0]) * (height_m - clear_m)
-    crown = prism(outlines, levels.tolist()).assign_material("vegetation")
-    return [post(centre, 0.15, bottom_m, clear_m).assign_material("wood"), crown]
+    levels = bottom_m + trunk_height_m + np.array([0.0, 0.3, 0.65, 1.0]) * (height_m - trunk_height_m)
+    crown = build_prism(outlines, levels.tolist()).assign_material("vegetation")
+    return [build_post(centre, 0.15, bottom_m, trunk_height_m).assign_material("wood"), crown]
 
 
-def few(*kinds: Sequence[Mesh]) -> tuple[Mesh, ...]:
+def merge_by_kind(*kinds: Sequence[Mesh]) -> tuple[Mesh, ...]:
     """One mesh for each kind of thing that there is."""
     return tuple(merge_meshes(list(pieces)) for pieces in kinds if pieces)
