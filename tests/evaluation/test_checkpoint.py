@@ -99,11 +99,20 @@ def cut_short(*args, **settings):
 
 def bits(result):
     """All that was measured."""
-    found = {"observed": result.observer_results, "num_frames": result.run.num_frames, "counts": dict(result.run.counts)}
+    found = {
+        "observed": result.observer_results,
+        "num_frames": result.run.num_frames,
+        "counts": dict(result.run.counts),
+    }
     for name, coverage in result.coverages.items():
         blocks = {"block sums": coverage.block_sums.sums, "block steps": coverage.block_sums.frame_counts}
         layers = {key: layer.values for key, layer in coverage.layers.items()}
-        for key, tensor in {**blocks, **layers, "points": coverage.point_counts, "probed": coverage.observed_frames}.items():
+        for key, tensor in {
+            **blocks,
+            **layers,
+            "points": coverage.point_counts,
+            "probed": coverage.observed_frames,
+        }.items():
             found[f"{name} {key}"] = tensor.numpy().tobytes()
     return {**found, "skipped_frames": tuple(result.run.skipped_frames)}
 
@@ -152,7 +161,9 @@ def test_it_goes_on_after_being_killed_at_any_moment(frame_of, path):
 def test_a_complete_run_goes_on_when_more_steps_are_wanted(frame_of, path):
     measured(Drive(frame_of), path, num_frames=5)
     seen = Seen()
-    assert bits(measured(Drive(frame_of), path, num_frames=12, seen=seen)) == bits(measured(Drive(frame_of), num_frames=12))
+    assert bits(measured(Drive(frame_of), path, num_frames=12, seen=seen)) == bits(
+        measured(Drive(frame_of), num_frames=12)
+    )
     assert len(seen.names) == 12
     again = measured(Drive(frame_of, range(STEPS)), path, num_frames=12)  # not a frame is made
     assert bits(again) == bits(measured(Drive(frame_of), num_frames=12))

@@ -457,7 +457,9 @@ def test_an_ego_that_leans_finds_the_same_numbers():
     def obstacle(band_frame=None, **pose):
         ego = {"shape": {"type": "box", "size_m": [4, 2, 1.5]}, "pose": pose}
         scenario = Scenario.model_validate({"name": "walls", "ego": ego, "bodies": bodies})
-        result = torchcover.evaluate(rig, scenario, num_frames=4, cell_m=4, num_rays=1024, regions=ask, band_frame=band_frame)
+        result = torchcover.evaluate(
+            rig, scenario, num_frames=4, cell_m=4, num_rays=1024, regions=ask, band_frame=band_frame
+        )
         (row,) = (row for row in result.summary if row["band"] == "obstacle")
         return np.array([row["detection_0.4m"], row["visible_m2"] / 10])
 

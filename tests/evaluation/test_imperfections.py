@@ -78,7 +78,12 @@ def numbers_of(rigs, steps=1, world=WORLD):
     for name, (coverage, *others) in observers.items():
         own = {}
         for row in coverage.compute().summary():
-            kinds = {"": row.numbers, "known": row.cell_averages, "seen by": row.redundancy.detecting_sensors, **row.redundancy.failure_numbers}
+            kinds = {
+                "": row.numbers,
+                "known": row.cell_averages,
+                "seen by": row.redundancy.detecting_sensors,
+                **row.redundancy.failure_numbers,
+            }
             own |= {(row.region, row.band, kind, key): one for kind, of in kinds.items() for key, one in of.items()}
         found[name] = own | {number.quantity.key: number for other in others for number in other.compute()}
     return found

@@ -25,7 +25,9 @@ def no_command(monkeypatch):
 def study():
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr("torchcover.evaluation.study.measure_command_s", lambda plan: 100.0)
-        return measure_error_against_time(StudyPlan(SMALL, ({"num_rays": 64}, {"reference": "paper", "num_rays": 1024})))
+        return measure_error_against_time(
+            StudyPlan(SMALL, ({"num_rays": 64}, {"reference": "paper", "num_rays": 1024}))
+        )
 
 
 def trial(a, seconds=64.0, bias=0.0, options="", least=64):
@@ -87,7 +89,9 @@ def test_the_worst_awaited_number_decides_and_what_prints_no_error_is_not_recomm
 def test_another_setting_is_recommended_only_where_it_saves_a_fifth():
     plan = StudyPlan(SMALL)
     for seconds, expected in ((60.0, ""), (40.0, "--set num_rays=64")):
-        found = Study(plan, [trial(0.04), trial(0.04, seconds, options="--set num_rays=64")], 1.0).find_recommended(0.01)
+        found = Study(plan, [trial(0.04), trial(0.04, seconds, options="--set num_rays=64")], 1.0).find_recommended(
+            0.01
+        )
         assert (found[0].options, found[1]) == (expected, 400)
     biased = Study(plan, [trial(0.04), trial(0.04, 1.0, bias=0.02, options="--set num_rays=64")], 1.0)
     assert biased.find_recommended(0.01)[0].options == ""

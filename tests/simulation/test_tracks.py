@@ -130,7 +130,10 @@ def test_trajectories_of_different_clocks_are_named(tmp_path):
     [
         (np.arange(4) * 100_000_000, "times in seconds are needed; their median interval is 1e+08: divide them by"),
         (np.arange(4) * 100, "times in seconds are needed; their median interval is 100: divide them by 1e3"),
-        ((np.arange(4) * 0.1 + 1e5).astype("f4"), "times of float32 are rounded to 0.0078125 s, with a median interval of"),
+        (
+            (np.arange(4) * 0.1 + 1e5).astype("f4"),
+            "times of float32 are rounded to 0.0078125 s, with a median interval of",
+        ),
     ],
 )
 def test_times_in_other_units_are_refused(tmp_path, times, message):

@@ -24,10 +24,10 @@ class Criterion:
     max_ttc_s: Annotated[float, "In traffic: who comes within this time to collision, in seconds, is met."] = 4.0
 
     def __post_init__(self) -> None:
-        for name in ("points", "pixels", "looks"):
+        for name in ("points", "pixels", "consecutive_scans"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}: a number >= 1 is needed; got {getattr(self, name)}")
-        for name, unit in (("deceleration_mps2", "m/s2"), ("within_s", "seconds")):
+        for name, unit in (("deceleration_mps2", "m/s2"), ("max_ttc_s", "seconds")):
             if not 0 < getattr(self, name) < math.inf:
                 raise ValueError(f"{name}: {unit} above 0 are needed; got {getattr(self, name)}")
         if not 0 <= self.latency_s <= MOST_LATENCY_S:

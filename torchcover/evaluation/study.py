@@ -316,7 +316,12 @@ def _record(trial: Trial) -> dict[str, Any]:
         own = {"region": one.region, "band": one.band, "quantity": one.quantity.key, "value": one.value}
         numbers.append(
             to_json_record(
-                {**own, "error_coefficient": one.error.error_coefficient, "bias": one.error.bias, "difference": to_json_record(told)}
+                {
+                    **own,
+                    "error_coefficient": one.error.error_coefficient,
+                    "bias": one.error.bias,
+                    "difference": to_json_record(told),
+                }
             )
         )
     names = ("options", "num_frames", "min_frames", "duration_s", "cpu_s", "band_frame")

@@ -335,14 +335,14 @@ def _estimate_detected_share(
     """Estimate the share of free positions near the vehicle at which a test target is detected."""
     ground = build_flat_ground().model_copy(update={"ego": search_frames.scenarios[0].ego})
     scenario = set_ego(ground, {rig.name: rig})
-    raster = Raster.around(scenario.compute_ego_box(), params.max_distance_m, params.spacing_m)
-    result = survey(rig.apply_sensor_model("ideal"), scenario, Target.load(target), raster)
-    is_tested = result.free & (result.distance_m <= params.max_distance_m)
+    raster = Raster.from_vehicle(scenario.compute_ego_box(), params.max_distance_m, params.spacing_m)
+    result = measure_target_visibility(rig.apply_sensor_model("ideal"), scenario, Target.load(target), raster)
+    is_tested = result.free_mask & (result.distance_m <= params.max_distance_m)
     # Every fourth cell along each axis is a block, so that the blocks estimate the error of a finite raster.
     rows, columns = (np.arange(count) % 4 for count in is_tested.shape)
     block_index = torch.from_numpy((4 * rows[:, None] + columns)[is_tested])
     cells = torch.bincount(block_index, minlength=16)
-    detected = torch.from_numpy(result.enough[is_tested]).double()
+    detected = torch.from_numpy(result.detected_mask[is_tested]).double()
     detected_cells = torch.bincount(block_index, detected, minlength=16)
     quantity = Quantity(target, f"{target} detected", "share", lower_is_better=False)
     return Estimate.from_ratios((quantity,), cells.double(), detected_cells[:, None], cells)

@@ -124,7 +124,7 @@ class NearFieldObserver(BlockedSums):
         self.near_field_targets = [NearFieldTarget.from_target(body, vehicle, regions, self.grid) for body in targets]
         each = len(rigs), len(targets)
         self.define_block_sum("sums", (*each, len(regions), len(COLUMNS)), is_fine=True)
-        self.define_sum("cells", (*each, self.grid.num_cells // len(self.grid.heights), 2))
+        self.define_sum("position_counts", (*each, self.grid.num_cells // len(self.grid.heights), 2))
 
     def update(self, frame: Frame) -> None:
         """Put them beside the vehicle at the time of a frame of the simulation."""

@@ -158,7 +158,7 @@ def compute_body_trajectories(
     for number in [number for number, kind in enumerate(kinds) if kind in DRAWS]:
         # At first the axles are on the lane, too.
         back_m = DRAWS[kinds[number]].hitch_to_axle_m - DRAWS[kinds[number]].hitch_offset_m
-        (axles_m,) = lanes[lane_of[number]].line.poses(lane_positions_m[:1, number] - back_m)[:, :2]
+        (axles_m,) = lanes[lane_of[number]].centerline.compute_poses(lane_positions_m[:1, number] - back_m)[:, :2]
         start.append(float(np.arctan2(*(positions_m[0, number, :2] - axles_m)[::-1])))
     return BodyTrajectories(positions_m, yaw_deg, kinds).add_trailers(start)
 
@@ -169,7 +169,7 @@ def _along(lanes: Sequence[Lane], lane_of: Int64, place_m: Float64) -> Iterator[
     for on_lane in np.split(order, np.flatnonzero(np.diff(lane_of[order])) + 1):
         first, last = int(on_lane[0]), int(on_lane[-1])
         some = slice(first, last + 1) if last - first == len(on_lane) - 1 else on_lane
-        yield some, lanes[lane_of[first]].line.poses(place_m[:, some])
+        yield some, lanes[lane_of[first]].centerline.compute_poses(place_m[:, some])
 
 
 def get_center_offsets_m(kinds: Sequence[str]) -> Float64:

@@ -310,9 +310,9 @@ def _leaders(lanes: Sequence[Lane], lane: Int64, place_m: Float64) -> tuple[Int6
         members = np.flatnonzero(lane == index)
         members = members[np.argsort(-place_m[members], kind="stable")]
         leader[members[1:]] = members[:-1]
-        if lanes[index].line.closed and len(members) > 1:
+        if lanes[index].centerline.is_closed and len(members) > 1:
             leader[members[0]] = members[-1]
-            lap[members[0]] = lanes[index].line.length_m
+            lap[members[0]] = lanes[index].centerline.length_m
         else:
             lap[members[0]] = np.inf
     return leader, lap

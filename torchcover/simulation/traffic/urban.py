@@ -241,7 +241,7 @@ def _in_place(
     lane_of = np.array([agent.lane_index for agent in agents])
     within_m = np.empty((2, len(agents)))
     for lane in np.unique(lane_of):
-        line, on_lane = lanes[lane].line, np.flatnonzero(lane_of == lane)
+        line, on_lane = lanes[lane].centerline, np.flatnonzero(lane_of == lane)
         assert isinstance(line, OffsetPath)
         of_main = line.street is streets.main_alignment
         within_m[:, on_lane] = np.sort(
