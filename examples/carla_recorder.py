@@ -24,22 +24,22 @@ from PIL import Image
 
 from torchcover.geometry import convert_rotation_to_euler, invert
 from torchcover.recordings.formats.carla import (
-    DEPTH,
-    EXTENT,
-    LIDARS,
-    POSE,
+    DEPTH_TYPE,
+    EXTENT_COLUMNS,
+    LIDAR_TYPES,
+    POSE_COLUMNS,
     REFERENCE,
-    VELOCITY,
+    VELOCITY_COLUMNS,
     CarlaVehicle,
 )
 from torchcover.simulation import PaperReference
 
 LOOKS = {"front": 0.0, "right": 90.0, "rear": 180.0, "left": 270.0}
 SENSORS = [
-    {"id": "roof", "type": LIDARS[0], "z": 1.9, "channels": 64, "range": 120.0, "upper_fov": 10.0, "lower_fov": -30.0}
-    | {"points_per_second": 1_500_000},
+    {"id": "roof", "type": LIDAR_TYPES[0], "z": 1.9, "channels": 64, "range": 120.0}
+    | {"upper_fov": 10.0, "lower_fov": -30.0, "points_per_second": 1_500_000},
     *(
-        {"id": name, "type": DEPTH, "z": 1.9, "yaw": yaw, "image_size_x": 800, "image_size_y": 600, "fov": 90.0}
+        {"id": name, "type": DEPTH_TYPE, "z": 1.9, "yaw": yaw, "image_size_x": 800, "image_size_y": 600, "fov": 90.0}
         for name, yaw in LOOKS.items()
     ),
 ]
@@ -57,11 +57,12 @@ class Sensor:
     def __init__(self, world, vehicle, listed):
         blueprint = world.get_blueprint_library().find(listed["type"])
         for name, value in listed.items():
-            if name not in ("id", "type", *POSE):
+            if name not in ("id", "type", *POSE_COLUMNS):
                 blueprint.set_attribute(ATTRIBUTES.get(name, name), str(value))
         self.name = listed["id"]
         self._sent = queue.Queue()
-        self._actor = world.spawn_actor(blueprint, placed([listed.get(name, 0.0) for name in POSE]), attach_to=vehicle)
+        pose = placed([listed.get(name, 0.0) for name in POSE_COLUMNS])
+        self._actor = world.spawn_actor(blueprint, pose, attach_to=vehicle)
         self._actor.listen(self._sent.put)
 
     def data(self, frame):
@@ -87,18 +88,18 @@ class Folder:
         self.path = path
         for one in [*listed, {"id": REFERENCE}, {"id": "boxes"}]:
             (path / one["id"]).mkdir(parents=True)
-        reference = {"id": REFERENCE, "type": LIDARS[0]}
+        reference = {"id": REFERENCE, "type": LIDAR_TYPES[0]}
         (path / "sensors.json").write_text(json.dumps([*listed, reference], indent=1))
         (path / "vehicle.json").write_text(vehicle.model_dump_json())
-        self._append(path / "poses.csv", ["frame", "time_s", *POSE])
-        self._append(path / REFERENCE / "poses.csv", ["frame", *POSE])
+        self._append(path / "poses.csv", ["frame", "time_s", *POSE_COLUMNS])
+        self._append(path / REFERENCE / "poses.csv", ["frame", *POSE_COLUMNS])
 
     def write(self, name, measured, reference_pose, objects, vehicle_row):
         """Write a frame."""
         for sensor, data in measured.items():
             save(self.path / sensor / name, data)
         self._append(self.path / REFERENCE / "poses.csv", [name, *reference_pose])
-        for row in [["id", "category", *POSE, *EXTENT, *VELOCITY], *objects]:
+        for row in [["id", "category", *POSE_COLUMNS, *EXTENT_COLUMNS, *VELOCITY_COLUMNS], *objects]:
             self._append(self.path / "boxes" / f"{name}.csv", row)
         self._append(self.path / "poses.csv", [name, *vehicle_row])
 
@@ -159,9 +160,9 @@ def record(client, options, listed):
     before, settings = world.get_settings(), world.get_settings()
     settings.synchronous_mode, settings.fixed_delta_seconds = True, options.tick_s
     generator = np.random.default_rng(options.seed)
-    listed = [at_each_tick(one, options.tick_s) for one in listed if one["type"] in (*LIDARS, DEPTH)]
+    listed = [at_each_tick(one, options.tick_s) for one in listed if one["type"] in (*LIDAR_TYPES, DEPTH_TYPE)]
     best_case = {
-        "type": LIDARS[0],
+        "type": LIDAR_TYPES[0],
         "channels": options.rays,
         "upper_fov": 0.0,
         "lower_fov": -90.0,
@@ -186,7 +187,7 @@ def record(client, options, listed):
         for number in range(options.frames):
             # Another sensor every time: where a new one is attached counts from the vehicle in every version.
             pose = random_pose(vehicle, generator)
-            reference = {"id": REFERENCE, **dict(zip(POSE, pose, strict=True)), **best_case}
+            reference = {"id": REFERENCE, **dict(zip(POSE_COLUMNS, pose, strict=True)), **best_case}
             sensors.append(Sensor(world, ego, at_each_tick(reference, options.tick_s)))
             for _ in range(options.every):
                 tick = world.tick()
@@ -207,7 +208,7 @@ def record(client, options, listed):
 
 def at_each_tick(listed, tick_s):
     """A LiDAR that makes a whole turn in a tick."""
-    return {**listed, "rotation_frequency": 1 / tick_s} if listed["type"] in LIDARS else listed
+    return {**listed, "rotation_frequency": 1 / tick_s} if listed["type"] in LIDAR_TYPES else listed
 
 
 def main(arguments=None):

@@ -118,14 +118,14 @@ def test_an_instant_is_as_many_frames_as_make_a_turn(tmp_path, turns, names):
 
 
 def test_too_few_frames_for_a_turn(tmp_path):
-    with pytest.raises(ValueError, match=r"a turn of its LiDARs takes 20 frames; there are 5"):
+    with pytest.raises(ValueError, match=r"a revolution of its LiDARs takes 20 files; there are 5"):
         open_recording(turning(tmp_path, 1.0))
 
 
 def test_without_times_a_sector_is_told_as_one(tmp_path):
     turning(tmp_path, 10.0)
     (tmp_path / "poses.csv").unlink()
-    with pytest.warns(UserWarning, match=r"0\.npy: roof: nothing in 270 degrees; if a file holds a part of a turn, "):
+    with pytest.warns(UserWarning, match=r"0\.npy: roof: no points in 270 degrees; if a file holds a part of a rev"):
         open_recording(tmp_path)
     recorded(tmp_path / "whole")
     listed = json.loads((tmp_path / "whole" / "sensors.json").read_text())
@@ -199,7 +199,7 @@ def test_an_object_without_a_size_costs_no_other(tmp_path):
     ]
     for tick in range(5):
         table(tmp_path / "boxes" / f"{tick}.csv", CARLA_BOX, rows)
-    with pytest.warns(UserWarning, match=r"without a size are left out: 1 of 2 .* 17 \(bike\): .* extent_y 0"):
+    with pytest.warns(UserWarning, match=r"without a size are excluded: 1 of 2 .* 17 \(bike\): .* extent_y 0"):
         assert open_recording(tmp_path).read_boxes(1).ids == ("18",)
 
 

@@ -375,7 +375,7 @@ def test_calibrations_of_kitti_that_cannot_be(tmp_path, line, instead, told):
     file.unlink()
     rig = build_rig_document(open_recording(path), lidar_models={"velodyne": "velodyne_hdl64e"})
     assert [sensor["name"] for sensor in rig["sensors"]] == ["velodyne"]
-    assert "no cameras, for there is no calib_cam_to_cam.txt" in rig["description"]
+    assert "no cameras without calib_cam_to_cam.txt" in rig["description"]
 
 
 def test_cameras_of_others_that_cannot_be(tmp_path):

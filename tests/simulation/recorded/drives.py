@@ -119,13 +119,13 @@ def write_argoverse2(folder, others=OTHERS, heights=hill_m):
             category = names.get(somebody.category, somebody.category.upper())
             row = {"timestamp_ns": T0_NS + round(1e9 * TIMES_S[k]), "track_uuid": somebody.name, "category": category}
             cuboids.append({**row, **size, **_row(pose)})
-    feather.write_feather(pa.Table.from_pylist(driven), str(folder / argoverse2.POSES))
+    feather.write_feather(pa.Table.from_pylist(driven), str(folder / argoverse2.POSES_FILE))
     feather.write_feather(pa.Table.from_pylist(cuboids), str(folder / "annotations.feather"))
     return folder
 
 
 def _row(pose):
-    return dict(zip(argoverse2.POSE, [*quaternion(pose), *pose[:3, 3].tolist()], strict=True))
+    return dict(zip(argoverse2.POSE_COLUMNS, [*quaternion(pose), *pose[:3, 3].tolist()], strict=True))
 
 
 def write_nuscenes(folder, others=OTHERS, heights=flat_m, scenes=("scene-0001",)):

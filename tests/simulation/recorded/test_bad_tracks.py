@@ -58,7 +58,7 @@ def test_paths_that_are_no_recording(tmp_path):
 def test_recordings_without_objects_over_time(tmp_path):
     drive = Drive()
     log = kitti_raw(drive, tmp_path / "kitti")
-    fails(scenario(log, scene="a"), "scene: is for tables of nuScenes")
+    fails(scenario(log, scene="a"), "scene: applies to tables of nuScenes only")
     (log / "tracklet_labels.xml").unlink()
     fails(scenario(log), rf"{log}: no frame has labeled objects", BadFileError)
     folder = plain_folder(drive, tmp_path / "folder")
@@ -175,7 +175,7 @@ def test_shapes_of_commonroad_have_centers_and_turns(tmp_path, shapes, size_m, m
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         track = read_objects(path).tracks[0]
-    assert ["taken as the box around them" in str(one.message) for one in caught] == [True] * (
+    assert ["replaced by the box around them" in str(one.message) for one in caught] == [True] * (
         shapes.count("<center>") == 1 and shapes.count("rectangle") == 2 and "circle" in shapes
     )
     np.testing.assert_allclose(track.size_m[:2], size_m)
@@ -253,7 +253,7 @@ def test_logs_that_lack_something(tmp_path, monkeypatch):
     log = write_argoverse2(tmp_path, (*OTHERS, EGO._replace(category="ego_vehicle")))
     (log / "annotations.feather").rename(log / "annotations_with_ego.feather")
     assert "ego" not in [actor.name for actor in scenario(log).build_scene().actors]
-    fails(scenario(log, scene="a"), "scene: is for tables of nuScenes")
+    fails(scenario(log, scene="a"), "scene: applies to tables of nuScenes only")
     lack_pyarrow(monkeypatch)
     fails(scenario(log), r"annotations_with_ego.feather: .*pip install 'torchcover\[av2\]'", ImportError)
     monkeypatch.undo()

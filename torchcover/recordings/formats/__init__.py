@@ -1,4 +1,4 @@
-"""The layouts of recordings, by name: a new one is a class and a line here."""
+"""Formats of recordings by name; to support another one, add a class and an entry in `FORMATS`."""
 
 import os
 import warnings
@@ -24,22 +24,20 @@ from torchcover.recordings.unsupported_formats import find_remedy
 
 
 class RecordingFormat(Protocol):
-    """A class of recordings."""
+    """Class that reads recordings of one format."""
 
     @property
     def layout(self) -> str:
-        """What such a recording looks like, for messages."""
+        """Files of such a recording, for messages."""
 
     def can_read(self, path: Path, /) -> bool:
-        """Whether what is at a path that exists is meant to be such a recording."""
+        """Test whether an existing path looks like such a recording."""
 
     def __call__(self, path: Path, /) -> Recording:
-        """Open it."""
+        """Open a recording."""
 
 
-# So many recordings in a folder are named, or in folders of it.
-BELOW, DEEP = 6, 3
-# The first that recognises a path reads it.
+# The first format that can read a path reads it.
 FORMATS: dict[str, RecordingFormat] = {
     "nuscenes": NuScenes,
     "argoverse2": Argoverse2,
@@ -57,96 +55,133 @@ def open_recording(
     *,
     link_roots: Sequence[str | os.PathLike[str]] = (),
 ) -> Recording:
-    """Open a recording; `RecordedFrames` makes frames of it.
+    """Open a recording; `RecordedFrames` converts it into frames.
 
     Args:
-        path: Where it is.
-        settings: How to read it; they win over `recording.yaml` in its folder.
-        link_roots: Other folders that links in the recording may lead to.
+        path: Folder or file of the recording.
+        settings: Settings that take precedence over `recording.yaml` in its folder.
+        link_roots: Other folders to which links in the recording may lead.
+
+    Returns:
+        The recording, with the corrections of its settings.
 
     Raises:
-        FileNotFoundError: There is nothing at the path.
-        ValueError: An unknown format, or no format that recognises it; what the format itself finds wrong.
+        FileNotFoundError: The path does not exist.
+        ValueError: The format is unknown, or the recording is invalid.
     """
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such recording")
-    allow_links(path, map(Path, link_roots))
-    recording = _open_checked(path, merge_recording_settings(path, settings))
-    allow_links(recording.path, [path, *map(Path, link_roots)])
+    roots = [Path(root) for root in link_roots]
+    allow_links(path, roots)
+    recording = _open_with_settings(path, merge_recording_settings(path, settings))
+    allow_links(recording.path, [path, *roots])
     return recording
 
 
-def _open_checked(path: Path, settings: RecordingSettings) -> Recording:
+def _open_with_settings(path: Path, settings: RecordingSettings) -> Recording:
     if settings.format is not None and settings.format not in FORMATS:
         raise ValueError(f"format {settings.format!r}: no such format of recordings; there are {', '.join(FORMATS)}")
-    written = _read_manifest(path)
+    manifest = _find_manifest(path)
     for name, recording_format in FORMATS.items():
-        if name != settings.format and (settings.format is not None or not recording_format.can_read(path)):
+        is_chosen = name == settings.format if settings.format is not None else recording_format.can_read(path)
+        if not is_chosen:
             continue
         if recording_format is RosBag:
             mounts = {sensor: mount.to_matrix() for sensor, mount in settings.mounts.items()}
             return correct_recording(RosBag(path, settings.vehicle_frame, mounts, settings.point_time_unit), settings)
         if settings.vehicle_frame is not None or settings.mounts or settings.point_time_unit is not None:
             raise ValueError(
-                f"{path}: vehicle_frame, mounts and point_time_unit are for bags; {name} has its own (a plain folder in "
-                "frames.yaml)"
+                f"{path}: vehicle_frame, mounts and point_time_unit are settings of bags; {name} stores extrinsics itself "
+                "(a plain folder in frames.yaml)"
             )
-        return correct_recording(_checked(recording_format(path), written), settings)
-    known = "; ".join(f"{name}: {recording_format.layout}" for name, recording_format in FORMATS.items())
-    raise ValueError(f"{path}: a recording of no known format{_below(path)}; known are {known}")
+        return correct_recording(_check_manifest(recording_format(path), manifest), settings)
+    formats = "; ".join(f"{name}: {recording_format.layout}" for name, recording_format in FORMATS.items())
+    raise ValueError(f"{path}: a recording of no known format{_suggest_subfolders(path)}; known are {formats}")
 
 
-def _below(folder: Path) -> str:
-    """The recordings in a folder, and in folders of it, for a message."""
-    places, found = [folder], list[Path]()
-    for _ in range(DEEP * folder.is_dir()):
-        places = [inner for place in places if place.is_dir() for inner in sorted(place.iterdir())]
-        if found := [place for place in places if any(one.can_read(place) for one in FORMATS.values())]:
-            break
-    told = ", ".join(map(str, found[:BELOW])) + (f" and {len(found) - BELOW} more" if len(found) > BELOW else "")
-    return f"; name one of those in it: {told}" if found else ""
+def _suggest_subfolders(folder: Path) -> str:
+    """Suggest recordings in a folder and up to three levels below, for a message."""
+    paths = [folder]
+    for _ in range(3):
+        children: list[Path] = []
+        for path in paths:
+            children.extend(sorted(path.iterdir()) if path.is_dir() else ())
+        recordings = [path for path in children if _has_known_format(path)]
+        if recordings:
+            return f"; name one of those in it: {_format_list([str(path) for path in recordings])}"
+        paths = children
+    return ""
 
 
-def _read_manifest(path: Path) -> tuple[Path, dict[str, Any]] | None:
-    """Read the manifest of a recording that torchcover has written; None of any other one."""
+def _has_known_format(path: Path) -> bool:
+    return any(recording_format.can_read(path) for recording_format in FORMATS.values())
+
+
+def _format_list(names: Sequence[str], max_names: int = 6) -> str:
+    """Format the first names of a list and the number of others."""
+    text = ", ".join(names[:max_names])
+    return f"{text} and {len(names) - max_names:,} more" if len(names) > max_names else text
+
+
+def _find_manifest(path: Path) -> tuple[Path, dict[str, Any]] | None:
+    """Find the folder and manifest of a recording that torchcover wrote; None for other recordings."""
     if not path.is_dir():  # a bag may be one file
         return None
-    manifests = ((folder, read_complete_manifest(folder)) for folder in (path, path / "training"))  # which is KITTI's
-    return next(((folder, manifest) for folder, manifest in manifests if manifest is not None), None)
+    for folder in (path, path / "training"):  # KITTI's layout has the folder training
+        manifest = read_complete_manifest(folder)
+        if manifest is not None:
+            return folder, manifest
+    return None
 
 
-def _checked(recording: Recording, written: tuple[Path, dict[str, Any]] | None) -> Recording:
-    """Compare a recording with its manifest: other frames are refused, other files are a warning."""
-    if written is None:
+def _check_manifest(recording: Recording, folder_and_manifest: tuple[Path, dict[str, Any]] | None) -> Recording:
+    """Check a recording against its manifest: other frames are an error, edited files cause a warning."""
+    if folder_and_manifest is None:
         return recording
-    folder, manifest = written
-    names, there = set(manifest["frames"]), set(recording.frame_names)
-    if names == there:
-        if changed := find_changed(folder, manifest["files"]):
-            more = f" and {len(changed) - BELOW:,} more" if len(changed) > BELOW else ""
+    folder, manifest = folder_and_manifest
+    expected, existing = set(manifest["frames"]), set(recording.frame_names)
+    if expected == existing:
+        changed = find_changed(folder, manifest["files"])
+        if changed:
             warnings.warn(
-                f"{folder}: edited since it was recorded: {', '.join(changed[:BELOW])}{more} (missing, or of another "
-                "size)",
+                f"{folder}: edited since it was recorded: {_format_list(changed)} (missing, or of another size)",
                 stacklevel=4,
             )
         return recording
-    missing, others = names - there, there - names
-    what = f"{len(missing):,} are missing" if missing else f"{len(others):,} more are there"
+    missing, additional = expected - existing, existing - expected
+    fault = f"{len(missing):,} are missing" if missing else f"{len(additional):,} more are there"
     raise ValueError(
-        f"{recording.path}: a recording of {len(names):,} frames ({RECORDING}), and {what}, such as "
-        f"{min(missing or others)}; copy or record it again"
+        f"{recording.path}: a recording of {len(expected):,} frames ({RECORDING}), and {fault}, such as "
+        f"{min(missing or additional)}; copy or record it again"
     )
 
 
 class ObjectFormat(NamedTuple):
-    """A format whose objects over time can be read without any scan."""
+    """Format whose objects over time can be read without scans.
+
+    Args:
+        can_read: Function that tests a path.
+        read: Function that reads the objects.
+    """
 
     can_read: Callable[[Path], bool]
     read: Callable[[Path], RecordedObjects]
 
 
-# By what it consists of, for messages.
+def _is_xml(path: Path) -> bool:
+    return path.suffix == ".xml"
+
+
+def _is_csv(path: Path) -> bool:
+    return path.suffix == ".csv"
+
+
+def _read_box_table(path: Path) -> RecordedObjects:
+    return RecordedObjects(read_box_tracks(path))
+
+
+# Description of each format for messages, and its functions.
 OBJECT_FORMATS = {
     "tables of nuScenes (a folder with sample_annotation.json)": ObjectFormat(
         nuscenes.has_objects, nuscenes.read_objects
@@ -154,39 +189,40 @@ OBJECT_FORMATS = {
     "a log of Argoverse 2 (a folder with annotations.feather)": ObjectFormat(
         argoverse2.has_objects, argoverse2.read_objects
     ),
-    "a scenario of CommonRoad (.xml)": ObjectFormat(lambda path: path.suffix == ".xml", read_commonroad),
-    "a table of boxes (.csv)": ObjectFormat(
-        lambda path: path.suffix == ".csv", lambda path: RecordedObjects(read_box_tracks(path))
-    ),
+    "a scenario of CommonRoad (.xml)": ObjectFormat(_is_xml, read_commonroad),
+    "a table of boxes (.csv)": ObjectFormat(_is_csv, _read_box_table),
 }
 
 
 def read_objects(path: str | os.PathLike[str], scene: str | None = None) -> RecordedObjects:
-    """Read the objects of a recording over time, and the drive of its ego.
+    """Read the objects of a recording over time, and the drive of its ego vehicle.
 
     Args:
-        path: A log of Argoverse 2, tables of nuScenes, a scenario of CommonRoad, a table of boxes, or any recording
-            with poses, times and boxes.
-        scene: Which of tables that hold several.
+        path: Log of Argoverse 2, tables of nuScenes, scenario of CommonRoad, table of boxes, or any recording with
+            poses, times and boxes.
+        scene: Name or token of a scene, if the tables of nuScenes hold several.
+
+    Returns:
+        Tracks and ego vehicles.
 
     Raises:
-        FileNotFoundError: There is nothing at the path, or a part of it is missing.
-        ValueError: No format that recognises it; what the format itself finds wrong.
+        FileNotFoundError: The path, or a file of the recording, does not exist.
+        ValueError: The format is unknown, or the recording is invalid.
     """
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file or folder; recorded tracks are needed")
     if scene is not None:
         if not nuscenes.has_objects(path):
-            raise ValueError(f"{path}: scene: is for tables of nuScenes; leave it out")
+            raise ValueError(f"{path}: scene: applies to tables of nuScenes only; leave it out")
         return nuscenes.read_objects(path, scene)
-    for one in OBJECT_FORMATS.values():
-        if one.can_read(path):
-            return one.read(path)
+    for object_format in OBJECT_FORMATS.values():
+        if object_format.can_read(path):
+            return object_format.read(path)
     for recording_format in FORMATS.values():
         if recording_format.can_read(path):
             return extract_objects(open_recording(path))
-    remedy = f"{find_remedy(path)}; " * bool(find_remedy(path))
+    remedy = f"{find_remedy(path)}; " if find_remedy(path) else ""
     raise ValueError(
         f"{path}: {remedy}recorded tracks are {'; '.join(OBJECT_FORMATS)}; or a recording with poses and boxes "
         f"({', '.join(FORMATS)})"

@@ -1,4 +1,4 @@
-"""LiDARs and depth cameras of CARLA (Dosovitskiy et al., CoRL 2017), as `save_to_disk` writes them, left-handed."""
+"""CARLA recordings (Dosovitskiy et al., CoRL 2017): left-handed LiDAR clouds and depth images of `save_to_disk`."""
 
 import math
 import os
@@ -19,23 +19,37 @@ from torchcover.geometry import BoundingBox, build_transform, convert_euler_to_r
 from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.clouds import read_cloud
 from torchcover.recordings.formats.frame_files import check_same_names, find_frame_files, find_frame_rows
-from torchcover.recordings.recording import RecordingBase, Scan, check_times
+from torchcover.recordings.recording import GROUND_CLEARANCE_M, RecordingBase, Scan, check_times
 
-# Attributes of cameras that bend the image, and the values at which CARLA does not.
-LENS = {"lens_k": -1.0, "lens_kcube": 0.0, "lens_x_size": 0.08, "lens_y_size": 0.08}
-LIDARS = ("sensor.lidar.ray_cast", "sensor.lidar.ray_cast_semantic")
-DEPTH = "sensor.camera.depth"
+LIDAR_TYPES = ("sensor.lidar.ray_cast", "sensor.lidar.ray_cast_semantic")
+DEPTH_TYPE = "sensor.camera.depth"
 REFERENCE = "reference"
-POSE = ("x", "y", "z", "roll", "pitch", "yaw")
-EXTENT, VELOCITY = ("extent_x", "extent_y", "extent_z"), ("velocity_x", "velocity_y")
-# What is so near to the ground is the ground that the vehicle stands on.
-CLEARANCE_M = 0.05
+# Columns of tables of poses and boxes.
+POSE_COLUMNS = ("x", "y", "z", "roll", "pitch", "yaw")
+EXTENT_COLUMNS = ("extent_x", "extent_y", "extent_z")
+VELOCITY_COLUMNS = ("velocity_x", "velocity_y")
+SENSORS_FILES = ("sensors.json", "sensors.yaml")
+POSES_FILE = "poses.csv"
+BOX_FOLDER = "boxes"
 
 
 class CarlaSensor(BaseModel):
-    """A sensor as an agent of CARLA's leaderboard lists it in `sensors()`: metres and degrees in CARLA's axes.
+    """Sensor in the list of `sensors()` of a CARLA leaderboard agent, in meters and degrees in CARLA's axes.
 
-    The size of an image may have the name of the blueprint's attribute, `image_size_x` and `image_size_y`.
+    Args:
+        id: Name of the sensor.
+        type: Blueprint, such as `sensor.lidar.ray_cast`.
+        x: Position forward of the actor.
+        y: Position to the right.
+        z: Position upward.
+        roll: Rotation about x.
+        pitch: Rotation about y; positive raises the nose.
+        yaw: Rotation about z; positive turns right.
+        rotation_frequency: Revolutions of a LiDAR per second.
+        horizontal_fov: Horizontal field of view of a LiDAR.
+        width: Width of images in pixels, or `image_size_x`.
+        height: Height of images in pixels, or `image_size_y`.
+        fov: Horizontal field of view of a camera.
     """
 
     model_config = ConfigDict(extra="allow", allow_inf_nan=False)
@@ -56,22 +70,25 @@ class CarlaSensor(BaseModel):
 
     @model_validator(mode="after")
     def _check_camera(self) -> Self:
-        if self.type == DEPTH and None in (self.width, self.height, self.fov):
+        if self.type == DEPTH_TYPE and None in (self.width, self.height, self.fov):
             raise ValueError("a camera needs width (or image_size_x), height (or image_size_y) and fov, in degrees")
-        bent = [name for name, value in LENS.items() if float((self.model_extra or {}).get(name, value)) != value]
-        if self.type == DEPTH and bent:
-            raise ValueError(f"{', '.join(bent)}: distorted depth images are not read; record with CARLA's values")
+        # Values of the lens attributes at which CARLA does not distort images.
+        defaults = {"lens_k": -1.0, "lens_kcube": 0.0, "lens_x_size": 0.08, "lens_y_size": 0.08}
+        attributes = self.model_extra or {}
+        distorted = [name for name, default in defaults.items() if float(attributes.get(name, default)) != default]
+        if self.type == DEPTH_TYPE and distorted:
+            raise ValueError(f"{', '.join(distorted)}: distorted depth images are not read; record with CARLA's values")
         return self
 
     @property
     def parent_T_sensor(self) -> Matrix:
-        """(4, 4) its mount, in right-handed axes."""
-        return to_right_handed([getattr(self, name) for name in POSE])
+        """(4, 4) pose of the sensor in the actor frame, right-handed."""
+        return to_right_handed([getattr(self, name) for name in POSE_COLUMNS])
 
     @property
     def camera(self) -> Camera | None:
-        """Its lens, in the origin; None for a LiDAR."""
-        if self.type != DEPTH:
+        """Camera model in the origin; None for a LiDAR."""
+        if self.type != DEPTH_TYPE:
             return None
         assert self.width is not None  # checked in _check_camera, like the next two
         assert self.height is not None
@@ -88,7 +105,13 @@ class _Point(BaseModel):
 
 
 class CarlaVehicle(BaseModel):
-    """The `bounding_box` of a vehicle of CARLA: its centre in the actor's frame, and half its size."""
+    """Bounding box of a CARLA vehicle.
+
+    Args:
+        location: Center in the actor frame.
+        extent: Half of its size.
+        rotation: Angles of the box, which have to be 0.
+    """
 
     location: _Point
     extent: _Point
@@ -97,199 +120,261 @@ class CarlaVehicle(BaseModel):
     @model_validator(mode="after")
     def _check_rotation(self) -> Self:
         if any(self.rotation.values()):
-            raise ValueError(f"rotation: a box along the vehicle's axes is needed; got {self.rotation}")
+            raise ValueError(f"rotation: a box aligned with the vehicle's axes is needed; got {self.rotation}")
         return self
 
     @property
     def vehicle_T_actor(self) -> Matrix:
-        """(4, 4) the actor's frame in the vehicle frame, whose origin is under the centre of the box."""
+        """(4, 4) pose of the actor frame in the vehicle frame, whose origin is below the center of the box."""
         return build_transform(np.eye(3), [-self.location.x, self.location.y, 0.0])
 
     @property
     def ego_box(self) -> BoundingBox:
-        """The box in the vehicle frame, off the ground."""
+        """Bounding box in the vehicle frame, slightly above the ground."""
         half, z = self.extent, self.location.z
-        low_m = max(z - half.z, 0.0) + CLEARANCE_M
-        return BoundingBox((-half.x, -half.y, low_m), (half.x, half.y, z + half.z))
+        bottom_m = max(z - half.z, 0.0) + GROUND_CLEARANCE_M
+        return BoundingBox((-half.x, -half.y, bottom_m), (half.x, half.y, z + half.z))
 
 
 @guard_reader("a list of CARLA's sensors")
 def read_carla_sensors(path: Path) -> list[CarlaSensor]:
-    """Read the LiDARs and depth cameras of a list of sensors; JSON is YAML, too."""
+    """Read the LiDARs and depth cameras of a list of sensors.
+
+    Args:
+        path: YAML or JSON file.
+
+    Returns:
+        The sensors; other types of sensors are skipped.
+
+    Raises:
+        BadFileError: The file is no such list, has no LiDAR or depth camera, or an id is repeated.
+    """
     try:
-        listed = TypeAdapter(list[CarlaSensor]).validate_python(parse_yaml(read_short_text(path)))
+        sensors = TypeAdapter(list[CarlaSensor]).validate_python(parse_yaml(read_short_text(path)))
     except ValidationError as error:
-        raise ValueError(f"a list of sensors with id and type is needed; {_complaints(error)}") from error
-    found = [one for one in listed if one.type in (*LIDARS, DEPTH)]
-    names = [one.id for one in found]
+        raise ValueError(f"a list of sensors with id and type is needed; {_format_errors(error)}") from error
+    sensors = [sensor for sensor in sensors if sensor.type in (*LIDAR_TYPES, DEPTH_TYPE)]
+    names = [sensor.id for sensor in sensors]
     if not set(names) - {REFERENCE} or len(set(names)) < len(names):
         raise ValueError(
-            f"LiDARs ({' or '.join(LIDARS)}) or depth cameras ({DEPTH}) of different id are needed; got "
+            f"LiDARs ({' or '.join(LIDAR_TYPES)}) or depth cameras ({DEPTH_TYPE}) of different id are needed; got "
             f"{', '.join(names) or 'none'}"
         )
-    return found
+    return sensors
 
 
 @guard_reader("the bounding box of a vehicle of CARLA")
 def read_carla_vehicle(path: Path) -> CarlaVehicle:
-    """Read `{"location": {"x": ..., "y": ..., "z": ...}, "extent": {...}}`."""
+    """Read `{"location": {"x": ..., "y": ..., "z": ...}, "extent": {...}}`.
+
+    Args:
+        path: YAML or JSON file.
+
+    Returns:
+        The bounding box.
+
+    Raises:
+        BadFileError: Keys are missing, or the box has no size or is rotated.
+    """
     try:
         vehicle = CarlaVehicle.model_validate(parse_yaml(read_short_text(path)))
     except ValidationError as error:
-        raise ValueError(f"location and extent, each with x, y, z, are needed; {_complaints(error)}") from error
-    _ = vehicle.ego_box  # refuses a box without a size
+        raise ValueError(f"location and extent, each with x, y, z, are needed; {_format_errors(error)}") from error
+    _ = vehicle.ego_box  # raises for a box without a size
     return vehicle
 
 
 def read_carla_boxes(path: Path, vehicle_T_world: Matrix) -> Boxes:
     """Read the objects of a frame.
 
-    The table has the columns `id, category, x, y, z, roll, pitch, yaw, extent_x, extent_y, extent_z`: the centre and
-    half the size of each bounding box in the world; `velocity_x, velocity_y` may be there too. Boxes without a size, as
-    CARLA 0.9.8 to 0.9.14 gives some bicycles and pedestrians, are left out, with a warning.
+    The columns are `id, category, x, y, z, roll, pitch, yaw, extent_x, extent_y, extent_z`, with the center and half
+    of the size of each bounding box in the world frame; `velocity_x, velocity_y` are optional.
+
+    Args:
+        path: CSV file.
+        vehicle_T_world: (4, 4) transform from the world to the vehicle frame.
+
+    Returns:
+        Boxes in the vehicle frame.
+
+    Raises:
+        BadFileError: Columns are missing, or values are invalid.
+
+    Warns:
+        UserWarning: Boxes without a size are excluded; CARLA 0.9.8 to 0.9.14 writes some for bicycles and walkers.
     """
-    table = read_csv(path, (*POSE, *EXTENT), ("id", "category"), VELOCITY)
-    has_size = np.all([table.numbers[name] > 0 for name in EXTENT], axis=0)
-    words = {name: [word for word, has in zip(of, has_size, strict=True) if has] for name, of in table.texts.items()}
-    numbers, count = {name: of[has_size] for name, of in table.numbers.items()}, int(has_size.sum())
+    table = read_csv(path, (*POSE_COLUMNS, *EXTENT_COLUMNS), ("id", "category"), VELOCITY_COLUMNS)
+    has_size = np.all([table.numbers[name] > 0 for name in EXTENT_COLUMNS], axis=0)
+    rows = np.flatnonzero(has_size)
+    texts = {name: tuple(column[row] for row in rows) for name, column in table.texts.items()}
+    numbers, count = {name: column[has_size] for name, column in table.numbers.items()}, len(rows)
     if count < len(has_size):
         empty = int(np.argmin(has_size))
-        extent = ", ".join(f"{name} {table.numbers[name][empty]:g}" for name in EXTENT)
+        extent = ", ".join(f"{name} {table.numbers[name][empty]:g}" for name in EXTENT_COLUMNS)
         warnings.warn(
-            f"{path.parent}: boxes of objects without a size are left out: {len(has_size) - count} of {len(has_size)} "
+            f"{path.parent}: boxes of objects without a size are excluded: {len(has_size) - count} of {len(has_size)} "
             f"in one frame, such as {table.texts['id'][empty]} ({table.texts['category'][empty]}): {extent}",
             stacklevel=2,
         )
-    poses = to_right_handed([numbers[name] for name in POSE])
-    size_m = 2 * np.column_stack([numbers[name] for name in EXTENT])
-    over_ground = np.column_stack([numbers.get(name, np.full(count, np.nan)) for name in VELOCITY]) * [1.0, -1.0]
-    velocity_mps = over_ground @ vehicle_T_world[:2, :2].T
+    poses = to_right_handed([numbers[name] for name in POSE_COLUMNS])
+    size_m = 2 * np.column_stack([numbers[name] for name in EXTENT_COLUMNS])
+    unknown = np.full(count, np.nan)
+    velocity_mps = np.column_stack([numbers.get(name, unknown) for name in VELOCITY_COLUMNS]) * [1.0, -1.0]
+    velocity_mps = velocity_mps @ vehicle_T_world[:2, :2].T
     with report_bad_file(path, "a table of boxes"):
         return Boxes.from_rows(
             build_upright_rows(poses[:, :3, 3], size_m, poses[:, :3, 0], vehicle_T_world),
             velocity_mps=torch.from_numpy(velocity_mps).float(),
-            ids=tuple(words["id"]),
-            categories=tuple(words["category"]),
+            ids=texts["id"],
+            categories=texts["category"],
         )
 
 
 def to_right_handed(pose: list[float] | list[NDArray[np.float64]]) -> Matrix:
-    """(..., 4, 4) of x, y, z, roll, pitch, yaw in CARLA's axes: y and yaw to the right, pitch up."""
-    x, y, z, roll, pitch, yaw = map(np.asarray, pose)
+    """Convert poses from CARLA's axes (y to the right, positive yaw right, positive pitch up) to right-handed ones.
+
+    Args:
+        pose: x, y, z in meters and roll, pitch, yaw in degrees, each a number or an (N,) array.
+
+    Returns:
+        (..., 4, 4) transforms.
+    """
+    x, y, z, roll, pitch, yaw = (np.asarray(values) for values in pose)
     return build_transform(convert_euler_to_rotation(-yaw, -pitch, roll), np.stack([x, -y, z], axis=-1))
 
 
-def _complaints(error: ValidationError) -> str:
-    return "; ".join(f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in error.errors())
-
-
-SENSORS_FILES = ("sensors.json", "sensors.yaml")
-VEHICLE_FILE, POSES_FILE, BOXES = "vehicle.json", "poses.csv", "boxes"
-# Times are a little off; so much of a file is no part of a turn of its own.
-OF_A_FILE = 0.02
-# Where a LiDAR that turns saw nothing over so wide an angle, it has probably not been there.
-SECTOR_DEG = 60.0
+def _format_errors(error: ValidationError) -> str:
+    messages = []
+    for detail in error.errors():
+        key = ".".join(str(part) for part in detail["loc"])
+        messages.append(f"{key}: {detail['msg']}")
+    return "; ".join(messages)
 
 
 class Carla(RecordingBase):
-    """A folder with `sensors.json` and `ID/FRAME.ply` (or `.npy`; `.png` of a depth camera) of each sensor in it.
+    """Folder with `sensors.json` and `ID/FRAME.ply` (or `.npy`; `.png` of a depth camera) of each of its sensors.
 
-    All of it is in CARLA's left-handed axes. `sensors.json` (or `.yaml`) is the list that an agent of CARLA's
+    All data are in CARLA's left-handed axes. `sensors.json` (or `.yaml`) is the list that an agent of CARLA's
     leaderboard returns: `id`, `type`, `x`, `y`, `z`, `roll`, `pitch`, `yaw` of each sensor on its vehicle, `width`,
-    `height` and `fov` of cameras, and any attributes of its blueprint; what is neither a LiDAR nor a depth camera is
-    left out. A sensor whose `id` is `reference` is the reference. All that follows is optional:
+    `height` and `fov` of cameras, and any attributes of its blueprint; sensors other than LiDARs and depth cameras are
+    skipped. A sensor with the `id` `reference` is the reference. Optional are:
 
-    * `vehicle.json`, the `bounding_box` of the vehicle: points in it are its own, and the vehicle frame lies under its
-      middle. Without it the actor's frame is taken for that, and own points are taken for the world;
-    * `ID/poses.csv`, with the columns `frame, x, y, z, roll, pitch, yaw`: where a sensor was on the vehicle;
-    * `poses.csv`, also with `time_s`: where the vehicle was;
+    * `vehicle.json`, the `bounding_box` of the vehicle: points inside belong to the ego vehicle, and the vehicle frame
+      is below its center. Without it the vehicle frame is the actor frame, and points of the ego vehicle remain;
+    * `ID/poses.csv` with the columns `frame, x, y, z, roll, pitch, yaw`: extrinsics of a sensor in each frame;
+    * `poses.csv`, also with `time_s`: poses of the vehicle;
     * `boxes/FRAME.csv`, the objects, see `read_carla_boxes`; they need `poses.csv`.
 
-    Where frames come faster than a LiDAR turns, as `poses.csv` and `rotation_frequency` say, an instant is as many
-    frames as make a turn of all LiDARs. It bears name, time and pose of the last; the parts before are moved by the
-    poses of the vehicle, without whatever else moved meanwhile. Frames at the end that make no turn are left out.
+    If `poses.csv` and `rotation_frequency` show that files cover less than one revolution, a frame joins as many files
+    as all LiDARs need for one revolution. It has the name, time and pose of the last file; earlier parts are moved by
+    the poses of the vehicle, without compensation of other moving objects. An incomplete revolution at the end is
+    excluded.
+
+    Args:
+        path: Folder.
 
     Raises:
-        FileNotFoundError: No `sensors.json`, or no clouds of a LiDAR in it.
-        ValueError: Not such a list, no LiDAR or depth camera in it, places with other frames, too few for a turn, or a
-            bad table.
+        FileNotFoundError: `sensors.json` or the clouds of a sensor are missing.
+        ValueError: The list is invalid, frames differ between folders, there are too few for a revolution, or a table
+            is invalid.
 
     Warns:
-        UserWarning: How long a turn takes is unknown, and the first file of a LiDAR looks like a part of one.
+        UserWarning: The period of a revolution is unknown, and the first file of a LiDAR looks like a part of one.
     """
 
     layout: ClassVar[str] = "sensors.json, ID/FRAME.ply of each LiDAR and ID/FRAME.png of each depth camera in it"
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
-        listed = read_carla_sensors(next(filter(Path.exists, _lists(self.path)), self.path / SENSORS_FILES[0]))
-        vehicle = read_carla_vehicle(self.path / VEHICLE_FILE) if (self.path / VEHICLE_FILE).exists() else None
+        existing = [file for file in _list_sensor_files(self.path) if file.exists()]
+        sensors = read_carla_sensors(existing[0] if existing else self.path / SENSORS_FILES[0])
+        vehicle_file = self.path / "vehicle.json"
+        vehicle = read_carla_vehicle(vehicle_file) if vehicle_file.exists() else None
         self.ego_box = None if vehicle is None else vehicle.ego_box
         self._vehicle_T_actor = np.eye(4) if vehicle is None else vehicle.vehicle_T_actor
-        self._mounts = {one.id: self._vehicle_T_actor @ one.parent_T_sensor for one in listed}
-        self._cameras = {one.id: one.camera for one in listed if one.camera is not None}
+        self._mounts = {sensor.id: self._vehicle_T_actor @ sensor.parent_T_sensor for sensor in sensors}
+        self._cameras = {sensor.id: sensor.camera for sensor in sensors if sensor.camera is not None}
         self.sensors = tuple(name for name in self._mounts if name != REFERENCE)
         self.rigs = {"carla": self.sensors}
         self.reference_sensors = (REFERENCE,) if REFERENCE in self._mounts else ()
-        self._files = {name: self._files_of(name) for name in self._mounts}
-        self._labelled = (self.path / BOXES).is_dir()
-        boxes = {BOXES: {file.stem: file for file in (self.path / BOXES).glob("*.csv")}} if self._labelled else {}
-        check_same_names(self.path, {**self._files, **boxes})
-        self._ticks = tuple(next(iter(self._files.values())))
-        moving = {name: self.path / name / POSES_FILE for name in self._mounts}
-        self._moving = {name: self._table(path, ())[1] for name, path in moving.items() if path.exists()}
+        self._files = {name: self._find_files(name) for name in self._mounts}
+        self._has_boxes = (self.path / BOX_FOLDER).is_dir()
+        files_by_folder = dict(self._files)
+        if self._has_boxes:
+            files_by_folder[BOX_FOLDER] = {file.stem: file for file in (self.path / BOX_FOLDER).glob("*.csv")}
+        check_same_names(self.path, files_by_folder)
+        self._file_names = tuple(next(iter(self._files.values())))
+        self._extrinsics = {}
+        for name in self._mounts:
+            table = self.path / name / POSES_FILE
+            if table.exists():
+                self._extrinsics[name] = self._read_poses(table, ())[1]
         self.times_s, self._poses = None, None
-        self._parts = dict.fromkeys(self._mounts, 1)
+        self._num_parts = dict.fromkeys(self._mounts, 1)
         if (self.path / POSES_FILE).exists():
-            self.times_s, self._poses = self._table(self.path / POSES_FILE, ("time_s",))
-            check_times(self.times_s, len(self._ticks), str(self.path / POSES_FILE))
-            self._parts = {one.id: _parts_of_a_turn(one, self.times_s) for one in listed}
-        elif self._labelled:
-            raise ValueError(f"{self.path}: {BOXES}/ are in the world; {POSES_FILE} is needed, which is not there")
+            self.times_s, self._poses = self._read_poses(self.path / POSES_FILE, ("time_s",))
+            check_times(self.times_s, len(self._file_names), str(self.path / POSES_FILE))
+            self._num_parts = {sensor.id: _count_parts(sensor, self.times_s) for sensor in sensors}
+        elif self._has_boxes:
+            raise ValueError(f"{self.path}: {BOX_FOLDER}/ are in the world; {POSES_FILE} is needed, which is missing")
         if self.times_s is None or len(self.times_s) == 1:
-            self._warn_of_sectors(listed)
-        turn = max(self._parts.values())
-        if len(self._ticks) < turn:
-            raise ValueError(f"{self.path}: a turn of its LiDARs takes {turn} frames; there are {len(self._ticks)}")
-        self._lasts = range(turn - 1, len(self._ticks), turn)
-        self.frame_names = tuple(self._ticks[last] for last in self._lasts)
+            self._warn_about_sectors(sensors)
+        num_parts = max(self._num_parts.values())
+        if len(self._file_names) < num_parts:
+            raise ValueError(
+                f"{self.path}: a revolution of its LiDARs takes {num_parts} files; there are {len(self._file_names)}"
+            )
+        self._last_files = range(num_parts - 1, len(self._file_names), num_parts)  # last file of each frame
+        self.frame_names = tuple(self._file_names[last] for last in self._last_files)
         if self.times_s is not None:
-            self.times_s = self.times_s[self._lasts.start :: turn]
+            self.times_s = self.times_s[self._last_files.start :: num_parts]
 
     @classmethod
     def can_read(cls, path: Path) -> bool:
-        """Whether there is a list of sensors."""
-        return any(file.is_file() for file in _lists(path))
+        """Test whether a path is a folder with a list of sensors.
+
+        Args:
+            path: Existing path.
+        """
+        return any(file.is_file() for file in _list_sensor_files(path))
 
     def read_scan(self, sensor: str, index: int) -> Scan:
-        """Read a cloud, its y turned to the left, or a depth image; all parts of a turn."""
-        last = self._lasts[index]
-        cloud_m, vehicle_T_sensor, source = self._read(sensor, last)
-        if self._parts[sensor] == 1:
+        """Read a cloud or depth image in right-handed axes, and join all parts of a revolution.
+
+        Args:
+            sensor: Name of the sensor.
+            index: Index of the frame.
+
+        Returns:
+            The scan; in the vehicle frame if it was joined.
+        """
+        last = self._last_files[index]
+        cloud_m, vehicle_T_sensor, source = self._read_file(sensor, last)
+        if self._num_parts[sensor] == 1:
             return Scan(cloud_m, vehicle_T_sensor, source)
         parts = [transform_points(vehicle_T_sensor, cloud_m)]
-        for tick in range(last - self._parts[sensor] + 1, last):
-            cloud_m, vehicle_T_sensor, _ = self._read(sensor, tick)
-            parts.append(self._moved(transform_points(vehicle_T_sensor, cloud_m), tick, last))
+        for number in range(last - self._num_parts[sensor] + 1, last):
+            cloud_m, vehicle_T_sensor, _ = self._read_file(sensor, number)
+            parts.append(self._move_points(transform_points(vehicle_T_sensor, cloud_m), number, last))
         return Scan(np.concatenate(parts), None, source)
 
     def get_world_T_vehicle(self, index: int) -> Matrix | None:
-        """Where the vehicle was, if there is a `poses.csv`."""
-        return self._pose(self._lasts[index])
+        """Return the (4, 4) pose of the vehicle in a frame; None without `poses.csv`."""
+        return self._get_pose(self._last_files[index])
 
     def read_boxes(self, index: int) -> Boxes | None:
-        """The objects of a frame; None without the folder."""
+        """Read the objects of a frame; None without the folder `boxes`."""
         pose = self.get_world_T_vehicle(index)
-        if pose is None or not self._labelled:
+        if pose is None or not self._has_boxes:
             return None
-        return read_carla_boxes(self.path / BOXES / f"{self.frame_names[index]}.csv", invert(pose))
+        return read_carla_boxes(self.path / BOX_FOLDER / f"{self.frame_names[index]}.csv", invert(pose))
 
-    def _read(self, sensor: str, tick: int) -> tuple[NDArray[np.floating], Matrix, str]:
-        """Points of a file in right-handed axes, where their sensor was, and the file."""
-        path = self._files[sensor][self._ticks[tick]]
+    def _read_file(self, sensor: str, number: int) -> tuple[NDArray[np.floating], Matrix, str]:
+        """Read the points of a file in right-handed axes, the extrinsics of the sensor, and the name of the file."""
+        path = self._files[sensor][self._file_names[number]]
         mount = self._mounts[sensor]
-        if sensor in self._moving:
-            mount = self._vehicle_T_actor @ self._moving[sensor][tick]
+        if sensor in self._extrinsics:
+            mount = self._vehicle_T_actor @ self._extrinsics[sensor][number]
         if sensor in self._cameras:
             with report_bad_file(path, "a depth image"):
                 points = self._cameras[sensor].unproject(read_depth(path))
@@ -298,54 +383,57 @@ class Carla(RecordingBase):
         points_m[:, 1] *= -1
         return points_m, mount, str(path)
 
-    def _moved(self, points_m: Matrix, tick: int, last: int) -> Matrix:
-        """Points of the world as the vehicle finds them later; its own go with it."""
-        before, after = self._pose(tick), self._pose(last)
+    def _move_points(self, points_m: Matrix, number: int, last: int) -> Matrix:
+        """Move points of the static world to the vehicle frame of a later file; points of the ego vehicle stay."""
+        before, after = self._get_pose(number), self._get_pose(last)
         assert before is not None  # without times there are no parts
         assert after is not None
         moved_m = transform_points(invert(after) @ before, points_m)
         if self.ego_box is None:
             return moved_m
-        own = ((points_m > self.ego_box.lower_m) & (points_m < self.ego_box.upper_m)).all(axis=1, keepdims=True)
-        return np.where(own, points_m, moved_m)
+        is_inside = (points_m > self.ego_box.lower_m) & (points_m < self.ego_box.upper_m)
+        return np.where(is_inside.all(axis=1, keepdims=True), points_m, moved_m)
 
-    def _pose(self, tick: int) -> Matrix | None:
-        return None if self._poses is None else self._poses[tick] @ invert(self._vehicle_T_actor)
+    def _get_pose(self, number: int) -> Matrix | None:
+        return None if self._poses is None else self._poses[number] @ invert(self._vehicle_T_actor)
 
-    def _files_of(self, sensor: str) -> dict[str, Path]:
+    def _find_files(self, sensor: str) -> dict[str, Path]:
         return find_frame_files(self.path / sensor, ignored_files=(POSES_FILE,), is_depth=sensor in self._cameras)
 
-    def _warn_of_sectors(self, listed: list[CarlaSensor]) -> None:
-        for one in listed:
-            if one.rotation_frequency is None or one.horizontal_fov < 360 - SECTOR_DEG:
+    def _warn_about_sectors(self, sensors: list[CarlaSensor]) -> None:
+        """Warn about rotating LiDARs whose first file covers only a sector."""
+        min_gap_deg = 60.0  # a wider angle without points is probably not covered
+        for sensor in sensors:
+            if sensor.rotation_frequency is None or sensor.horizontal_fov < 360 - min_gap_deg:
                 continue
-            points_m, _, source = self._read(one.id, 0)
+            points_m, _, source = self._read_file(sensor.id, 0)
             azimuth_deg = np.sort(np.rad2deg(np.arctan2(points_m[:, 1], points_m[:, 0])))
             gap_deg = float(np.diff(azimuth_deg, append=azimuth_deg[:1] + 360).max(initial=0.0))
-            if gap_deg > SECTOR_DEG:
+            if gap_deg > min_gap_deg:
                 warnings.warn(
-                    f"{source}: {one.id}: nothing in {gap_deg:.0f} degrees; if a file holds a part of a turn, add "
-                    f"{POSES_FILE}, by which parts are joined, or record with a rotation_frequency of "
+                    f"{source}: {sensor.id}: no points in {gap_deg:.0f} degrees; if a file holds a part of a "
+                    f"revolution, add {POSES_FILE}, by which parts are joined, or record with a rotation_frequency of "
                     "1 / fixed_delta_seconds",
                     stacklevel=4,
                 )
 
-    def _table(self, path: Path, timed: tuple[str, ...]) -> tuple[NDArray[np.float64], Matrix]:
-        """(F,) times, or nothing, and (F, 4, 4) poses of the frames of a table."""
-        table = read_csv(path, (*timed, *POSE), ("frame",))
+    def _read_poses(self, path: Path, time_columns: tuple[str, ...]) -> tuple[NDArray[np.float64], Matrix]:
+        """Read (F,) times, if requested, and (F, 4, 4) poses of all files from a table."""
+        table = read_csv(path, (*time_columns, *POSE_COLUMNS), ("frame",))
         with report_bad_file(path, "a table of poses"):
-            order = find_frame_rows(table.texts["frame"], self._ticks)
-        poses = to_right_handed([table.numbers[name][order] for name in POSE])
-        return (table.numbers["time_s"][order] if timed else np.empty(0)), poses
+            order = find_frame_rows(table.texts["frame"], self._file_names)
+        poses = to_right_handed([table.numbers[name][order] for name in POSE_COLUMNS])
+        return (table.numbers["time_s"][order] if time_columns else np.empty(0)), poses
 
 
-def _lists(folder: Path) -> list[Path]:
+def _list_sensor_files(folder: Path) -> list[Path]:
     return [folder / name for name in SENSORS_FILES]
 
 
-def _parts_of_a_turn(sensor: CarlaSensor, times_s: NDArray[np.float64]) -> int:
-    """How many files make a turn; 1 where that is unknown, as of a camera."""
+def _count_parts(sensor: CarlaSensor, times_s: NDArray[np.float64]) -> int:
+    """Count the files of one revolution; 1 for cameras and if the period is unknown."""
     if sensor.rotation_frequency is None or sensor.camera is not None or len(times_s) < 2:
         return 1
-    turns_in_a_file = sensor.rotation_frequency * float(np.median(np.diff(times_s)))
-    return max(1, math.ceil(1 / turns_in_a_file - OF_A_FILE))
+    revolutions_per_file = sensor.rotation_frequency * float(np.median(np.diff(times_s)))
+    rounding = 0.02  # times are not exact; such a part of a file is no additional file
+    return max(1, math.ceil(1 / revolutions_per_file - rounding))

@@ -1,4 +1,4 @@
-"""nuScenes (Caesar et al., CVPR 2020): the LiDAR on the roof, its sweeps and key frames, and the annotations."""
+"""nuScenes data set (Caesar et al., CVPR 2020): sweeps and key frames of the roof LiDAR, and annotations."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -27,29 +27,22 @@ from torchcover.recordings.objects import (
 )
 from torchcover.recordings.recording import Scan, SensorCalibrations, check_times
 
-# The ego frame lies under the rear axle, on the ground; the centre of a Renault Zoe's box is 1.385 m before it, as in
-# the rig `nuscenes`, where the source is.
+# The ego frame is on the ground below the rear axle; the center of a Renault Zoe is 1.385 m in front of it. The rig
+# `nuscenes` names the source.
 vehicle_T_ego = build_transform(np.eye(3), [-1.385, 0.0, 0.0])
-# As in the body `renault_zoe`, where its source is.
-SIZE_M = (4.084, 1.730, 1.562)
 CHANNEL = "LIDAR_TOP"
-# The middle of each level of visibility, by its token.
-SHARES = {"1": 0.2, "2": 0.5, "3": 0.7, "4": 0.9}
-# Nothing but the car and what is mounted on it can be in its outline of 4.08 x 1.73 m up to a little above the LiDAR.
-BODY = BoundingBox((-2.042, -0.865, 0.05), (2.042, 0.865, 2.04))
 
 
 class NuScenes:
-    """A folder with `v1.0-*/` tables, `samples/` and `sweeps/`. Key frames are looked at, sweeps serve the reference.
+    """Data set with `v1.0-*/` tables, `samples/` and `sweeps/`; other sweeps only contribute to the reference.
 
     Args:
-        path: The data set, or its folder of tables.
-        scenes: Names of scenes, such as `scene-0061`; all if not given.
+        path: Data set, or its folder of tables.
+        scenes: Names of scenes, such as `scene-0061`; None for all.
 
     Raises:
         FileNotFoundError: A table is missing.
-        ValueError: A table that is none, a token that leads nowhere, a path out of the data set, an unknown scene, no
-            key frame.
+        ValueError: A table is invalid, a token or scene is unknown, a path leaves the data set, or no key frame exists.
     """
 
     layout: ClassVar[str] = "v1.0-*/*.json, samples/LIDAR_TOP, sweeps/LIDAR_TOP"
@@ -57,210 +50,262 @@ class NuScenes:
     reference_sensors = ()
     has_area_weights = False
     block_indices = None
-    ego_box: BoundingBox | None = BODY
+    # Outline of 4.08 x 1.73 m, up to a little above the LiDAR.
+    ego_box: BoundingBox | None = BoundingBox((-2.042, -0.865, 0.05), (2.042, 0.865, 2.04))
 
     def __init__(self, path: str | os.PathLike[str], scenes: Sequence[str] | None = None) -> None:
-        tables = _tables(Path(path))
+        tables = _find_tables(Path(path))
         self.path = tables.parent
         self.rigs = {"nuscenes": self.sensors}
-        with report_bad_file(tables, "tables of nuScenes"):  # rows without a column, numbers that are none
-            self._read(tables, scenes)
+        with report_bad_file(tables, "tables of nuScenes"):  # rows may lack a column or have invalid numbers
+            self._read_tables(tables, scenes)
 
     @classmethod
     def can_read(cls, path: Path) -> bool:
-        """Whether there are tables of samples."""
-        return path.is_dir() and bool(_tables_with("sample_data", path))
+        """Test whether a path is a folder with tables of samples.
+
+        Args:
+            path: Existing path.
+        """
+        return path.is_dir() and bool(_find_folders_with_table("sample_data", path))
 
     def read_scan(self, sensor: str, index: int) -> Scan:
-        """Read a sweep."""
+        """Read a sweep of the LiDAR.
+
+        Args:
+            sensor: Name of the LiDAR.
+            index: Index of the frame.
+
+        Returns:
+            The scan with rings.
+        """
         path = self.path / self._files[index]
-        points_m, rows = read_cloud_with_rings(path)
-        return Scan(points_m, vehicle_T_ego @ self._mounts[index], str(path), rings=rows)
+        points_m, rings = read_cloud_with_rings(path)
+        return Scan(points_m, vehicle_T_ego @ self._mounts[index], str(path), rings=rings)
 
     def get_world_T_vehicle(self, index: int) -> Matrix:
-        """The pose of the ego when the sweep was made."""
-        world_T_ego = build_transform(convert_quaternion_to_rotation(self._rotations[index]), self._places_m[index])
+        """Return the (4, 4) pose of the vehicle at the time of a sweep."""
+        world_T_ego = build_transform(convert_quaternion_to_rotation(self._rotations[index]), self._positions_m[index])
         return world_T_ego @ invert(vehicle_T_ego)
 
     def read_boxes(self, index: int) -> Boxes:
-        """The annotations; between two key frames, what lies between theirs."""
-        return self._tracks.interpolate_boxes(float(self.times_s[index]), invert(self.get_world_T_vehicle(index)))
+        """Read the annotations of a key frame, or interpolate them between two key frames."""
+        return self._interpolator.interpolate_boxes(float(self.times_s[index]), invert(self.get_world_T_vehicle(index)))
 
     def read_calibrations(self) -> SensorCalibrations:
-        """The LiDAR's mount, and the cameras of its first key frame."""
+        """Read the extrinsics of the LiDAR and the cameras of its first key frame."""
         with report_bad_file(self._tables, "tables of nuScenes"):
-            first = self._sample_tokens[self.key_frames[0]]
-            rows = [
-                row
-                for row in read_json_table(self._tables / "sample_data.json").rows
-                if row["sample_token"] == first and row["is_key_frame"] and "/CAM_" in str(row["filename"])
-            ]
-            cameras = [
-                read_nuscenes(
+            sample_token = self._sample_tokens[self.key_frames[0]]
+            rows = []
+            for row in read_json_table(self._tables / "sample_data.json").rows:
+                is_in_frame = row["sample_token"] == sample_token and row["is_key_frame"]
+                if is_in_frame and "/CAM_" in str(row["filename"]):
+                    rows.append(row)
+            cameras = []
+            for row in sorted(rows, key=_get_file_name):
+                camera = read_nuscenes(
                     self._tables,
                     Path(row["filename"]).parent.name,
                     token=row["calibrated_sensor_token"],
                     width=row["width"],
                     height=row["height"],
                 )
-                for row in sorted(rows, key=lambda row: str(row["filename"]))
-            ]
-        placed = [replace(one, vehicle_T_camera=vehicle_T_ego @ np.asarray(one.vehicle_T_camera)) for one in cameras]
+                vehicle_T_camera = vehicle_T_ego @ np.asarray(camera.vehicle_T_camera)
+                cameras.append(replace(camera, vehicle_T_camera=vehicle_T_camera))
         source = f"calibrated_sensor.json for {self.frame_names[self.key_frames[0]]}"
-        return SensorCalibrations(source, {CHANNEL: vehicle_T_ego @ self._mounts[self.key_frames[0]]}, tuple(placed))
+        return SensorCalibrations(source, {CHANNEL: vehicle_T_ego @ self._mounts[self.key_frames[0]]}, tuple(cameras))
 
-    def _read(self, tables: Path, scenes: Sequence[str] | None) -> None:
-        samples = self._samples(tables, scenes)
-        poses, calibrations = (
-            read_json_table(tables / "ego_pose.json"),
-            read_json_table(tables / "calibrated_sensor.json"),
-        )
-        data = [
-            row
-            for row in read_json_table(tables / "sample_data.json").rows
-            if f"/{CHANNEL}/" in str(row["filename"]) and row["sample_token"] in samples
-        ]
-        data.sort(key=lambda row: row["timestamp"])
+    def _read_tables(self, tables: Path, scenes: Sequence[str] | None) -> None:
+        samples = self._read_sample_times(tables, scenes)
+        poses = read_json_table(tables / "ego_pose.json")
+        calibrations = read_json_table(tables / "calibrated_sensor.json")
+        data = []
+        for row in read_json_table(tables / "sample_data.json").rows:
+            if f"/{CHANNEL}/" in str(row["filename"]) and row["sample_token"] in samples:
+                data.append(row)
+        data.sort(key=itemgetter("timestamp"))
         self.frame_names = tuple(row["filename"].rpartition("/")[2].removesuffix(".pcd.bin") for row in data)
-        self.key_frames = [number for number, row in enumerate(data) if row["is_key_frame"]]
+        self.key_frames = [index for index, row in enumerate(data) if row["is_key_frame"]]
         if not self.key_frames:
             raise ValueError(f"no key frame of {CHANNEL}")
         self.times_s = check_times(np.array([row["timestamp"] for row in data]) * 1e-6, len(data), CHANNEL)
         self._files = [check_path_within(self.path, row["filename"]) for row in data]
-        driven = [poses.get_row(row["ego_pose_token"]) for row in data]
-        self._rotations = np.array([row["rotation"] for row in driven], dtype=np.float64)
-        self._places_m = np.array([row["translation"] for row in driven], dtype=np.float64)
-        _check_poses(self._rotations, self._places_m)
-        mounts = {
-            token: parse_pose(calibrations.get_row(token)) for token in {row["calibrated_sensor_token"] for row in data}
-        }
-        self._mounts = [mounts[row["calibrated_sensor_token"]] for row in data]
+        pose_rows = [poses.get_row(row["ego_pose_token"]) for row in data]
+        self._rotations = np.array([row["rotation"] for row in pose_rows], dtype=np.float64)
+        self._positions_m = np.array([row["translation"] for row in pose_rows], dtype=np.float64)
+        _check_poses(self._rotations, self._positions_m)
+        calibration_tokens = [row["calibrated_sensor_token"] for row in data]
+        mounts = {token: parse_pose(calibrations.get_row(token)) for token in set(calibration_tokens)}
+        self._mounts = [mounts[token] for token in calibration_tokens]
         self._sample_tokens = [row["sample_token"] for row in data]
         self._tables, self._sample_times = tables, samples
 
     @cached_property
-    def _tracks(self) -> ObjectInterpolator:
+    def _interpolator(self) -> ObjectInterpolator:
         with report_bad_file(self._tables, "annotations of nuScenes"):
-            return ObjectInterpolator(_seen(self._tables, self._sample_times))
+            return ObjectInterpolator(_read_states(self._tables, self._sample_times))
 
-    def _samples(self, tables: Path, scenes: Sequence[str] | None) -> dict[str, float]:
-        """Token -> time in seconds of the key frames of the wanted scenes."""
+    def _read_sample_times(self, tables: Path, scenes: Sequence[str] | None) -> dict[str, float]:
+        """Read token and time in seconds of the key frames of the requested scenes."""
         by_name = {row["name"]: row["token"] for row in read_json_table(tables / "scene.json").rows}
         unknown = set(scenes or ()) - by_name.keys()
         if unknown:
             raise ValueError(f"no scene {', '.join(sorted(unknown))}; there are {', '.join(sorted(by_name))}")
-        wanted = {token for name, token in by_name.items() if scenes is None or name in scenes}
+        scene_tokens = {token for name, token in by_name.items() if scenes is None or name in scenes}
         rows = read_json_table(tables / "sample.json").rows
-        return {row["token"]: row["timestamp"] * 1e-6 for row in rows if row["scene_token"] in wanted}
+        return {row["token"]: row["timestamp"] * 1e-6 for row in rows if row["scene_token"] in scene_tokens}
 
 
 def has_objects(path: Path) -> bool:
-    """Whether it is one folder of tables with annotations, be there scans or not."""
-    return path.is_dir() and len(_tables_with("sample_annotation", path)) == 1
+    """Test whether a path holds one folder of tables with annotations, with or without scans.
+
+    Args:
+        path: Existing path.
+    """
+    return path.is_dir() and len(_find_folders_with_table("sample_annotation", path)) == 1
 
 
 def read_objects(path: Path, scene: str | None = None) -> RecordedObjects:
-    """Read the annotations of one scene and the drive of its ego, at times after its first sample.
+    """Read the annotations of one scene and the drive of its ego vehicle.
 
     Args:
-        path: The data set, or its folder of tables.
-        scene: Its name, or its token; the only one if None.
+        path: Data set, or its folder of tables.
+        scene: Name or token of the scene; None if there is only one.
+
+    Returns:
+        Tracks and the ego vehicle, with times relative to the first sample.
 
     Raises:
-        BadFileError: Tables of another content, several scenes.
+        BadFileError: A table has another content, or the scene is ambiguous or unknown.
         FileNotFoundError: A table is missing.
     """
-    (tables,) = _tables_with("sample_annotation", path)
-    samples, poses = (read_json_table(tables / f"{name}.json").rows for name in ("sample", "ego_pose"))
+    (tables,) = _find_folders_with_table("sample_annotation", path)
+    samples = read_json_table(tables / "sample.json").rows
+    poses = read_json_table(tables / "ego_pose.json").rows
     with report_bad_file(tables, "tables of nuScenes"):
-        token = _scene(samples, tables / "scene.json", scene)
-        taken = {row["token"]: row["timestamp"] for row in samples if row["scene_token"] == token}
-        first_us, last_us = min(taken.values()), max(taken.values())
-        seen = group_by_name(_seen(tables, {token: (time_us - first_us) * 1e-6 for token, time_us in taken.items()}))
-        driven = sorted((row for row in poses if first_us <= row["timestamp"] <= last_us), key=itemgetter("timestamp"))
-        if not driven:
+        scene_token = _find_scene_token(samples, tables / "scene.json", scene)
+        times_us = {row["token"]: row["timestamp"] for row in samples if row["scene_token"] == scene_token}
+        first_us, last_us = min(times_us.values()), max(times_us.values())
+        times_s = {token: (time_us - first_us) * 1e-6 for token, time_us in times_us.items()}
+        states_by_name = group_by_name(_read_states(tables, times_s))
+        ego_rows = [row for row in poses if first_us <= row["timestamp"] <= last_us]
+        ego_rows.sort(key=itemgetter("timestamp"))
+        if not ego_rows:
             raise ValueError("no ego_pose from the first sample of the scene to the last")
-        ego_s = np.array([(row["timestamp"] - first_us) * 1e-6 for row in driven])
-        world_T_ego = np.stack([parse_pose(row) for row in driven])
-        tracks = tuple(build_track(one, _class(one[0].category)) for one in seen.values())
-    return RecordedObjects(tracks, (Ego("ego", ego_s, world_T_ego, invert(vehicle_T_ego), SIZE_M),))
+        ego_s = np.array([(row["timestamp"] - first_us) * 1e-6 for row in ego_rows])
+        world_T_ego = np.stack([parse_pose(row) for row in ego_rows])
+        tracks = tuple(build_track(states, _find_class(states[0].category)) for states in states_by_name.values())
+    size_m = (4.084, 1.730, 1.562)  # as in the body `renault_zoe`, which names the source
+    return RecordedObjects(tracks, (Ego("ego", ego_s, world_T_ego, invert(vehicle_T_ego), size_m),))
 
 
-def _seen(tables: Path, times_s: Mapping[str, float]) -> list[ObjectState]:
+def _read_states(tables: Path, times_s: Mapping[str, float]) -> list[ObjectState]:
+    """Read the annotations of samples with known times, in the world frame."""
     categories, instances = read_json_table(tables / "category.json"), read_json_table(tables / "instance.json")
-    seen = []
+    visible_shares = {"1": 0.2, "2": 0.5, "3": 0.7, "4": 0.9}  # center of each visibility level, by its token
+    states = []
     for row in read_json_table(tables / "sample_annotation.json").rows:
         if row["sample_token"] in times_s:
             width, length, height = row["size"]
             name = row["instance_token"]
             category = str(categories.get_row(instances.get_row(name)["category_token"])["name"])
             world_T_box = build_transform(convert_quaternion_to_rotation(row["rotation"]), row["translation"])
-            visibility = SHARES.get(str(row.get("visibility_token")), np.nan)
+            visibility = visible_shares.get(str(row.get("visibility_token")), np.nan)
             size_m = (length, width, height)
-            seen.append(ObjectState(name, times_s[row["sample_token"]], world_T_box, size_m, category, visibility))
-    return seen
+            states.append(ObjectState(name, times_s[row["sample_token"]], world_T_box, size_m, category, visibility))
+    return states
 
 
-def _scene(samples: list[dict[str, Any]], path: Path, scene: str | None) -> str:
+def _find_scene_token(samples: list[dict[str, Any]], path: Path, scene: str | None) -> str:
+    """Find the token of a scene by its name or token; `path` is the table of scenes, which may be missing."""
     tokens = dict.fromkeys(str(row["scene_token"]) for row in samples)
     rows = read_json_table(path).rows if path.exists() else []
-    names = {row["name"]: row["token"] for row in rows if row["token"] in tokens}
-    called = names or {token: token for token in tokens}
+    token_by_name = {row["name"]: row["token"] for row in rows if row["token"] in tokens}
+    token_by_name = token_by_name or {token: token for token in tokens}
     if scene is None and len(tokens) == 1:
         return next(iter(tokens))
-    if scene is not None and (scene in called or scene in tokens):
-        return str(called.get(scene, scene))
-    told = ", ".join(list(called)[:8]) + (f" and {len(called) - 8} more" if len(called) > 8 else "")
-    raise ValueError(f"scene: one of {told or 'none'} is needed; got {'none' if scene is None else repr(scene)}")
+    if scene is not None and (scene in token_by_name or scene in tokens):
+        return str(token_by_name.get(scene, scene))
+    names = ", ".join(list(token_by_name)[:8])
+    if len(token_by_name) > 8:
+        names += f" and {len(token_by_name) - 8} more"
+    raise ValueError(f"scene: one of {names or 'none'} is needed; got {'none' if scene is None else repr(scene)}")
 
 
-def _class(category: str) -> str | None:
-    classes = load_road_user_classes()["nuscenes"].items()
-    return next((found for beginning, found in classes if category.lower().startswith(beginning)), None)
+def _find_class(category: str) -> str | None:
+    """Find SUMO's vehicle class by the first matching prefix of a category."""
+    for prefix, vehicle_class in load_road_user_classes()["nuscenes"].items():
+        if category.lower().startswith(prefix):
+            return vehicle_class
+    return None
+
+
+def _get_file_name(row: Mapping[str, Any]) -> str:
+    return str(row["filename"])
 
 
 def parse_pose(row: dict[str, Any]) -> Matrix:
-    """(4, 4) the pose of a row with `rotation` (w, x, y, z) and `translation`."""
+    """Parse the pose of a row with `rotation` (w, x, y, z) and `translation`.
+
+    Args:
+        row: Row of a table.
+
+    Returns:
+        (4, 4) transform.
+
+    Raises:
+        ValueError: The quaternion is 0, or numbers are missing or not finite.
+    """
     matrix = build_transform(convert_quaternion_to_rotation(row["rotation"]), row["translation"])
     if not np.isfinite(matrix).all():
         raise ValueError(f"translation: three finite numbers are needed; got {row['translation']}")
     return matrix
 
 
-def _check_poses(rotations: NDArray[np.float64], places_m: NDArray[np.float64]) -> None:
-    """Whether (F, 4) quaternions and (F, 3) places are those of poses."""
-    if rotations.shape[1:] != (4,) or places_m.shape[1:] != (3,):
+def _check_poses(rotations: NDArray[np.float64], positions_m: NDArray[np.float64]) -> None:
+    """Check that (F, 4) quaternions and (F, 3) positions are valid poses."""
+    if rotations.shape[1:] != (4,) or positions_m.shape[1:] != (3,):
         raise ValueError("every pose needs a rotation of 4 numbers and a translation of 3")
-    if not (np.isfinite(rotations).all() and np.isfinite(places_m).all()):
-        bad = ~np.isfinite(np.column_stack([rotations, places_m])).all(axis=1)
+    if not (np.isfinite(rotations).all() and np.isfinite(positions_m).all()):
+        bad = ~np.isfinite(np.column_stack([rotations, positions_m])).all(axis=1)
         raise ValueError(f"{np.count_nonzero(bad)} of {len(rotations)} poses have numbers that are not finite")
     if not rotations.any(axis=1).all():
         raise ValueError("a quaternion of norm 0 is no rotation; the identity is [1, 0, 0, 0] (w, x, y, z)")
 
 
-def _tables(path: Path) -> Path:
-    found = _tables_with("sample_data", path)
-    if len(found) != 1:
-        names = ", ".join(version.name for version in found) or "none"
+def _find_tables(path: Path) -> Path:
+    folders = _find_folders_with_table("sample_data", path)
+    if len(folders) != 1:
+        names = ", ".join(folder.name for folder in folders) or "none"
         raise ValueError(f"{path}: one folder of tables v1.0-*/ is needed; got {names}; name it in the path")
-    return found[0]
+    return folders[0]
 
 
-def _tables_with(table: str, path: Path) -> list[Path]:
-    """The folder itself if the table is in it, else those of its versions."""
+def _find_folders_with_table(table: str, path: Path) -> list[Path]:
+    """Find the folder itself if it has the table, else its folders of versions that have it."""
     if (path / f"{table}.json").exists():
         return [path]
-    return sorted(found.parent for found in path.glob(f"v1.0-*/{table}.json"))
+    return sorted(file.parent for file in path.glob(f"v1.0-*/{table}.json"))
 
 
 def check_path_within(folder: Path, name: str) -> str:
-    """Return a path that a table names, if it is one within a folder.
+    """Check that a path of a table lies within the data set.
+
+    Args:
+        folder: Data set.
+        name: Path relative to it.
+
+    Returns:
+        `name`.
+
+    Raises:
+        ValueError: The path is absolute, empty or leaves the folder.
 
     Example:
         >>> check_path_within(Path("drive"), "samples/a.bin")
         'samples/a.bin'
     """
-    # Of a hundred thousand names few need to be taken apart.
+    # Splitting a hundred thousand names is slow, and few of them need it.
     if ".." in name or ":" in name or "\\" in name or not name.strip("./") or name.startswith("/"):
         parts = Path(name).parts
         if Path(name).is_absolute() or ".." in parts or not parts:
