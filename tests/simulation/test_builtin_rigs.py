@@ -161,7 +161,7 @@ def test_the_placements_of_place3ds_tables_have_the_lidar_of_its_tables():
     assert len(placements) == 9 + len(IN_DEGREES)
     for name in placements:
         for sensor in Rig.load(name).sensors:
-            rows = sensor.rows_deg()
+            rows = sensor.compute_elevations_deg()
             assert (len(rows), rows.min(), rows.max()) == (16, pytest.approx(-24.8), pytest.approx(2.0))
             assert (sensor.columns, sensor.max_range_m, sensor.horizontal_fov_deg) == (250, 100.0, 360.0)
     for name in RIGS:
@@ -260,7 +260,7 @@ def test_argoverses_lower_lidar_hangs_upside_down():
 def test_roof_rigs_differ_in_their_rows_alone():
     roofs = {rows: Rig.load(f"front_roof_{rows}").sensors[0] for rows in (32, 64, 128)}
     for rows, sensor in roofs.items():
-        assert len(sensor.rows_deg()) == rows
+        assert len(sensor.compute_elevations_deg()) == rows
         assert sensor.model_copy(update={"channels": 128}) == roofs[128]
 
 

@@ -128,7 +128,7 @@ def test_a_model_can_be_a_file_beside_the_rig(tmp_path):
     (tmp_path / "own.yaml").write_text(
         "{name: own, elevations_deg: [0, -5], horizontal_fov_deg: 90, columns: 4, max_range_m: 9}"
     )
-    assert read(tmp_path, "model: own.yaml").rows_deg().tolist() == [0, -5]
+    assert read(tmp_path, "model: own.yaml").compute_elevations_deg().tolist() == [0, -5]
 
 
 @pytest.mark.parametrize(

@@ -111,11 +111,11 @@ def test_a_sensor_faces_outwards_unless_the_region_says_where_to(side, facing_de
 @pytest.mark.parametrize(
     ("keys", "message"),
     [
-        ({"seen_from": "above", "x_m": (0.0, 1.0)}, "a window has x_m and y_m; got x_m"),
-        ({"seen_from": "left", "x_m": (0.0, 1.0), "y_m": (0.0, 1.0)}, "x_m and z_m; got x_m and y_m"),
-        ({"seen_from": "above", "x_m": (1.0, 1.0), "y_m": (0.0, 1.0)}, "the lower bound must be below the upper one"),
-        ({"seen_from": "above", "x_m": (0.0, np.nan), "y_m": (0.0, 1.0)}, "finite"),
-        ({"seen_from": "below", "x_m": (0.0, 1.0), "y_m": (0.0, 1.0)}, "'above', 'front', 'rear', 'left' or 'right'"),
+        ({"side": "above", "x_m": (0.0, 1.0)}, "a window has x_m and y_m; got x_m"),
+        ({"side": "left", "x_m": (0.0, 1.0), "y_m": (0.0, 1.0)}, "x_m and z_m; got x_m and y_m"),
+        ({"side": "above", "x_m": (1.0, 1.0), "y_m": (0.0, 1.0)}, "the lower bound must be below the upper one"),
+        ({"side": "above", "x_m": (0.0, np.nan), "y_m": (0.0, 1.0)}, "finite"),
+        ({"side": "below", "x_m": (0.0, 1.0), "y_m": (0.0, 1.0)}, "'above', 'front', 'rear', 'left' or 'right'"),
     ],
 )
 def test_a_region_that_is_none_is_refused(keys, message):

@@ -159,7 +159,7 @@ def test_an_object_that_turns_only_its_inner_side_to_a_place_hides_itself():
     place_m = np.array([1.0, 2.0, 3.0])
     away = UprightBoxes(np.full((1, 3), 90.0), np.full((1, 3), 99.0))
     patches = Patches.from_mesh(mesh)
-    strata = SurfaceStrata(patches._replace(of_object=np.zeros_like(patches.object_indices)), away)
+    strata = SurfaceStrata(patches._replace(object_indices=np.zeros_like(patches.object_indices)), away)
     drawn = strata.sample_points(place_m, 5.0, np.random.default_rng(0), points_per_object=50)
     assert drawn.object_indices.tolist() == [0] * 50
     instant = SceneGeometry(Scene((mesh,), EGO)).get_snapshot(0)
@@ -208,5 +208,5 @@ def test_a_frame_tells_what_is_hidden_from_the_places_too_from_what_nobody_asked
 
 def test_frames_with_boxes_ask_about_every_object_unless_they_are_given_a_reference():
     frames = [SimulatedFrames("courtyard", "front_roof_32", num_frames=1, boxes=boxes) for boxes in (False, True)]
-    assert [some.reference_sensor.object_points for some in frames] == [0, 64]
+    assert [some.reference_sensor.points_per_object for some in frames] == [0, 64]
     assert frames[0].reference_sensor.areas == frames[1].reference_sensor.areas

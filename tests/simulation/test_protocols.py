@@ -65,16 +65,16 @@ class DownReference:
     @classmethod
     def from_query_plan(cls, query_plan, num_rays):
         if num_rays is not None and num_rays < 1:
-            raise ValueError(f"rays: at least 1 is needed; got {num_rays}")
+            raise ValueError(f"num_rays: at least 1 is needed; got {num_rays}")
         return cls(8 if num_rays is None else num_rays)
 
     def scan(self, context):
-        pose, redrawn = context.free_pose(self.sample_pose)
-        x, y = context.generator.uniform(-0.1, 0.1, size=(2, 1, self.num_rays))
+        pose, redrawn = context.sample_free_pose(self.sample_pose)
+        x, y = context.rng.uniform(-0.1, 0.1, size=(2, 1, self.num_rays))
         tiles = split_into_tiles(np.stack([x, y, -np.sqrt(1 - x**2 - y**2)]))
-        seen = context.instant.scan(pose, tiles, max_range_m=self.max_range_m)
+        seen = context.snapshot.scan(pose, tiles, max_range_m=self.max_range_m)
         weights = np.full(len(seen.points), 2.0, dtype=np.float32)
-        return ReferenceScan(seen.points, weights, seen.rays, seen.self_hits, seen.body_casts, redrawn)
+        return ReferenceScan(seen.points, weights, seen.num_rays, seen.self_hits, seen.num_body_casts, redrawn)
 
     def sample_pose(self, ego_box, rng):
         return build_transform(np.eye(3), sample_position_in_shell(ego_box, self.shell_m, rng))
@@ -115,7 +115,7 @@ def reference_sensor(request, monkeypatch):
 
 
 def test_a_sensors_directions_are_of_length_one_or_none(sensor):
-    directions = sensor.directions()
+    directions = sensor.compute_directions()
     assert directions.dtype == np.float64
     assert directions.ndim == 3
     assert len(directions) == 3
@@ -124,11 +124,11 @@ def test_a_sensors_directions_are_of_length_one_or_none(sensor):
     assert (there.all(axis=0) == there.any(axis=0)).all()
     lengths = np.linalg.norm(directions, axis=0)[there[0]]
     np.testing.assert_allclose(lengths, 1.0, atol=1e-12)
-    np.testing.assert_array_equal(sensor.directions(), directions)
+    np.testing.assert_array_equal(sensor.compute_directions(), directions)
 
 
 def test_a_sensors_fields_of_view_hold_its_rays(sensor):
-    x, y, z = sensor.directions()
+    x, y, z = sensor.compute_directions()
     low, high = compute_vertical_fov_deg(sensor)
     middle = np.rad2deg(np.arcsin(z))[:, x.shape[1] // 2]
     assert (low, high) == pytest.approx((np.nanmin(middle), np.nanmax(middle)))
@@ -138,14 +138,14 @@ def test_a_sensors_fields_of_view_hold_its_rays(sensor):
 
 def hits_of(sensor, range_m, ray=None):
     """Hits of all rays, or of some, at these distances."""
-    pixel_of_ray = np.flatnonzero(~np.isnan(sensor.directions()[0]))
+    pixel_of_ray = np.flatnonzero(~np.isnan(sensor.compute_directions()[0]))
     ray = np.arange(len(pixel_of_ray)) if ray is None else ray
     return RayHits(ray, np.broadcast_to(range_m, len(ray)).astype(np.float32), pixel_of_ray)
 
 
 def hit_by(returns, count):
     """Which of so many hits give a point."""
-    return np.arange(count) if returns.hit is None else returns.hit
+    return np.arange(count) if returns.hit_indices is None else returns.hit_indices
 
 
 def test_a_sensor_makes_points_of_hits_that_are_far_enough_and_of_no_others(sensor):
@@ -163,7 +163,7 @@ def test_a_sensor_makes_points_of_hits_that_are_far_enough_and_of_no_others(sens
 
 def test_what_a_sensor_makes_of_a_beam_does_not_depend_on_other_beams(sensor):
     """Hits that are taken away change nothing about those of beams that keep theirs, in any number of places."""
-    beams, random = sensor.beams(), np.random.default_rng(5)
+    beams, random = sensor.compute_beam_indices(), np.random.default_rng(5)
     whole = hits_of(sensor, random.uniform(0.5, 9.0, len(hits_of(sensor, 1.0).ray_indices)))
     of_ray = whole.ray_indices if beams is None else beams.ravel()[whole.pixel_indices]
     measured = sensor.measure(whole, SensorNoise(np.random.default_rng(0), num_rays=len(whole.ray_indices)))
@@ -172,9 +172,9 @@ def test_what_a_sensor_makes_of_a_beam_does_not_depend_on_other_beams(sensor):
         whole.ray_indices[kept], whole.range_m[kept], whole.ray_pixel_indices, np.zeros(len(kept), dtype=np.int64)
     )
     of_part = sensor.measure(part, SensorNoise(np.random.default_rng(0), num_rays=len(whole.ray_indices)))
-    left = np.isin(measured.hit, kept)
-    np.testing.assert_array_equal(kept[of_part.hit], measured.hit[left])
-    np.testing.assert_array_equal(of_part.error_m, measured.error_m[left])
+    left = np.isin(measured.hit_indices, kept)
+    np.testing.assert_array_equal(kept[of_part.hit_indices], measured.hit_indices[left])
+    np.testing.assert_array_equal(of_part.range_error_m, measured.range_error_m[left])
     twice = RayHits(
         np.tile(whole.ray_indices, 2),
         np.tile(whole.range_m, 2),
@@ -182,7 +182,7 @@ def test_what_a_sensor_makes_of_a_beam_does_not_depend_on_other_beams(sensor):
         np.repeat([0, 1], len(whole.ray_indices)),
     )
     both = sensor.measure(twice, SensorNoise(np.random.default_rng(0), num_rays=len(whole.ray_indices)))
-    np.testing.assert_array_equal(both.hit, np.concatenate([measured.hit, measured.hit + len(whole.ray_indices)]))
+    np.testing.assert_array_equal(both.hit_indices, np.concatenate([measured.hit_indices, measured.hit_indices + len(whole.ray_indices)]))
 
 
 def test_a_sensor_asks_for_the_same_numbers_whatever_is_hit(sensor):
@@ -191,8 +191,8 @@ def test_a_sensor_asks_for_the_same_numbers_whatever_is_hit(sensor):
     used, fresh = (SensorNoise(np.random.default_rng(2), num_rays=rays) for _ in range(2))
     sensor.measure(hits_of(sensor, 1.0, np.empty(0, dtype=np.int64)), used)
     one, other = (sensor.measure(hits_of(sensor, 5.0), draws) for draws in (used, fresh))
-    np.testing.assert_array_equal(one.hit, other.hit)
-    np.testing.assert_array_equal(one.error_m, other.error_m)
+    np.testing.assert_array_equal(one.hit_indices, other.hit_indices)
+    np.testing.assert_array_equal(one.range_error_m, other.range_error_m)
 
 
 def test_a_sensor_survives_pickling_and_its_own_document(sensor):
@@ -213,8 +213,8 @@ def test_a_sensor_is_simulated(sensor):
         "courtyard", Rig(name="r", sensors=(exact,)), num_frames=1, reference_sensor=PaperReference(8, 8)
     )
     frame = frames[0]
-    assert frame.counts["sensor_rays"] == (~np.isnan(exact.directions()[0])).sum()
-    assert sensor.rays == exact.directions()[0].size
+    assert frame.counts["sensor_rays"] == (~np.isnan(exact.compute_directions()[0])).sum()
+    assert sensor.num_rays == exact.compute_directions()[0].size
     ranges_m = (frame.sensor.double() - torch.tensor([2.6, 0.0, 1.0])).norm(dim=1)
     assert 0 < len(ranges_m) <= frame.counts["sensor_rays"]
     assert ranges_m.max() <= exact.max_range_m
@@ -235,14 +235,14 @@ def test_how_far_a_sensor_reaches_is_decided_by_the_scenario(sensor, monkeypatch
 
     (whole, away_m), of_targets = seen(), targets()
     reach_m = float(away_m.min() + away_m.max()) / 2 - 0.01
-    monkeypatch.setattr(Scenario, "reach_m", lambda *_: reach_m)
+    monkeypatch.setattr(Scenario, "compute_max_range_m", lambda *_: reach_m)
     reference, near_m = seen()
     assert torch.equal(reference, whole)
     assert (near_m <= reach_m).all()
     assert (away_m > reach_m).any()
-    if sensor.beams() is None:  # else points of a beam are made of all its hits
+    if sensor.compute_beam_indices() is None:  # else points of a beam are made of all its hits
         assert len(near_m) == (away_m <= reach_m).sum()
-    monkeypatch.setattr(Scenario, "reach_m", lambda *_: 1.0)
+    monkeypatch.setattr(Scenario, "compute_max_range_m", lambda *_: 1.0)
     assert targets() == 0 < of_targets or sensor.type == "altimeter"
 
 
@@ -257,7 +257,7 @@ def test_what_is_no_sensor_is_refused_with_the_kinds_there_are(content):
 def test_a_reference_sensors_place_is_in_the_shell_around_the_ego(sensor):
     grown_m = sensor.shell_m + 1e-12
     for seed in range(50):
-        pose = sensor.vehicle_T_reference(EGO, np.random.default_rng(seed))
+        pose = sensor.sample_pose(EGO, np.random.default_rng(seed))
         np.testing.assert_allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
         np.testing.assert_array_equal(pose[3], [0, 0, 0, 1])
         assert (pose[:3, 3] >= np.array(EGO.lower_m) - [grown_m, grown_m, 0]).all()
@@ -266,15 +266,15 @@ def test_a_reference_sensors_place_is_in_the_shell_around_the_ego(sensor):
 
 
 def test_a_reference_sensor_without_a_number_of_rays_has_one_of_its_own(reference_sensor):
-    own = type(reference_sensor).from_rays(ASKED, None)
-    assert own == type(reference_sensor).from_rays(ASKED, None)
+    own = type(reference_sensor).from_query_plan(ASKED, None)
+    assert own == type(reference_sensor).from_query_plan(ASKED, None)
     assert own != reference_sensor
 
 
 @pytest.mark.parametrize("rays", [0, -4])
 def test_a_reference_sensor_without_rays_is_refused(reference_sensor, rays):
-    with pytest.raises(ValueError, match=f"rays: at least .*; got {rays}"):
-        type(reference_sensor).from_rays(ASKED, rays)
+    with pytest.raises(ValueError, match=f"num_rays: at least .*; got {rays}"):
+        type(reference_sensor).from_query_plan(ASKED, rays)
 
 
 def test_a_reference_sensor_survives_pickling(reference_sensor):
@@ -304,7 +304,7 @@ def test_a_reference_sensors_points_are_near_enough_and_have_the_weights_that_it
     assert seen.reference.shape == (len(seen.reference), 3)
     farthest_m = np.linalg.norm(EGO.corners_m, axis=1).max() + 2 * reference_sensor.shell_m
     assert np.linalg.norm(seen.reference, axis=1).max() <= reference_sensor.max_range_m + farthest_m
-    assert reference_sensor.square_metres == (seen.reference_weights is not None)
+    assert reference_sensor.has_area_weights == (seen.reference_weights is not None)
     if seen.reference_weights is not None:
         assert seen.reference_weights.dtype == np.float32
         assert len(seen.reference_weights) == len(seen.reference)

@@ -30,7 +30,7 @@ def points_of(sensor, *bodies):
 def cells_of(sensor, points_m):
     """(N, 2) the cells of azimuth and of range that points lie in."""
     azimuth_deg = np.rad2deg(np.arctan2(points_m[:, 1], points_m[:, 0]))
-    across = (azimuth_deg + sensor.horizontal_fov_deg / 2) / sensor.horizontal_fov_deg * sensor.azimuth_cells
+    across = (azimuth_deg + sensor.horizontal_fov_deg / 2) / sensor.horizontal_fov_deg * sensor.num_azimuth_cells
     along = np.linalg.norm(points_m, axis=1) / sensor.range_cell_m
     return np.floor(np.column_stack([across, along]) + 1e-6).astype(int)
 

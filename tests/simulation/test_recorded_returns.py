@@ -157,7 +157,7 @@ def test_what_lies_beside_the_lanes_is_no_road():
 
 def test_rays_to_what_is_near_are_in_nobodys_count(sweeps):
     """The steep ones: they return, whatever the LiDAR."""
-    assert np.tan(np.deg2rad(RIG.sensors[0].rows_deg())).min() < -HEIGHT_M / 5
+    assert np.tan(np.deg2rad(RIG.sensors[0].compute_elevations_deg())).min() < -HEIGHT_M / 5
     assert count_ground_rays(sweeps, RIG.sensors[0]).range_m.min() > NEAREST_M
 
 

@@ -20,7 +20,7 @@ from torchcover.simulation.scan_estimate import estimate_scan, infer_laser_indic
 
 def in_a_room(lidar, seed, dropout=0.2):
     """What a LiDAR sees in a room, where no ray is lost but by chance: points in its frame."""
-    directions = lidar.directions()
+    directions = lidar.compute_directions()
     random = np.random.default_rng(seed)
     size_m = np.array([30.0, 12.0, 8.0])[:, None, None]
     range_m = (size_m / np.maximum(np.abs(directions), 1e-12)).min(axis=0)
@@ -93,19 +93,19 @@ class Turning(Drive):
         points_m = np.einsum(
             "nij,nj->ni", np.broadcast_to(local_T_world, world_T_cast.shape), np.c_[seen_m, np.ones(len(seen_m))]
         )[:, :3]
-        told = {"rows": np.repeat(np.arange(16), 300), "offsets_s": offsets_s}
+        told = {"rings": np.repeat(np.arange(16), 300), "offsets_s": offsets_s}
         return Scan(points_m, self.mount, "roof", **{name: told[name] for name in self.told_of})
 
 
 @pytest.mark.parametrize(
     ("drive", "said"),
     [
-        (Turning(told=("rows", "offsets_s")), "each ray at its own time"),
+        (Turning(told=("rings", "offsets_s")), "each ray at its own time"),
         (Turning(told=("offsets_s",)), "each ray at its own time"),
         (Turning(), "motion undone .turns clockwise from"),
         (Turning(1, -70.0, 1.0), "motion undone .turns counter-clockwise from"),
         (Turning(moved=False), "farthest return[.]$"),
-        (Turning(told=("rows",)), "motion undone .turns clockwise from"),
+        (Turning(told=("rings",)), "motion undone .turns clockwise from"),
     ],
 )
 def test_rows_of_a_vehicle_in_motion_are_those_of_its_rays(drive, said):
@@ -113,18 +113,18 @@ def test_rows_of_a_vehicle_in_motion_are_those_of_its_rays(drive, said):
     (lidar,) = Rig.model_validate(rig).sensors
     assert re.search(said, rig["description"])
     assert "min_range_m" not in rig["sensors"][0]  # of the nearest return it would be blind to all that comes nearer
-    true_deg = drive.lidar.rows_deg()
-    assert len(lidar.rows_deg()) == len(true_deg)
-    np.testing.assert_allclose(lidar.rows_deg(), np.sort(true_deg)[::-1], atol=0.05)
+    true_deg = drive.lidar.compute_elevations_deg()
+    assert len(lidar.compute_elevations_deg()) == len(true_deg)
+    np.testing.assert_allclose(lidar.compute_elevations_deg(), np.sort(true_deg)[::-1], atol=0.05)
     np.testing.assert_allclose(lidar.mount.to_matrix(), drive.mount, atol=1e-5)
 
 
 def test_of_frames_seconds_apart_no_motion_is_undone_and_no_clock_is_blamed():
-    drive = Turning(told=("rows",))
+    drive = Turning(told=("rings",))
     drive.times_s = 100.0 * drive.times_s
     said = build_rig_document(drive)["description"]
     assert "motion within a turn not undone, for frames are 10 s apart (at most 0.25 s are needed" in said
-    drive.told_of = ("rows", "offsets_s")
+    drive.told_of = ("rings", "offsets_s")
     with pytest.raises(ValueError, match=r"the poses before and after .* are 10 s apart; .* at most 1 s apart"):
         build_rig_document(drive)
 
@@ -309,7 +309,7 @@ def test_cameras_show_points_where_their_data_set_says(layout, raw, tmp_path):
     )
     vehicle_m = ahead_m[:3].T
     in_camera_m = transform_points(invert(sensor.mount.to_matrix() @ MOUNT_T_CAMERA), vehicle_m)
-    found, shown = sensor.camera().project(torch.from_numpy(in_camera_m))
+    found, shown = sensor.build_camera().project(torch.from_numpy(in_camera_m))
     assert shown.sum() > 30
     np.testing.assert_allclose(
         found[shown].numpy(), pixels(vehicle_m, **{"raw": True} if raw else {})[shown.numpy()], atol=0.01

@@ -171,7 +171,7 @@ def test_grid_and_regions_fit_the_room_and_the_range(max_range_m, name, x, forwa
         {"name": "r", "sensors": [{"name": "s", "mount": {"x_m": 0.2, "z_m": 1.0}, "channels": 2, "columns": 4,
          "vertical_fov_deg": (-30, 0), "horizontal_fov_deg": 360, "max_range_m": max_range_m}]}
     )  # fmt: skip
-    result = evaluate(rig, office(), steps=1, rays=256, probe="none")
+    result = evaluate(rig, office(), num_frames=1, num_rays=256, test_targets="none")
     grid = result.coverage.grid
     assert grid.x == x
     near = ["front_3m", "rear_3m", "left_3m", "right_3m"]
@@ -179,4 +179,4 @@ def test_grid_and_regions_fit_the_room_and_the_range(max_range_m, name, x, forwa
     whole = next(region for region in result.regions if region.name == name)
     assert (whole.x, whole.y) == (grid.x, grid.y)
     asked = RegionsOfInterest(grid={"x_m": (-10.0, 50.0)})
-    assert evaluate(rig, office(), steps=1, rays=256, probe="none", ask=asked).coverage.grid.x == (-10.0, 50.0)
+    assert evaluate(rig, office(), num_frames=1, num_rays=256, test_targets="none", regions=asked).coverage.grid.x == (-10.0, 50.0)

@@ -87,7 +87,7 @@ def test_bad_materials_are_told():
     ("given", "told"),
     [
         ({"range_at_10_percent_m": 0.0}, "greater than 0"),
-        ({"range_at_10_percent_m": 50.0, "spread": 0.0}, "greater than 0"),
+        ({"range_at_10_percent_m": 50.0, "log_range_std": 0.0}, "greater than 0"),
         ({"range_factors": [1.0]}, "one for each of the 2 rows is needed; got 1"),
     ],
 )
@@ -113,7 +113,7 @@ ROOF = {
     "horizontal_fov_deg": 360.0,
     "max_range_m": 150.0,
     "range_at_10_percent_m": 60.0,
-    "spread": 0.25,
+    "log_range_std": 0.25,
 }
 
 
@@ -135,7 +135,7 @@ def test_as_many_return_from_a_plain_as_the_law_says():
         road.incidence_exponent,
         ROOF["range_at_10_percent_m"],
     )
-    expected = compute_return_probability(excess, ROOF["spread"], road.log_reflectivity_std)
+    expected = compute_return_probability(excess, ROOF["log_range_std"], road.log_reflectivity_std)
     there = np.isin(every.ray_indices, returned.ray_indices)
     for low_m in range(15, 75, 15):
         some = is_road & (every.range_m > low_m) & (every.range_m < low_m + 15)

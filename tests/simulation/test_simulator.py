@@ -49,7 +49,7 @@ def test_a_step_depends_on_seed_and_index_only_and_survives_pickling():
     late = made.simulate_frame(6)
     assert made.simulate_frame(0).counts["moving_bodies"] > 0
     assert same(made.simulate_frame(6), late)
-    assert same(pickle.loads(pickle.dumps(made)).step(6), late)
+    assert same(pickle.loads(pickle.dumps(made)).simulate_frame(6), late)
     assert not same(simulator(scenario=made.scenario, seed=2).simulate_frame(6), late)
 
 

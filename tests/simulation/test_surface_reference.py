@@ -222,9 +222,9 @@ def test_threads_workers_and_pickling_change_nothing():
         ({"bands_m": ()}, "bands_m: at least one"),
         ({"bands_m": ((0.5, 0.5),)}, "bands_m: at least one"),
         ({"bands_m": ((0.0, math.inf),)}, "bands_m: at least one"),
-        ({"rays": 0}, "rays: at least 1 is needed; got 0"),
-        ({"places": 0}, "places: at least 1 is needed; got 0"),
-        ({"object_points": -1}, "object_points: at least 0 is needed; got -1"),
+        ({"num_rays": 0}, "num_rays: at least 1 is needed; got 0"),
+        ({"num_poses": 0}, "num_poses: at least 1 is needed; got 0"),
+        ({"points_per_object": -1}, "points_per_object: at least 0 is needed; got -1"),
         ({"shell_m": 0.0}, "shell_m: a positive thickness"),
         ({"max_range_m": math.nan}, "max_range_m: a positive distance"),
     ],
@@ -252,4 +252,4 @@ def test_what_is_hidden_from_a_roadside_rig_counts_as_not_detected():
     with pytest.raises(ValueError, match="looks from the mast of this roadside rig"):
         SimulatedFrames(road, rig, num_frames=1, reference_sensor=PaperReference())
     on_car = SimulatedFrames("courtyard", "front_roof_32", num_frames=1).reference_sensor
-    assert (on_car.over_areas, on_car.shell_m) == (False, 0.5)
+    assert (on_car.is_over_areas, on_car.shell_m) == (False, 0.5)

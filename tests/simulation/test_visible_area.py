@@ -40,10 +40,10 @@ def visible_area(scene, place_m, box_m, rays, seed, max_range_m=250.0):
 def _scene(world, step):
     """Everything at one time in the vehicle frame, first the ego."""
     time_s = step * world.time_step_s
-    vehicle_T_world = invert(world.ego.trajectory.at(time_s))
+    vehicle_T_world = invert(world.ego.trajectory.interpolate(time_s))
     scene = EmbreeScene(robust=True)
-    meshes = [world.ego.mesh, *(mesh.moved(vehicle_T_world) for mesh in world.static)]
-    meshes += [actor.mesh.moved(vehicle_T_world @ actor.trajectory.at(time_s)) for actor in world.objects]
+    meshes = [world.ego.mesh, *(mesh.transform(vehicle_T_world) for mesh in world.static_meshes)]
+    meshes += [actor.mesh.transform(vehicle_T_world @ actor.trajectory.interpolate(time_s)) for actor in world.objects]
     for mesh in meshes:
         TriangleMesh(scene, mesh.vertices_m.astype(np.float32), mesh.faces.astype(np.int32))
     return scene

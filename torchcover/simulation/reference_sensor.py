@@ -227,7 +227,7 @@ class PaperReference:
         if num_rays is None:
             return cls()
         if num_rays < 1:
-            raise ValueError(f"rays: at least 1 is needed; got {num_rays}")
+            raise ValueError(f"num_rays: at least 1 is needed; got {num_rays}")
         side = round(math.sqrt(num_rays))
         return cls(rows=side, columns=side)
 

@@ -1,13 +1,13 @@
-"""What a sensor of a rig is: the rays that it casts, and what it makes of their hits.
+"""Sensors of a rig: the rays that they cast, and the points that they measure at the hits of these rays.
 
-Another kind is a class with the members of `Sensor` and a line in `kinds.py`.
+A new kind of sensor is a class with the members of `Sensor` and an entry in `kinds.py`.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from threading import Lock
-from typing import Annotated, NamedTuple, Protocol, Self
+from typing import Annotated, Literal, NamedTuple, Protocol, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,15 +24,16 @@ Elevation = Annotated[float, Field(ge=-90.0, le=90.0)]
 
 @dataclass(frozen=True, eq=False)
 class RayHits:
-    """N rays of a sensor that ended on something which is not the vehicle that carries it.
+    """Hits of N rays of one sensor; hits on the vehicle that carries the sensor are not among them.
 
     Args:
-        ray_indices: (N,) which ray, counted over the sensor's tiles. The rays of one beam ascend.
-        range_m: (N,) how far it went, up to the sensor's range.
-        ray_pixel_indices: (rays,) where each ray stands in `Sensor.directions`, row by row.
-        position_indices: (N,) in which of several worlds, of which a sensor sees each alone; None if there is one.
-        find_attributes: Finds out what they ended on.
-        weather: What they went through.
+        ray_indices: (N,) index of the ray, counted over the ray tiles of the sensor; rays of one beam ascend.
+        range_m: (N,) range of the hit, at most the maximum range of the sensor.
+        ray_pixel_indices: (rays,) position of each ray in the row-major order of `Sensor.compute_directions`.
+        position_indices: (N,) index of the scene that the ray belongs to if several scenes are measured at once; each
+            scene is measured independently. None for one scene.
+        find_attributes: Computes bodies, triangles, incidence angles and materials of the hits on demand.
+        weather: Weather along the rays.
     """
 
     ray_indices: Int64
@@ -44,25 +45,27 @@ class RayHits:
 
     @property
     def pixel_indices(self) -> Int64:
-        """(N,) row * columns + column of each ray in `Sensor.directions`."""
+        """(N,) row * columns + column of each ray in `Sensor.compute_directions`."""
         return np.asarray(self.ray_pixel_indices[self.ray_indices])
 
     @cached_property
     def attributes(self) -> HitAttributes:
-        """What they ended on: bodies, faces, angles of incidence, materials. A sensor that does not ask does not pay.
+        """Bodies, triangles, incidence angles and materials of the hits, computed at the first access.
 
         Raises:
-            ValueError: Hits of which that is unknown.
+            ValueError: `find_attributes` is missing.
         """
         if self.find_attributes is None:
-            raise ValueError("the hits know where they are, and not on what; give RayHits its `find`")
+            raise ValueError("these RayHits have no attributes (body, material, angle); pass them `find_attributes`")
         return self.find_attributes()
 
 
 class Returns(NamedTuple):
-    """The points that a sensor makes of hits: `hit_indices` (K,) of which, ascending; `range_error_m` (K,) along their rays.
+    """Points that a sensor measures at N hits.
 
-    None for `hit_indices`: of each, in order. None for `range_error_m`: they are exact.
+    Args:
+        hit_indices: (K,) ascending indices of the hits that return; None if all N hits return.
+        range_error_m: (K,) error of the measured range; None if the ranges are exact.
     """
 
     hit_indices: Int64 | None
@@ -70,131 +73,154 @@ class Returns(NamedTuple):
 
 
 class SensorNoise:
-    """The random numbers of one sensor at one step.
+    """Random numbers of one sensor in one frame.
 
-    A sensor asks for the same kinds in the same order, whatever its rays hit.
+    A sensor requests the same kinds of numbers in the same order, regardless of its hits.
 
     Args:
-        generator: Their source; None for a measurement without errors, in which nothing drops out.
-        rays: How many rays the sensor has, if each is to have its own numbers, however many hits there are: what is
-            placed in front of some rays then changes nothing about the others. Else there is a number for each hit.
+        rng: Source of the numbers; None for a measurement without errors and without drop-out.
+        num_rays: Number of rays of the sensor if each ray has its own numbers. An object in front of some rays then
+            changes nothing about the other rays. None samples one number for each hit.
 
     Example:
-        >>> draws = Draws(np.random.default_rng(0), rays=100)
-        >>> bool((draws.normal(np.array([7, 8])) == draws.normal(np.arange(100))[7:9]).all())
+        >>> noise = SensorNoise(np.random.default_rng(0), num_rays=100)
+        >>> bool((noise.sample_normal(np.array([7, 8])) == noise.sample_normal(np.arange(100))[7:9]).all())
         True
-        >>> Draws(None).uniform(np.arange(2)).tolist()
+        >>> SensorNoise(None).sample_dropout_uniform(np.arange(2)).tolist()
         [1.0, 1.0]
     """
 
     def __init__(self, rng: np.random.Generator | None, num_rays: int | None = None) -> None:
-        self._generator, self._rays = rng, num_rays
-        self._of_rays: dict[str, Float64] = {}
+        self._rng, self._num_rays = rng, num_rays
+        self._values_per_ray: dict[str, Float64] = {}
         self._lock = Lock()
 
     def sample_normal(self, ray_indices: Int64) -> Float64:
-        """(N,) of a normal distribution with standard deviation 1, for hits of these rays."""
-        return (
-            np.zeros(len(ray_indices))
-            if self._generator is None
-            else self._drawn("error", "standard_normal", ray_indices)
-        )
+        """Sample from the standard normal distribution.
+
+        Args:
+            ray_indices: (N,) ray of each hit.
+
+        Returns:
+            (N,) values; 0 without a source of random numbers.
+        """
+        return self._sample("error", "standard_normal", ray_indices, exact_value=0.0)
 
     def sample_dropout_uniform(self, ray_indices: Int64) -> Float64:
-        """(N,) evenly from [0, 1), for hits of these rays; 1 where there is no source."""
-        return np.ones(len(ray_indices)) if self._generator is None else self._drawn("dropout", "random", ray_indices)
+        """Sample from the uniform distribution over [0, 1) that decides about drop-out.
+
+        Args:
+            ray_indices: (N,) ray of each hit.
+
+        Returns:
+            (N,) values; 1 without a source of random numbers.
+        """
+        return self._sample("dropout", "random", ray_indices, exact_value=1.0)
 
     def sample_return_uniform(self, ray_indices: Int64) -> Float64:
-        """(N,) evenly from [0, 1), others than `uniform`, for hits of these rays; 1/2 where there is no source."""
-        return (
-            np.full(len(ray_indices), 0.5) if self._generator is None else self._drawn("return", "random", ray_indices)
-        )
+        """Sample from the uniform distribution over [0, 1) that is compared with P(return).
 
-    def _drawn(self, purpose: str, kind: str, ray: Int64) -> Float64:
-        draw = getattr(self._generator, kind)
-        if self._rays is None:
-            return np.asarray(draw(len(ray)))
-        with self._lock:  # whichever thread asks first draws for all
-            if purpose not in self._of_rays:
-                self._of_rays[purpose] = draw(self._rays)
-            return self._of_rays[purpose][ray]
+        Args:
+            ray_indices: (N,) ray of each hit.
+
+        Returns:
+            (N,) values, independent of those for drop-out; 1/2 without a source of random numbers.
+        """
+        return self._sample("return", "random", ray_indices, exact_value=0.5)
+
+    def _sample(
+        self, purpose: str, method: Literal["standard_normal", "random"], ray_indices: Int64, exact_value: float
+    ) -> Float64:
+        if self._rng is None:
+            return np.full(len(ray_indices), exact_value)
+        sample = getattr(self._rng, method)
+        if self._num_rays is None:
+            return np.asarray(sample(len(ray_indices)))
+        with self._lock:  # the first thread samples the numbers of all rays
+            if purpose not in self._values_per_ray:
+                self._values_per_ray[purpose] = sample(self._num_rays)
+            return self._values_per_ray[purpose][ray_indices]
 
 
 class Sensor(Protocol):
-    """A device on the vehicle that measures how far it is to where its rays end.
+    """Device on a vehicle that measures the range of surfaces along its rays.
 
-    A value, made from its keys in a rig's file, `type` among them: a `Document`, which can be compared and pickled.
+    A sensor is a value: a `Document` made from the keys of a rig file, `type` among them, that can be compared and
+    pickled.
     """
 
     @property
     def name(self) -> str:
-        """What maps and messages call it; another one for each sensor of a rig."""
+        """Name in maps and messages, unique within a rig."""
 
     @property
     def mount(self) -> Pose:
-        """`vehicle_T_sensor`; the sensor's frame is x forward, y left, z up."""
+        """Extrinsics `vehicle_T_sensor`; the sensor frame is x forward, y left, z up."""
 
     @property
     def horizontal_fov_deg(self) -> float:
-        """Angle that its rays span, seen from above; 360 for a full turn."""
+        """Azimuth range that the rays span; 360 for a full turn."""
 
     @property
     def min_range_m(self) -> float:
-        """Closer hits give no point."""
+        """Smallest range of a return; closer hits give no point."""
 
     @property
     def max_range_m(self) -> float:
-        """Farther hits give no point; so far its rays are cast."""
+        """Largest range of a return; rays end here."""
 
     @property
     def rate_hz(self) -> float:
-        """How often it looks in a second."""
+        """Number of scans or images per second."""
 
     @property
     def housing(self) -> Sequence[Body]:
-        """What it is built into, in its own frame: the other sensors of its rig see that, and it looks out of it."""
+        """Bodies around the sensor, in its frame: they occlude the other sensors of the rig, not the sensor itself."""
 
     @property
     def is_exact(self) -> bool:
-        """Whether it measures the same thing alike at any time: its measuring draws no random numbers."""
+        """True if the measurement uses no random numbers."""
 
     @property
     def num_rays(self) -> int:
-        """How many rays `directions` has, NaN ones included: asked before it is called."""
+        """Number of rays of `compute_directions`, NaN directions included."""
 
     def compute_directions(self) -> Float64:
-        """(3, rows, columns) unit directions in the sensor's frame; NaN where there is no ray."""
+        """Compute (3, rows, columns) unit directions in the sensor frame; NaN where there is no ray."""
 
     @property
     def pixels_per_sample(self) -> int:
-        """How many points each of its points is counted as on a body: of a camera, pixels of the full image."""
+        """Number of measurements that each point represents in point counts: pixels of the full image for a camera."""
 
     def compute_ray_times_s(self) -> Float64 | None:
-        """(rows, columns) when each ray is cast, after the time of the frame; None if all are at that time."""
+        """Compute (rows, columns) times of the rays relative to the frame; None if all rays are cast at that time."""
 
     def compute_beam_indices(self) -> Int64 | None:
-        """(rows, columns) the number of the beam that each ray is part of; None if each is a beam of its own.
+        """Compute (rows, columns) beam index of each ray; None if each ray is its own beam.
 
-        What the rays of one beam hit is measured together; what those of others hit changes nothing about it.
+        Hits of one beam are measured together and do not influence other beams.
         """
 
     def measure(self, hits: RayHits, noise: SensorNoise) -> Returns:
-        """What it makes of the hits of its rays.
+        """Measure points at ray hits.
 
         Args:
-            hits: All hits of each beam that has one.
+            hits: Hits of the rays; for each beam either all of its hits or none.
             noise: Source of all random numbers.
+
+        Returns:
+            Hits that give a point, and their range errors.
         """
 
 
 class ScanTimes(Document):
-    """How long a sensor takes for its rays: a LiDAR for its columns, in their order, a camera for its rows, from above.
+    """Times at which a sensor casts its rays: column by column for a LiDAR, row by row from the top for a camera.
 
     Args:
-        period_s: From the first to the last.
-        start_s: When the first is cast, after the time of the frame; `-period_s` if not given, so that it ends then.
-        deskewed: Whether points land where they are at the time of the frame. Else each lands as its ray was cast, in
-            the vehicle frame of that time, as in the raw cloud of a driver; no number depends on it.
+        period_s: Time between the first and the last column or row.
+        start_s: Time of the first one relative to the frame; None for `-period_s`: the scan ends at the frame time.
+        deskewed: True if points are given as of the frame time. False leaves each point in the vehicle frame at the
+            time of its ray, as in the raw point cloud of a driver; no coverage number depends on it.
     """
 
     period_s: PositiveFloat
@@ -202,21 +228,28 @@ class ScanTimes(Document):
     deskewed: bool = True
 
     def compute_times_s(self, num_times: int) -> Float64:
-        """(count,) when each is cast, after the time of the frame."""
+        """Compute the times of all columns or rows.
+
+        Args:
+            num_times: Number of columns or rows.
+
+        Returns:
+            (num_times,) times in seconds relative to the frame.
+        """
         start_s = -self.period_s if self.start_s is None else self.start_s
         return np.asarray(start_s + self.period_s * (np.arange(num_times) + 0.5) / num_times)
 
 
 class RangeSensor(Document):
-    """A sensor within whose ranges every hit gives a point, with noise and drop-out: the keys that such kinds share.
+    """Common part of all built-in sensors: each hit within the range limits gives a point, with noise and drop-out.
 
     Args:
         min_range_m: Closer hits give no point.
         max_range_m: Farther hits give no point.
         range_noise_m: Standard deviation of the measured range, along the ray.
-        dropout: Probability that a point is missing, from 0 to 1.
-        rate_hz: How often it looks in a second, for encounters.
-        housing: Bodies that it is built into or stands on, in its own frame, which are in the way of the rig's others.
+        dropout: Probability that a point is missing, 0 to 1.
+        rate_hz: Scans or images per second, for encounters.
+        housing: Bodies that contain or carry the sensor, in its frame; they occlude the other sensors of the rig.
     """
 
     min_range_m: NonNegativeFloat = 0.0
@@ -235,66 +268,93 @@ class RangeSensor(Document):
         return self
 
     def compute_noise_std_m(self, range_m: NDArray[np.floating]) -> float | NDArray[np.floating]:
-        """Standard deviation of measured ranges, of each of (N,) or of all; 0 if they are exact."""
+        """Compute the standard deviation of measured ranges.
+
+        Args:
+            range_m: (N,) true ranges.
+
+        Returns:
+            (N,) standard deviations in meters, or one number for all ranges; 0 if ranges are exact.
+        """
         return self.range_noise_m
 
     @property
     def is_exact(self) -> bool:
-        """Whether it has neither noise nor drop-out."""
-        return not self._errs
+        """True without noise and drop-out."""
+        return not self._has_errors
 
     @property
-    def _errs(self) -> bool:
+    def _has_errors(self) -> bool:
         return bool(self.dropout or np.any(self.compute_noise_std_m(np.ones(1))))
 
     @property
     def pixels_per_sample(self) -> int:
-        """1: a point is a measurement."""
+        """1: each point is one measurement."""
         return 1
 
     def compute_ray_times_s(self) -> Float64 | None:
-        """None: all rays are cast at the time of the frame."""
+        """Return None: all rays are cast at the time of the frame."""
         return None
 
     def compute_beam_indices(self) -> Int64 | None:
-        """None: every ray measures alone."""
+        """Return None: each ray is its own beam."""
         return None
 
     def measure(self, hits: RayHits, noise: SensorNoise) -> Returns:
-        """A point for each hit that is not too close, with noise along its ray, unless it drops out."""
+        """Measure a point with range noise at each hit beyond the minimum range, unless it drops out.
+
+        Args:
+            hits: Hits of the rays.
+            noise: Source of all random numbers.
+
+        Returns:
+            Hits that give a point, and their range errors.
+        """
         if not self.min_range_m:
             return self.sample_returns(hits, None, noise)
-        far_enough = hits.range_m >= self.min_range_m
-        return self.sample_returns(hits, None if far_enough.all() else np.flatnonzero(far_enough), noise)
+        is_in_range = hits.range_m >= self.min_range_m
+        return self.sample_returns(hits, None if is_in_range.all() else np.flatnonzero(is_in_range), noise)
 
     def sample_returns(self, hits: RayHits, hit_indices: Int64 | None, noise: SensorNoise) -> Returns:
-        """Points at some of N hits, (K,) `hit_indices` of them or all, with noise and drop-out."""
-        if not self._errs:
+        """Apply range noise and drop-out to selected hits.
+
+        Args:
+            hits: All N hits.
+            hit_indices: (K,) ascending indices of the selected hits; None for all.
+            noise: Source of all random numbers.
+
+        Returns:
+            Selected hits that do not drop out, and their range errors.
+        """
+        if not self._has_errors:
             return Returns(hit_indices, None)
-        ray, range_m = (
-            (hits.ray_indices, hits.range_m)
-            if hit_indices is None
-            else (hits.ray_indices[hit_indices], hits.range_m[hit_indices])
-        )
-        noise_m = self.compute_noise_std_m(range_m)
-        # No range is less than 0.
-        error_m = np.maximum(noise_m * noise.sample_normal(ray), -range_m) if np.any(noise_m) else None
+        ray_indices, range_m = hits.ray_indices, hits.range_m
+        if hit_indices is not None:
+            ray_indices, range_m = ray_indices[hit_indices], range_m[hit_indices]
+        noise_std_m = self.compute_noise_std_m(range_m)
+        error_m = None
+        if np.any(noise_std_m):
+            error_m = np.maximum(noise_std_m * noise.sample_normal(ray_indices), -range_m)  # measured range >= 0
         if self.dropout:
-            stays = np.flatnonzero(noise.sample_dropout_uniform(ray) >= self.dropout)
-            hit_indices, error_m = (
-                stays if hit_indices is None else hit_indices[stays],
-                None if error_m is None else error_m[stays],
-            )
+            remaining = np.flatnonzero(noise.sample_dropout_uniform(ray_indices) >= self.dropout)
+            hit_indices = remaining if hit_indices is None else hit_indices[remaining]
+            error_m = None if error_m is None else error_m[remaining]
         return Returns(hit_indices, error_m)
 
 
 def compute_vertical_fov_deg(sensor: Sensor) -> tuple[float, float]:
-    """Lowest and highest elevation of a sensor's rays, in its middle column.
+    """Compute the lowest and the highest elevation of the rays in the middle column of a sensor.
+
+    Args:
+        sensor: Sensor with at least one ray in its middle column.
+
+    Returns:
+        Lowest and highest elevation in degrees.
 
     Example:
         >>> from torchcover.simulation import Lidar
         >>> lidar = Lidar(name="a", model="velodyne_vlp16", max_range_m=50)
-        >>> [round(elevation, 9) for elevation in vertical_fov_deg(lidar)]
+        >>> [round(elevation, 9) for elevation in compute_vertical_fov_deg(lidar)]
         [-15.0, 15.0]
     """
     x, y, z = sensor.compute_directions()
