@@ -182,7 +182,9 @@ def test_what_a_sensor_makes_of_a_beam_does_not_depend_on_other_beams(sensor):
         np.repeat([0, 1], len(whole.ray_indices)),
     )
     both = sensor.measure(twice, SensorNoise(np.random.default_rng(0), num_rays=len(whole.ray_indices)))
-    np.testing.assert_array_equal(both.hit_indices, np.concatenate([measured.hit_indices, measured.hit_indices + len(whole.ray_indices)]))
+    np.testing.assert_array_equal(
+        both.hit_indices, np.concatenate([measured.hit_indices, measured.hit_indices + len(whole.ray_indices)])
+    )
 
 
 def test_a_sensor_asks_for_the_same_numbers_whatever_is_hit(sensor):

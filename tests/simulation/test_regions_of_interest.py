@@ -173,10 +173,12 @@ def test_grid_and_regions_fit_the_room_and_the_range(max_range_m, name, x, forwa
     )  # fmt: skip
     result = evaluate(rig, office(), num_frames=1, num_rays=256, test_targets="none")
     grid = result.coverage.grid
-    assert grid.x == x
+    assert grid.x_m == x
     near = ["front_3m", "rear_3m", "left_3m", "right_3m"]
     assert [region.name for region in result.regions] == [*forward, name, *near]
     whole = next(region for region in result.regions if region.name == name)
-    assert (whole.x, whole.y) == (grid.x, grid.y)
+    assert (whole.x_m, whole.y_m) == (grid.x_m, grid.y_m)
     asked = RegionsOfInterest(grid={"x_m": (-10.0, 50.0)})
-    assert evaluate(rig, office(), num_frames=1, num_rays=256, test_targets="none", regions=asked).coverage.grid.x == (-10.0, 50.0)
+    assert evaluate(
+        rig, office(), num_frames=1, num_rays=256, test_targets="none", regions=asked
+    ).coverage.grid.x_m == (-10.0, 50.0)

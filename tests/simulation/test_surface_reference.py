@@ -210,7 +210,7 @@ def test_threads_workers_and_pickling_change_nothing():
             assert torch.equal(frame.sensor, other.sensor)
             assert torch.equal(frame.reference, other.reference)
             assert torch.equal(frame.reference_weights, other.reference_weights)
-            assert torch.equal(frame.boxes.sampled_points, other.boxes.drawn_points)
+            assert torch.equal(frame.boxes.sampled_points, other.boxes.sampled_points)
             assert frame.counts == other.counts
 
 

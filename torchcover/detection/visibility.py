@@ -74,7 +74,7 @@ class BoxVisibility:
         return self._each(lambda tensor: move_tensor(tensor, device))
 
     def _each(self, change: Callable[[Tensor], Tensor]) -> "BoxVisibility":
-        names = ("share", "mean_radius_m", "reference_points", "drawn_points", "sensor_points")
+        names = ("share", "mean_radius_m", "reference_points", "sampled_points", "sensor_points")
         changed: dict[str, Any] = {name: change(getattr(self, name)) for name in names}
         return replace(self, **changed)
 

@@ -196,7 +196,7 @@ class MovingBodies:
             alone = casters[number].compute_hit_attributes(
                 np.zeros(len(some), dtype=np.int32), triangle_indices[some], towards[:, some]
             )
-            cosine[some], material[some] = alone.cos_incidence, alone.material
+            cosine[some], material[some] = alone.cos_incidence, alone.material_indices
         return HitAttributes(self.body_indices[part_indices].astype(np.int32), triangle_indices, cosine, material)
 
     def cast_pairs(
