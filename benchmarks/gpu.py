@@ -14,7 +14,7 @@ from benchmarks import table
 from torchcover import nearest
 from torchcover.data import RegionsOfInterest, SimulatedFrames, create_reference_sensor
 from torchcover.evaluation import CoverageObserver, Settings
-from torchcover.evaluation.measuring import build_metric
+from torchcover.evaluation.measurement import build_metric
 from torchcover.neighbors.warp import wp
 from torchcover.simulation import PaperReference
 from torchcover.simulation.raycaster import RayCaster

@@ -13,7 +13,7 @@ from embreex.rtcore_scene import EmbreeScene
 
 from benchmarks import compare, table
 from torchcover.data import SimulatedFrames
-from torchcover.evaluation.cores import set_threads
+from torchcover.evaluation.cpu_cores import set_threads
 from torchcover.simulation import PaperReference, Rig, Scenario, SensorNoise
 from torchcover.simulation.instant import SensorScan
 from torchcover.simulation.raycaster import cast_from_vehicle

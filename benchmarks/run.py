@@ -161,7 +161,7 @@ def parts(folder):
 
         return call
 
-    observe = owner_of("torchcover.evaluation.measuring:observe")
+    observe = owner_of("torchcover.evaluation.measurement:observe")
     setattr(*observe, first(getattr(*observe)))
     watches.watch_all()
     raycaster, choice = (import_module(f"torchcover.{name}") for name in ("simulation.raycaster", "neighbors.choice"))

@@ -28,7 +28,7 @@ from benchmarks import table
 from torchcover.data import RegionsOfInterest, SimulatedFrames, create_reference_sensor
 from torchcover.evaluation import CoverageObserver, Settings
 from torchcover.evaluation.checkpoint import write_checkpoint
-from torchcover.evaluation.measuring import build_metric
+from torchcover.evaluation.measurement import build_metric
 from torchcover.evaluation.ranks import serialize
 from torchcover.simulation import Scenario
 

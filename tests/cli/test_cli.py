@@ -331,7 +331,9 @@ def test_an_output_folder_that_cannot_be_made_is_a_mistake_too(torchcover, recor
 
 
 def test_an_impossible_output_folder_is_found_before_the_run(torchcover, recording, tmp_path, monkeypatch):
-    monkeypatch.setattr("torchcover.evaluation.measuring.observe", lambda *_, **__: pytest.fail("it ran all the same"))
+    monkeypatch.setattr(
+        "torchcover.evaluation.measurement.observe", lambda *_, **__: pytest.fail("it ran all the same")
+    )
     (tmp_path / "file").write_text("")
     (tmp_path / "link").symlink_to(tmp_path / "nothing")
     for out in (tmp_path / "file", tmp_path / "file" / "below", tmp_path / "link", tmp_path / "link" / "below"):

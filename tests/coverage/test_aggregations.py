@@ -219,7 +219,7 @@ def test_any_number_of_a_result_has_an_estimate():
 
     one, other = measured(0.0), measured(0.1)
     keys = [quantity.key for quantity in one.all_quantities]
-    assert {"cells_radius_m", "radius_m_without_a", "radius_q0.9_m", "seen_by_two_0.4m"} < set(keys)
+    assert {"cells_radius_m", "radius_m_without_a", "radius_q0.9_m", "detected_by_two_0.4m"} < set(keys)
     row = one.summary()[0]
     values = {
         **row.numbers,

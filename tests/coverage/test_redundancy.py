@@ -91,7 +91,7 @@ def test_how_many_sensors_see_a_point_is_counted():
         expected = sum(each.summary()[at].numbers["detection_0.8m"].value for each in alone)
         seen_by = row.redundancy.detecting_sensors
         assert seen_by["sensors_0.8m"].value == pytest.approx(expected, rel=1e-13)
-        assert 0 < seen_by["seen_by_two_0.8m"].value < row.numbers["detection_0.8m"].value
+        assert 0 < seen_by["detected_by_two_0.8m"].value < row.numbers["detection_0.8m"].value
         assert seen_by["sensors_0.8m"].error > 0
 
 
@@ -105,7 +105,7 @@ def test_a_twin_makes_a_sensor_dispensable_and_the_only_one_is_indispensable():
         assert {change.value for changes in row.redundancy.failure_effects.values() for change in changes.values()} == {
             0.0
         }
-        assert row.redundancy.detecting_sensors["seen_by_two_0.3m"].value == row.numbers["detection_0.3m"].value
+        assert row.redundancy.detecting_sensors["detected_by_two_0.3m"].value == row.numbers["detection_0.3m"].value
     for row in measured(steps(empty=("left", "rear")), has_area_weights=True).summary():
         assert row.redundancy.most_critical_sensor == "roof"
         assert row.redundancy.failure_numbers["roof"]["radius_m"].value == 3.0

@@ -10,9 +10,9 @@ import pytest
 import torch
 
 from torchcover.data import SimulatedFrames
-from torchcover.evaluation import cores as module
-from torchcover.evaluation import evaluate, measuring
-from torchcover.evaluation.cores import compute_num_workers, count_cores, set_threads, warn_about_spinning
+from torchcover.evaluation import cpu_cores as module
+from torchcover.evaluation import evaluate, measurement
+from torchcover.evaluation.cpu_cores import compute_num_workers, count_cores, set_threads, warn_about_spinning
 
 SAID = (*module.WAITING, "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
@@ -147,8 +147,8 @@ def test_a_simulation_has_the_usual_workers_and_frames_of_others_none(monkeypatc
         return 2
 
     asked = []
-    monkeypatch.setattr(measuring, "observe", observe)
-    monkeypatch.setattr(measuring, "compute_num_workers", usual)
+    monkeypatch.setattr(measurement, "observe", observe)
+    monkeypatch.setattr(measurement, "compute_num_workers", usual)
     frames = SimulatedFrames("urban", "front_roof_32", num_frames=64)
     for given, expected in (
         ({"scenario": "urban", "num_frames": 64}, 2),
@@ -159,4 +159,4 @@ def test_a_simulation_has_the_usual_workers_and_frames_of_others_none(monkeypatc
         with pytest.raises(KnownError) as found:
             evaluate("front_roof_32", **given)
         assert found.value.args == (expected,)
-    assert asked == [(64, 11, False), (measuring.ENOUGH_FRAMES, 43, True)]
+    assert asked == [(64, 11, False), (measurement.ENOUGH_FRAMES, 43, True)]

@@ -141,7 +141,7 @@ def test_what_does_not_err_is_what_it_was(kind):
     )
 
 
-@pytest.mark.parametrize("number", ["detection_0.2m", "radius_m", "seen_by_two_0.4m", "detection_0.4m_without_any"])
+@pytest.mark.parametrize("number", ["detection_0.2m", "radius_m", "detected_by_two_0.4m", "detection_0.4m_without_any"])
 def test_no_imperfection_lets_a_search_prefer_a_rig(number):
     instants = CommonFrames([WORLD], {"asked": Objective(number=number, region="20m", band="ground")}, num_rays=1024)
     for chain in ("range noise", "drop-out", "missing returns"):

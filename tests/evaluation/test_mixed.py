@@ -175,13 +175,13 @@ def test_each_world_has_a_checkpoint_of_its_own(mixed, yards, tmp_path):
     ],
 )
 def test_what_is_no_mixture_is_refused_before_anything_is_measured(scenario, says, monkeypatch):
-    monkeypatch.setattr("torchcover.evaluation.mixed.measure_coverage", None)
+    monkeypatch.setattr("torchcover.evaluation.mixed_result.measure_coverage", None)
     with pytest.raises((ValueError, FileNotFoundError), match=says):
         evaluate(RIGS[0], scenario, **SMALL)
 
 
 def test_who_cannot_be_mixed_is_refused_before_anything_is_measured(yards, monkeypatch):
-    monkeypatch.setattr("torchcover.evaluation.mixed.measure_coverage", None)
+    monkeypatch.setattr("torchcover.evaluation.mixed_result.measure_coverage", None)
     tall = yards / "tall.yaml"
     tall.write_text(YARD.format(name="tall", wall_m=8, height_m=1.5).replace("[4, 2, 1.5]", "[6, 2, 1.5]"))
     near = str(yards / "near.yaml")
@@ -198,7 +198,7 @@ def test_who_cannot_be_mixed_is_refused_before_anything_is_measured(yards, monke
 
 
 def test_who_needs_what_is_not_installed_is_refused_before_anything_is_measured(yards, monkeypatch):
-    monkeypatch.setattr("torchcover.evaluation.mixed.measure_coverage", None)
+    monkeypatch.setattr("torchcover.evaluation.mixed_result.measure_coverage", None)
     monkeypatch.setattr("torchcover.simulation.sumo.simulating.find_spec", lambda _: None)
     monkeypatch.setattr("torchcover.simulation.sumo.simulating.which", lambda _: None)
     with pytest.raises(ImportError, match=r"torchcover\[sumo\]"):

@@ -10,7 +10,7 @@ import pytest
 
 from torchcover.encounters import EncounterSet
 from torchcover.evaluation import Requirements, report
-from torchcover.evaluation.target_survey import NEAR_M, build_target_plan, summarize_target_maps
+from torchcover.evaluation.target_visibility import NEAR_M, build_target_plan, summarize_target_maps
 from torchcover.report import render_page
 from torchcover.simulation import Rig
 
@@ -25,7 +25,7 @@ def lidar(name, x_m, z_m=0.8):
 ONE = Rig.model_validate({"name": "one", "sensors": [lidar("front", 2.6)]})
 TWO = Rig.model_validate({"name": NASTY, "sensors": [lidar("front", 2.6), lidar("rear", -2.6)]})
 CROSSING = {"name": "a", "ego": {"speed_kmh": 30}, "other": {"body": "adult", "speed_kmh": 5, "from_m": 2}}
-NEEDS = {"name": "needs", "requirements": [{"target": "child", "at": {"points_m": [[5.0, 0.0]]}, "points": 5}]}
+NEEDS = {"name": "needs", "requirements": [{"target": "child", "positions": {"points_m": [[5.0, 0.0]]}, "points": 5}]}
 
 
 @pytest.fixture(scope="module")

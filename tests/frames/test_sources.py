@@ -18,7 +18,7 @@ from torchcover.data import (
     collate_frames,
     open_recording,
 )
-from torchcover.evaluation.measuring import find_block_ends
+from torchcover.evaluation.measurement import find_block_ends
 from torchcover.recordings.formats.folder import FolderRecording
 from torchcover.simulation import PaperReference, SurfaceReference
 

@@ -46,7 +46,7 @@ def test_the_points_that_are_kept_are_those_in_the_regions_and_in_their_cells():
 NUMBERS = {
     "detection_0.4m": Objective(region="20m", band="ground"),
     "radius_m": Objective(number="radius_m", region="20m", band="ground"),
-    "seen_by_two_0.4m": Objective(number="seen_by_two_0.4m", region="20m", band="ground"),
+    "detected_by_two_0.4m": Objective(number="detected_by_two_0.4m", region="20m", band="ground"),
     "detection_0.4m_without_top": Objective(number="detection_0.4m_without_top", region="20m", band="ground"),
     "detection_0.4m_without_any": Objective(number="detection_0.4m_without_any", region="20m", band="ground"),
     "radius_maximum_m": Objective(number="radius_maximum_m", region="20m", band="ground"),
@@ -81,7 +81,7 @@ def test_an_objective_is_any_number_of_a_result_and_knows_its_direction(several)
     assert value["radius_m"] == row.numbers["radius_m"].value
     for key in ("radius_maximum_m", "radius_q0.5_m", "radius_q0.9_m"):
         assert value[key] == row.numbers[key].value
-    assert value["seen_by_two_0.4m"] == row.redundancy.detecting_sensors["seen_by_two_0.4m"].value
+    assert value["detected_by_two_0.4m"] == row.redundancy.detecting_sensors["detected_by_two_0.4m"].value
     without = {sensor: numbers["detection_0.4m"].value for sensor, numbers in row.redundancy.failure_numbers.items()}
     assert value["detection_0.4m_without_top"] == without["top"]
     assert value["detection_0.4m_without_any"] == min(without.values()) < row.numbers["detection_0.4m"].value
@@ -108,7 +108,7 @@ def test_what_a_failure_leaves_is_over_known_cells_where_evaluate_has_it_so(seve
     observer = CoverageObserver(metric)
     for frame in several.iterate_frames(TWO):
         observer.update(frame)
-    for key in ("detection_0.4m", "radius_m", "seen_by_two_0.4m", "detection_0.4m_without_top"):
+    for key in ("detection_0.4m", "radius_m", "detected_by_two_0.4m", "detection_0.4m_without_top"):
         assert by_cells[key] == float(observer.compute().estimate_number(key, region, "ground").value)
         assert by_cells[key] != by_area[key]
     # An aggregation is over all points of the region, whatever the means are over.
@@ -144,7 +144,7 @@ def test_what_the_second_sensor_loses_without_a_block_is_known_too(several):
         ("detektion_0.4m", "detection_0.4m"),
         ("radius", "radius_m"),
         ("detection_0.4m_without_roof", "detection_0.4m_without_top"),
-        ("seen_by_too_0.4m", "seen_by_two_0.4m"),
+        ("seen_by_too_0.4m", "detected_by_two_0.4m"),
         ("detection_0.40m", "detection_0.4m"),
         ("radius_maximal_m", "radius_maximum_m"),
         ("detection_0.4.1m", "detection_0.4m"),

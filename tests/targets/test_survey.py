@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchcover.evaluation.target_survey import summarize_target_maps
+from torchcover.evaluation.target_visibility import summarize_target_maps
 from torchcover.geometry import BoundingBox, build_transform
 from torchcover.simulation import PaperReference, Scenario, Simulator
 from torchcover.simulation.bodies import merge_meshes

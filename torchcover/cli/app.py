@@ -18,7 +18,7 @@ import typer
 
 from torchcover.cli import commands
 from torchcover.cli.evaluate import compare, evaluate
-from torchcover.evaluation.cores import set_threads
+from torchcover.evaluation.cpu_cores import set_threads
 from torchcover.evaluation.progress import handle_termination
 
 

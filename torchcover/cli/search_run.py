@@ -7,7 +7,7 @@ from typing import Any
 import typer
 
 from torchcover.cli.printing import print_files
-from torchcover.evaluation.cores import compute_num_workers
+from torchcover.evaluation.cpu_cores import compute_num_workers
 from torchcover.files import SUMMARY, lock_folder
 from torchcover.placement import (
     PlacementSearch,

@@ -32,8 +32,8 @@ def make_sensor_count_quantity(threshold_m: float) -> Quantity:
 
 def make_redundancy_quantity(threshold_m: float) -> Quantity:
     """The share of reference points that two sensors or more see within a threshold in metres."""
-    title = f"seen by two sensors or more within {threshold_m:g} m"
-    return Quantity(f"seen_by_two_{threshold_m:g}m", title, "share", lower_is_better=False)
+    title = f"detected by two sensors or more within {threshold_m:g} m"
+    return Quantity(f"detected_by_two_{threshold_m:g}m", title, "share", lower_is_better=False)
 
 
 def make_failure_quantity(sensor_name: str, quantity: Quantity) -> Quantity:

@@ -27,7 +27,7 @@ class Redundancy:
         sensor_names: Their names.
         observed_cells: The cells that it is known of.
         sparse_layers: In these, by the key of their quantity: for each threshold by how many sensors the points of a
-            cell are seen ("sensors_0.4m") and the share that two or more see ("seen_by_two_0.4m"); for each sensor the
+            cell are seen ("sensors_0.4m") and the share that two or more see ("detected_by_two_0.4m"); for each sensor the
             radius and the detection without it ("radius_m_without_roof"). By area if the coverage is, else means of
             means.
     """
@@ -52,7 +52,7 @@ def list_redundancy_quantities(sensor_names: Sequence[str], thresholds_m: Sequen
 
     Example:
         >>> [each.key for each in list_redundancy_quantities(["roof"], [0.4])]
-        ['sensors_0.4m', 'seen_by_two_0.4m', 'radius_m_without_roof', 'detection_0.4m_without_roof']
+        ['sensors_0.4m', 'detected_by_two_0.4m', 'radius_m_without_roof', 'detection_0.4m_without_roof']
     """
     several = [
         each(threshold) for threshold in thresholds_m for each in (make_sensor_count_quantity, make_redundancy_quantity)

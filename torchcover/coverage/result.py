@@ -278,7 +278,7 @@ class Coverage:
 
         Args:
             quantity_key: "radius_m", "detection_0.4m"; "cells_detection_0.4m" over the known cells of a result by area;
-                "radius_maximum_m" of an aggregation; "radius_m_without_roof" and "seen_by_two_0.4m" of redundancy.
+                "radius_maximum_m" of an aggregation; "radius_m_without_roof" and "detected_by_two_0.4m" of redundancy.
             region: A region within the grid.
             band: Name of the band.
 

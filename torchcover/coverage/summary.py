@@ -23,7 +23,7 @@ class RegionRedundancy:
 
     Args:
         detecting_sensors: Key of the quantity, `"sensors_0.4m"`: mean number of sensors that see a point within the threshold,
-            or `"seen_by_two_0.4m"`: share that two or more see -> its number. By one or more: the detection.
+            or `"detected_by_two_0.4m"`: share that two or more see -> its number. By one or more: the detection.
         failure_numbers: Name of the sensor -> key of the quantity, as in `RegionSummary.numbers` -> its number without it.
         failure_effects: The same less the number with all sensors; of detection at most 0, of the radius at least 0.
         most_critical_sensor: The sensor without which most is lost: of the detection at the first threshold, or of the radius

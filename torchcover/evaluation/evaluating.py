@@ -7,8 +7,8 @@ from typing import Any
 from torchcover.coverage import Coverage
 from torchcover.evaluation.arguments import accept_fields
 from torchcover.evaluation.config import DESCRIPTIONS
-from torchcover.evaluation.measuring import measure_coverage
-from torchcover.evaluation.mixed import MixedResult, measure_scenarios
+from torchcover.evaluation.measurement import measure_coverage
+from torchcover.evaluation.mixed_result import MixedResult, measure_scenarios
 from torchcover.evaluation.result import Result
 from torchcover.evaluation.settings import Settings
 from torchcover.evaluation.task import build_task, make_unique_names

@@ -16,7 +16,7 @@ import torch
 from torch.utils.data import DataLoader, Dataset, get_worker_info
 
 from torchcover.evaluation.checkpoint import CheckpointManager
-from torchcover.evaluation.cores import count_cores, get_start_method, warn_about_spinning
+from torchcover.evaluation.cpu_cores import count_cores, get_start_method, warn_about_spinning
 from torchcover.evaluation.observers import AnyObserver, CoverageObserver
 from torchcover.evaluation.progress import ENDS, Progress, defer_signals
 from torchcover.evaluation.ranks import Ranks

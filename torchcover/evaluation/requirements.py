@@ -1,16 +1,15 @@
-"""What a rig must see, as YAML: of bodies at places, of regions, in encounters; and whether numbers keep it."""
+"""Requirements as YAML documents: on test targets at positions, on numbers of regions, and on encounters."""
 
 import re
 import warnings
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from pydantic import (
     AfterValidator,
     Discriminator,
@@ -32,6 +31,8 @@ from torchcover.coverage.quantity import (
 )
 from torchcover.encounters import Criterion, EncounterSet
 from torchcover.encounters.criterion import MOST_LATENCY_S
+from torchcover.estimation import Quantity
+from torchcover.evaluation.verdicts import Bound, Float64
 from torchcover.geometry import BoundingBox
 from torchcover.simulation import RegionsOfInterest, Sensor, list_builtin_names
 from torchcover.simulation.documents import (
@@ -49,130 +50,48 @@ from torchcover.targets import SIDES, TARGETS
 from torchcover.targets.placing import find_sides
 from torchcover.targets.survey import HITS, THRESHOLD_M
 
-Float64 = NDArray[np.float64]
 Side = Literal["front", "rear", "left", "right"]
-State = Literal["kept", "not kept", "not checked"]
 Corners = tuple[tuple[Coordinate, Coordinate], ...]
+Names = Annotated[tuple[str, ...], SEVERAL]
 
-KINDS, ANY = tuple(SENSORS), "any"
-# Of a mean over steps, what rounding makes of it.
-ROUNDING = 1e-9
-# Steps to a side of a place, and the worst places that are named.
-MOST_STEPS, TOLD = 1000, 5
-# What tables call numbers whose keys say too little.
-CALLED = {"ttc_s": "seconds to collision", "spare_s": "seconds to spare"}
-# Regions are called alike around any vehicle, and places are about as large.
-SOME_VEHICLE = BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5))
+SENSOR_KINDS = tuple(SENSORS)
+# Value of `failing_sensors` that stands for every sensor.
+ANY_SENSOR = "any"
+# Vehicle with which a file is checked before its own vehicle is known: regions have the same names around any vehicle.
+EXAMPLE_VEHICLE = BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5))
 
 
-class Bound(NamedTuple):
-    """What a number must not be below, or above."""
-
-    key: str
-    value: float
-    is_minimum: bool = True
-
-    @property
-    def text(self) -> str:
-        """As in `points >= 5`."""
-        return f"{CALLED.get(self.key, self.key)} {'>=' if self.is_minimum else '<='} {self.value:g}"
-
-
-class Readings(NamedTuple):
-    """(N,) values of a number, NaN where unknown, the ends of their 95 % intervals, and where each was measured.
-
-    Both ends are the value where it is exact, and NaN where there is no interval; inf if it may be anything above. In
-    `occupied_count` other places there was no room for a body.
-    """
-
-    value: Float64
-    low: Float64
-    high: Float64
-    locations: Sequence[str]
-    occupied_count: int = 0
-
-
-class Verdict(NamedTuple):
-    """Whether a bound is kept.
-
-    `value`, `low` and `high` are of the worst that is known; `margin` is what it has beyond the bound, in its unit:
-    what it lacks if negative, and NaN if that is not checked. Of `total_count` places, regions or encounters, `not_met_count` do not
-    keep it and `undecided_count` are not checked; `worst_locations` names the worst of them, else of all. Others had `occupied_count`.
-    """
-
-    requirement: str
-    bound: Bound
-    state: State
-    value: float
-    low: float
-    high: float
-    margin: float
-    total_count: int
-    not_met_count: int
-    undecided_count: int
-    worst_locations: tuple[str, ...]
-    occupied_count: int = 0
-
-
-def judge_requirements(requirements: "Requirements", readings: Sequence[Mapping[str, Readings]]) -> list[Verdict]:
-    """Judge every bound: kept if all of every interval keeps it, not kept if all of one does not, else not checked.
-
-    Args:
-        requirements: What is required.
-        readings: Of each requirement in turn, the numbers of its bounds, by key; with none in it, nothing is checked.
-
-    Example:
-        >>> child = {"target": "child", "at": {"within_m": 2.0}, "points": 5}
-        >>> asked, points = Requirements.model_validate({"requirements": [child]}), np.array([9.0, 3.0])
-        >>> one, = verdicts(asked, [{"points": Readings(points, points, points, ["ahead", "behind"])}])
-        >>> one.state, one.margin, one.where
-        ('not kept', -2.0, ('behind',))
-    """
-    pairs = zip(requirements.requirements, readings, strict=True)
-    return [_judged(one.text, bound, numbers[bound.key]) for one, numbers in pairs for bound in one.bounds]
-
-
-def _judged(words: str, bound: Bound, measured: Readings) -> Verdict:
-    sign = 1.0 if bound.is_minimum else -1.0
-    beyond, *ends = (sign * (each - bound.value) for each in measured[:3])
-    kept, failed = np.minimum(*ends) >= -ROUNDING, np.maximum(*ends) < -ROUNDING  # NaN is neither
-    unknown, order = ~(kept | failed), np.argsort(beyond, kind="stable")  # NaN is last
-    told = order[(failed if failed.any() else unknown if unknown.any() else kept)[order]][:TOLD].tolist()
-    of_worst = (float(each[order[0]]) if len(order) else np.nan for each in (*measured[:3], beyond))
-    state: State = "not kept" if failed.any() else "kept" if len(kept) and kept.all() else "not checked"
-    (value, low, high, margin), where = of_worst, tuple(measured.locations[k] for k in told)
-    margin = np.nan if state == "not checked" else margin
-    counts = len(kept), int(failed.sum()), int(unknown.sum())
-    return Verdict(words, bound, state, value, low, high, margin, *counts, where, measured.occupied_count)
-
-
-def _check_called(what: str, given: Iterable[str], known: Iterable[str]) -> None:
-    """Refuse names that nothing has, with the nearest."""
-    names = list(known)
-    for name in given:
-        if name not in names:
-            near = get_close_matches(name, names, n=1)
-            meant = f"is {near[0]!r} meant?" if near else f"there are {', '.join(names) or 'none'}"
-            raise ValueError(f"no {what} is called {name!r}; {meant}")
+def _check_names(kind: str, names: Iterable[str], valid_names: Iterable[str]) -> None:
+    """Raise ValueError for an unknown name, with the most similar valid one."""
+    valid = list(valid_names)
+    for name in names:
+        if name not in valid:
+            similar = get_close_matches(name, valid, n=1)
+            advice = f"is {similar[0]!r} meant?" if similar else f"there are {', '.join(valid) or 'none'}"
+            raise ValueError(f"no {kind} is called {name!r}; {advice}")
 
 
 class TargetPositions(Document):
-    """Where the middle of a body is put: one of five, in metres.
+    """Positions of the center of a test target: one of five forms, in meters.
 
     Args:
-        within_m: All around, up to this distance from the vehicle's box.
-        sides: With `within_m`: there only, from corners at 45 degrees.
-        x_m: Bounds forward of a rectangle; the vehicle's length if only y_m is given.
-        y_m: Bounds to the left; the vehicle's width if only x_m is given.
-        polygon_m: Corners x, y of an area, one after the other around it.
+        within_m: All positions up to this distance from the vehicle's box.
+        sides: With `within_m`: only on these sides, which are divided by 45 degree lines from the corners of the box.
+        x_m: Bounds of a rectangle in the forward direction; the length of the vehicle if only y_m is given.
+        y_m: Bounds to the left; the width of the vehicle if only x_m is given.
+        polygon_m: Corners x, y of an area, in order.
         line_m: Corners x, y of a line.
-        points_m: Points x, y, at each of which there must be room.
-        relative_to: The side of the vehicle's box from whose middle all x and y count; if not given, from its origin.
-        spacing_m: How far apart bodies are put.
+        points_m: Single points x, y; an occupied one makes the requirement undecided.
+        relative_to: Side of the vehicle's box whose center is the origin of x and y; the vehicle frame if not given.
+        spacing_m: Distance between neighboring positions.
+
+    Raises:
+        ValueError: Not exactly one form, a polygon that crosses itself, or more than 1000 positions along one axis.
 
     Example:
         >>> car = BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5))
-        >>> TargetPositions(x_m=(-1.0, -0.2), relative_to="rear", step_m=2.0).positions_m(car).tolist()
+        >>> positions = TargetPositions(x_m=(-1.0, -0.2), relative_to="rear", spacing_m=2.0)
+        >>> positions.compute_positions_m(car).tolist()
         [[-3.0, -1.0], [-2.2, -1.0], [-3.0, 1.0], [-2.2, 1.0]]
     """
 
@@ -187,56 +106,78 @@ class TargetPositions(Document):
     spacing_m: Annotated[float, Field(ge=0.01)] = 0.2
 
     @model_validator(mode="after")
-    def _check_one_of(self) -> Self:
+    def _check_form(self) -> Self:
         forms = (self.within_m, self.x_m or self.y_m, self.polygon_m, self.line_m, self.points_m)
         if sum(form is not None for form in forms) != 1:
             raise ValueError("give one of within_m, x_m and y_m, polygon_m, line_m, points_m")
         if (self.sides and not self.within_m) or (self.relative_to and self.within_m):
-            raise ValueError("sides are of within_m, and relative_to is of the others")
+            raise ValueError("sides go with within_m, and relative_to with the other forms")
         if self.polygon_m and not shapely.Polygon(self.polygon_m).is_valid:
-            raise ValueError("polygon_m: its sides cross, or lie on each other")
-        self.compute_positions_m(SOME_VEHICLE)  # not too many
+            raise ValueError("polygon_m: its sides cross or overlap")
+        self.compute_positions_m(EXAMPLE_VEHICLE)  # raises if there are too many
         return self
 
     def compute_positions_m(self, vehicle: BoundingBox) -> Float64:
-        """(P, 2) in the frame of a vehicle. ValueError: more than 1000 to a side."""
-        low_m, high_m = np.array(vehicle.lower_m[:2]), np.array(vehicle.upper_m[:2])
-        towards = {None: (0, 0), "front": (1, 0), "rear": (-1, 0), "left": (0, 1), "right": (0, -1)}[self.relative_to]
-        origin_m = (low_m + high_m + (high_m - low_m) * towards) / 2 * bool(self.relative_to)
-        places_m: Float64 = np.array(self.points_m or (), dtype=np.float64)
+        """Compute the positions around a vehicle.
+
+        Args:
+            vehicle: Bounding box of the vehicle in its own frame.
+
+        Returns:
+            (P, 2) x and y in the vehicle frame in meters.
+
+        Raises:
+            ValueError: More than 1000 positions along one axis.
+        """
+        lower_m, upper_m = np.array(vehicle.lower_m[:2]), np.array(vehicle.upper_m[:2])
+        origin_m = np.zeros(2)
+        if self.relative_to:
+            direction = {"front": (1, 0), "rear": (-1, 0), "left": (0, 1), "right": (0, -1)}[self.relative_to]
+            origin_m = (lower_m + upper_m + (upper_m - lower_m) * direction) / 2
         if self.line_m is not None:
             line = shapely.LineString(self.line_m)
-            places_m = shapely.get_coordinates(line.interpolate(self._between(0.0, line.length)))
-        elif self.points_m is None:
-            own_m = np.stack([low_m, high_m], axis=1) - origin_m[:, None]
-            (x0, x1), (y0, y1) = self.x_m or own_m[0], self.y_m or own_m[1]
-            area = shapely.Polygon(self.polygon_m) if self.polygon_m else shapely.box(x0, y0, x1, y1)
-            area = area.buffer(self.within_m or 0.0)
-            x0, y0, x1, y1 = area.bounds
-            there_m = np.stack(np.meshgrid(self._between(x0, x1), self._between(y0, y1)), axis=-1).reshape(-1, 2)
-            there = shapely.intersects_xy(area, there_m)
-            if self.within_m:
-                there &= np.isin(find_sides(vehicle, there_m), [*map(SIDES.index, self.sides or SIDES)])
-            places_m = there_m[there]
-        return np.asarray(origin_m + places_m)
+            positions_m = shapely.get_coordinates(line.interpolate(self._space_evenly(0.0, line.length)))
+        elif self.points_m is not None:
+            positions_m = np.array(self.points_m, dtype=np.float64)
+        else:
+            positions_m = self._compute_area_positions_m(vehicle, lower_m - origin_m, upper_m - origin_m)
+        return np.asarray(origin_m + positions_m)
 
-    def _between(self, low_m: float, high_m: float) -> Float64:
-        """Both ends, and as many steps in between as it takes."""
-        steps = int(np.ceil((high_m - low_m) / self.spacing_m - ROUNDING))
-        if steps > MOST_STEPS:
-            raise ValueError(f"a place of {high_m - low_m:g} m in steps of {self.spacing_m:g} m; take a larger step_m")
-        return np.linspace(low_m, high_m, steps + 1)
+    def _compute_area_positions_m(self, vehicle: BoundingBox, lower_m: Float64, upper_m: Float64) -> Float64:
+        """Compute the raster positions in an area; `lower_m` and `upper_m` are corners of the vehicle's box."""
+        (x_min_m, x_max_m), (y_min_m, y_max_m) = (
+            self.x_m or (lower_m[0], upper_m[0]),
+            self.y_m or (lower_m[1], upper_m[1]),
+        )
+        rectangle = shapely.box(x_min_m, y_min_m, x_max_m, y_max_m)
+        area = shapely.Polygon(self.polygon_m) if self.polygon_m else rectangle
+        area = area.buffer(self.within_m or 0.0)
+        x_min_m, y_min_m, x_max_m, y_max_m = area.bounds
+        axes_m = self._space_evenly(x_min_m, x_max_m), self._space_evenly(y_min_m, y_max_m)
+        raster_m = np.stack(np.meshgrid(*axes_m), axis=-1).reshape(-1, 2)
+        is_inside = shapely.intersects_xy(area, raster_m)
+        if self.within_m:
+            side_indices = [SIDES.index(side) for side in self.sides or SIDES]
+            is_inside &= np.isin(find_sides(vehicle, raster_m), side_indices)
+        return np.asarray(raster_m[is_inside])
 
-
-Names = Annotated[tuple[str, ...], SEVERAL]
+    def _space_evenly(self, low_m: float, high_m: float, max_intervals: int = 1000) -> Float64:
+        """Divide an interval evenly into the fewest parts of at most `spacing_m`; both ends are included."""
+        num_intervals = int(np.ceil((high_m - low_m) / self.spacing_m - 1e-9))  # rounding must not add an interval
+        if num_intervals > max_intervals:
+            raise ValueError(
+                f"positions over {high_m - low_m:g} m with a spacing of {self.spacing_m:g} m are more than "
+                f"{max_intervals:,}; use a larger spacing_m"
+            )
+        return np.linspace(low_m, high_m, num_intervals + 1)
 
 
 class _Requirement(Document):
-    """What each has.
+    """Common fields of all requirements.
 
     Args:
-        name: What tables call it.
-        failing_sensors: Sensors that may fail, one at a time: a name or several, or "any".
+        name: Name in tables.
+        failing_sensors: The requirement must also hold without each of these sensors, one at a time; "any" for all.
     """
 
     name: str = ""
@@ -244,7 +185,7 @@ class _Requirement(Document):
 
     @property
     def bounds(self) -> list[Bound]:
-        """What is required."""
+        """Bounds of the requirement."""
         raise NotImplementedError
 
     @model_validator(mode="after")
@@ -254,44 +195,59 @@ class _Requirement(Document):
         return self
 
     def format_text(self, text: str) -> str:
-        """What it says, after its own name."""
-        lost = f", also without {' or '.join(self.failing_sensors)}" * bool(self.failing_sensors)
-        return f"{self.name}: " * bool(self.name) + text + lost
+        """Add the name and the failing sensors to the text of a requirement.
+
+        Args:
+            text: Text of the requirement itself.
+        """
+        name = f"{self.name}: " if self.name else ""
+        failures = f", also without {' or '.join(self.failing_sensors)}" if self.failing_sensors else ""
+        return name + text + failures
 
     def find_failing_sensors(self, sensor_names: Sequence[str]) -> list[str]:
-        """Those of a rig's sensors that may fail. ValueError: the rig has none of a name."""
-        _check_called("sensor", self.failing_sensors, [*sensor_names, ANY])
-        return list(sensor_names if ANY in self.failing_sensors else self.failing_sensors)
+        """Find the sensors of a rig that may fail.
+
+        Args:
+            sensor_names: Names of all sensors of the rig.
+
+        Returns:
+            Names of the sensors without which the requirement must also hold.
+
+        Raises:
+            ValueError: The rig lacks a sensor of this name.
+        """
+        _check_names("sensor", self.failing_sensors, [*sensor_names, ANY_SENSOR])
+        return list(sensor_names if ANY_SENSOR in self.failing_sensors else self.failing_sensors)
 
 
-def _target(given: str, info: ValidationInfo) -> str:
-    if Path(given).suffix:
-        return str(resolve_path(Path(given), info))
-    _check_called("target", [given], [*TARGETS, *list_builtin_names("vehicles")])
-    return given
+def _validate_target(target: str, info: ValidationInfo) -> str:
+    if Path(target).suffix:
+        return str(resolve_path(Path(target), info))
+    _check_names("target", [target], [*TARGETS, *list_builtin_names("vehicles")])
+    return target
 
 
 class TargetRequirement(_Requirement):
-    """What must be seen of a body wherever it is put.
+    """Requirement on a test target at every position of a set, in every frame.
 
     Args:
-        target: "child", a built-in vehicle, the YAML file of one, or a mesh, as of `torchcover targets`.
-        positions: A place, or the name of one of the file's.
-        counted_sensors: Only these sensors count: a name or a kind ("lidar", "camera", "radar"), or several; all if not given.
-        detection_points: Points that are enough for `sensors` and `visual_angle_deg`.
-        points: Least number of points on it, in every step.
-        pixels: Least number of pixels of the full image of one camera, in every step.
-        sensors: Least number of sensors with enough points each, in every step.
-        share: Least share of its visible surface within 0.4 m of a point on it, over all steps.
-        visual_angle_deg: Least angle from its foot to its top, at a sensor that has enough points in every step.
+        target: "child", a built-in vehicle, the YAML file of one, or a mesh file, as in `torchcover targets`.
+        positions: Positions, or the name of a set in `position_sets`.
+        counted_sensors: Names or kinds ("lidar", "camera", "radar") of the sensors that count; all if not given.
+        detection_points: Points on the target with which a sensor counts for `sensors` and `visual_angle_deg`.
+        points: Minimum number of points on the target in each frame.
+        pixels: Minimum number of pixels in the full image of one camera in each frame.
+        sensors: Minimum number of sensors that detect the target in each frame.
+        share: Minimum share of its visible surface within 0.4 m of a point on it, over all frames.
+        visual_angle_deg: Minimum vertical angle of the target at a sensor that detects it in each frame.
     """
 
-    target: Annotated[str, AfterValidator(_target)]
+    target: Annotated[str, AfterValidator(_validate_target)]
     positions: Annotated[
-        Annotated[str, Tag("(name)")] | Annotated[TargetPositions, Tag("(place)")],
-        Discriminator(lambda given: "(name)" if isinstance(given, str) else "(place)"),
+        Annotated[str, Tag("(name)")] | Annotated[TargetPositions, Tag("(positions)")],
+        Discriminator(lambda content: "(name)" if isinstance(content, str) else "(positions)"),
     ]
-    counted_sensors: Annotated[Names, Field(min_length=1)] = KINDS
+    counted_sensors: Annotated[Names, Field(min_length=1)] = SENSOR_KINDS
     detection_points: PositiveInt = HITS
     points: PositiveFloat | None = None
     pixels: PositiveFloat | None = None
@@ -301,48 +257,72 @@ class TargetRequirement(_Requirement):
 
     @property
     def bounds(self) -> list[Bound]:
-        """What is required."""
+        """Bounds of the requirement; all are minima."""
         keys = ("points", "pixels", "sensors", "share", "visual_angle_deg")
         return [Bound(key, getattr(self, key)) for key in keys if getattr(self, key)]
 
     @model_validator(mode="after")
-    def _check(self) -> Self:
-        left = len(set(self.counted_sensors)) - any(one in (ANY, *self.counted_sensors) for one in self.failing_sensors)
-        few = (self.sensors or 1) > left and not set(KINDS).intersection(self.counted_sensors)
-        if few or (self.pixels and {"lidar", "radar"}.issuperset(self.counted_sensors)):
-            both = ", ".join(bound.text for bound in self.bounds)
-            raise ValueError(f"requirements contradict each other: {self.text}: {both}")
+    def _check_contradictions(self) -> Self:
+        names, failing = set(self.counted_sensors), set(self.failing_sensors)
+        has_kind = bool(names.intersection(SENSOR_KINDS))
+        num_remaining = len(names) - bool(failing & {ANY_SENSOR, *names})
+        too_few_sensors = (self.sensors or 1) > num_remaining and not has_kind
+        pixels_without_camera = self.pixels and names <= {"lidar", "radar"}
+        if too_few_sensors or pixels_without_camera:
+            bounds = ", ".join(bound.text for bound in self.bounds)
+            raise ValueError(f"requirements contradict each other: {self.text}: {bounds}")
         return self
 
     @property
     def text(self) -> str:
-        """Of what, where, by which sensors."""
-        place = {} if isinstance(self.positions, str) else self.positions.model_dump(exclude_unset=True, mode="json")
-        at = " ".join(f"{key} {value}" for key, value in place.items()) or self.positions
-        by = f", by {', '.join(self.counted_sensors)}" * (
-            self.counted_sensors != KINDS
-        ) + f", hits {self.detection_points}" * (self.detection_points != HITS)
-        return self.format_text(f"{Path(TARGETS.get(self.target, self.target)).stem}, {at}{by}")
+        """Target, positions and sensors in words."""
+        target = Path(TARGETS.get(self.target, self.target)).stem
+        positions = self.positions
+        if not isinstance(positions, str):
+            fields = positions.model_dump(exclude_unset=True, mode="json")
+            positions = " ".join(f"{key} {value}" for key, value in fields.items())
+        text = f"{target}, {positions}"
+        if self.counted_sensors != SENSOR_KINDS:
+            text += f", by {', '.join(self.counted_sensors)}"
+        if self.detection_points != HITS:
+            text += f", detection_points {self.detection_points}"
+        return self.format_text(text)
 
     def group_sensors(self, sensors: Sequence[Sensor]) -> dict[str, list[int]]:
-        """Numbers of the sensors that count, and of those without each that may fail; by what is then said of where."""
-        _check_called("sensor", self.counted_sensors, [*(one.name for one in sensors), *KINDS])
-        of_kinds = tuple(of for kind, of in SENSORS.items() if kind in self.counted_sensors)
-        counts = [k for k, one in enumerate(sensors) if one.name in self.counted_sensors or isinstance(one, of_kinds)]
-        names = self.find_failing_sensors([one.name for one in sensors])
-        lost = [k for k in counts if sensors[k].name in names]  # the others change nothing
-        return {"": counts} | {f", without {sensors[k].name}": [each for each in counts if each != k] for k in lost}
+        """Group the sensors that count: all of them, and without each one that may fail.
+
+        Args:
+            sensors: Sensors of the rig.
+
+        Returns:
+            Text for the location -> indices of the sensors: "" for all, ", without NAME" for a failure.
+
+        Raises:
+            ValueError: The rig lacks a sensor of a name.
+        """
+        _check_names("sensor", self.counted_sensors, [*(sensor.name for sensor in sensors), *SENSOR_KINDS])
+        kinds = tuple(sensor_class for kind, sensor_class in SENSORS.items() if kind in self.counted_sensors)
+        counted = []
+        for index, sensor in enumerate(sensors):
+            if sensor.name in self.counted_sensors or isinstance(sensor, kinds):
+                counted.append(index)
+        failing_names = self.find_failing_sensors([sensor.name for sensor in sensors])
+        groups = {"": counted}
+        for failing in counted:  # the failure of any other sensor changes nothing
+            if sensors[failing].name in failing_names:
+                groups[f", without {sensors[failing].name}"] = [index for index in counted if index != failing]
+        return groups
 
 
 class RegionRequirement(_Requirement):
-    """What a number of a region must be.
+    """Requirement on a number of a region in one height band.
 
     Args:
-        region: As the file's `regions` call it; without these, as the usual table: "20m", "front_3m", ...
-        band: Of the height band.
-        number: By the name of its column in `summary.csv`: "detection_0.4m", "radius_m", "seen_by_two_0.4m", ...
-        min_value: What it must not be below, if more of it is better.
-        max_value: What it must not be above, if less of it is.
+        region: Name in the `regions` of the file; without these a usual region: "20m", "front_3m", ...
+        band: Name of the height band.
+        number: Column of `summary.csv`: "detection_0.4m", "radius_m", "detected_by_two_0.4m", ...
+        min_value: Minimum, for numbers of which more is better.
+        max_value: Maximum, for numbers of which less is better.
     """
 
     region: str
@@ -353,53 +333,64 @@ class RegionRequirement(_Requirement):
 
     @property
     def bounds(self) -> list[Bound]:
-        """What is required."""
-        both = (self.min_value, True), (self.max_value, False)
-        return [Bound(self.number, value, is_least) for value, is_least in both if value is not None]
+        """The bound."""
+        limits = (self.min_value, True), (self.max_value, False)
+        return [Bound(self.number, value, is_minimum) for value, is_minimum in limits if value is not None]
 
     @property
     def threshold_m(self) -> float | None:
-        """In the name of the number; None if there is none."""
-        found = re.search(r"_(\d+(?:\.\d+)?)m$", self.number)
-        return float(found[1]) if found else None
+        """Detection threshold in the name of the number in meters; None if there is none."""
+        match = re.search(r"_(\d+(?:\.\d+)?)m$", self.number)
+        return float(match[1]) if match else None
 
     @model_validator(mode="after")
-    def _check(self) -> Self:
+    def _check_number(self) -> Self:
         threshold_m = self.threshold_m or THRESHOLD_M
-        both = RADIUS, make_detection_quantity(threshold_m)
-        known = [
-            *both,
-            *map(make_cells_quantity, both),
+        main_quantities = RADIUS, make_detection_quantity(threshold_m)
+        quantities = {quantity.key: quantity for quantity in self._list_quantities(threshold_m)}
+        _check_names("number of a region", [self.number], quantities)
+        quantity = quantities[self.number]
+        better, right, wrong = ("more", "min_value", "max_value")
+        if quantity.lower_is_better:
+            better, right, wrong = ("less", "max_value", "min_value")
+        if getattr(self, wrong) is not None:
+            raise ValueError(f"{wrong}: of {self.number} {better} is better; {right} is meant")
+        upper_limit = 1.0 if quantity.unit == "share" else np.inf
+        if any(not 0.0 < bound.value <= upper_limit for bound in self.bounds):
+            range_text = "above 0 and at most 1" if upper_limit == 1 else "above 0"
+            raise ValueError(f"{self.bounds[0].text}: a value {range_text} is needed")
+        if self.failing_sensors and quantity not in main_quantities:
+            raise ValueError(
+                f"failing_sensors: only radius_m and detection rates are measured without a sensor; got {self.number}"
+            )
+        return self
+
+    def _list_quantities(self, threshold_m: float) -> list[Quantity]:
+        """List all quantities of a region at a threshold."""
+        main_quantities = [RADIUS, make_detection_quantity(threshold_m)]
+        quantities = [
+            *main_quantities,
+            *(make_cells_quantity(quantity) for quantity in main_quantities),
             make_sensor_count_quantity(threshold_m),
             make_redundancy_quantity(threshold_m),
         ]
-        known += [
-            one for of in AGGREGATIONS for one in (of.from_keys({self.number}) or of.parse(of.example)).quantities
-        ]
-        _check_called("number of a region", [self.number], [one.key for one in known])
-        quantity = next(one for one in known if one.key == self.number)
-        better, right, wrong = ("less", "most", "least") if quantity.lower_is_better else ("more", "least", "most")
-        if getattr(self, wrong) is not None:
-            raise ValueError(f"{wrong}: of {self.number} {better} is better; {right} is meant")
-        most = 1.0 if quantity.unit == "share" else np.inf
-        if any(not 0.0 < bound.value <= most for bound in self.bounds):
-            raise ValueError(f"{self.bounds[0].text}: it is above 0{' and at most 1' * (most == 1)}")
-        if self.failing_sensors and quantity not in both:
-            raise ValueError(f"without: radius_m and detections are known without a sensor; got {self.number}")
-        return self
+        for kind in AGGREGATIONS:
+            aggregation = kind.from_keys({self.number}) or kind.parse(kind.example)
+            quantities.extend(aggregation.quantities)
+        return quantities
 
     @property
     def text(self) -> str:
-        """Where."""
+        """Region and band."""
         return self.format_text(f"{self.region} {self.band}")
 
 
 class BrakingModel(Document):
-    """What braking needs: v / (2 x deceleration) + latency_s.
+    """Time that braking needs: v / (2 x deceleration_mps2) + latency_s.
 
     Args:
-        deceleration_mps2: Of the brakes, in m/s2.
-        latency_s: From the detection to the brakes.
+        deceleration_mps2: Deceleration of the brakes in m/s2.
+        latency_s: Seconds from the detection to the start of braking.
     """
 
     deceleration_mps2: PositiveFloat = 9.0
@@ -407,15 +398,15 @@ class BrakingModel(Document):
 
 
 class EncounterRequirement(_Requirement):
-    """When the other must be detected in each encounter of a set: in every phase of the looks, and every draw.
+    """Requirement on the time to collision at first detection in every encounter of a set, with every start offset.
 
     Args:
-        encounters: A set, built in or a YAML file, as of `torchcover encounter`.
-        ttc_s: Least time to collision at detection.
-        braking: So early that braking still prevents it.
-        points: So many points on the other, `pixels` and `consecutive_scans` are a detection, as of `Criterion`.
-        pixels: Of a camera.
-        consecutive_scans: In a row.
+        encounters: Built-in set or YAML file, as in `torchcover encounter`.
+        ttc_s: Minimum time to collision at first detection.
+        braking: Brakes that must still prevent the collision after the first detection.
+        points: Points on the road user for a detection, as in `Criterion`.
+        pixels: Pixels in the full image of one camera for a detection.
+        consecutive_scans: Number of consecutive scans for a detection.
     """
 
     encounters: Annotated[EncounterSet, build_name_validator(EncounterSet)]
@@ -427,27 +418,33 @@ class EncounterRequirement(_Requirement):
 
     @property
     def bounds(self) -> list[Bound]:
-        """What is required: `spare_s` is what the time to collision has beyond what braking needs."""
-        ttc = [] if self.ttc_s is None else [Bound("ttc_s", self.ttc_s)]
-        return ttc if self.braking is None else [*ttc, Bound("spare_s", 0.0)]
+        """Bounds; `braking_margin_s` is the time to collision beyond the time that braking needs."""
+        bounds = []
+        if self.ttc_s is not None:
+            bounds.append(Bound("ttc_s", self.ttc_s))
+        if self.braking is not None:
+            bounds.append(Bound("braking_margin_s", 0.0))
+        return bounds
 
     @property
     def criterion(self) -> Criterion:
-        """What is detected, and what is in time."""
+        """Criterion for a detection, with the brakes."""
         brakes = self.braking or BrakingModel()
         return Criterion(self.points, self.pixels, self.consecutive_scans, brakes.deceleration_mps2, brakes.latency_s)
 
     @property
     def text(self) -> str:
-        """In which encounters, and by what."""
-        given: dict[str, float] = self.model_dump(include=self.model_fields_set & {"points", "pixels", "looks"})
-        given |= self.braking.model_dump() if self.braking else {}
-        return self.format_text(
-            ", ".join((self.encounters.name, *(f"{key} {value:g}" for key, value in given.items())))
-        )
+        """Set of encounters and criterion in words."""
+        criterion_fields = self.model_fields_set & {"points", "pixels", "consecutive_scans"}
+        values: dict[str, float] = self.model_dump(include=criterion_fields)
+        if self.braking:
+            values |= self.braking.model_dump()
+        parts = [self.encounters.name]
+        parts += [f"{key} {value:g}" for key, value in values.items()]
+        return self.format_text(", ".join(parts))
 
 
-def _kind(content: Any) -> str | None:  # noqa: ANN401
+def _find_kind(content: Any) -> str | None:  # noqa: ANN401  (content of a YAML file)
     keys = content if isinstance(content, dict) else getattr(content, "model_fields_set", ())
     return next((f"({key})" for key in ("target", "region", "encounters") if key in keys), None)
 
@@ -456,19 +453,27 @@ AnyRequirement = Annotated[
     Annotated[TargetRequirement, Tag("(target)")]
     | Annotated[RegionRequirement, Tag("(region)")]
     | Annotated[EncounterRequirement, Tag("(encounters)")],
-    Discriminator(_kind, custom_error_type="kind", custom_error_message="give target, region or encounters"),
+    Discriminator(_find_kind, custom_error_type="kind", custom_error_message="give target, region or encounters"),
 ]
 
 
 class Requirements(BuiltInDocument, RegionsOfInterest):
-    """Requirements of a rig on any vehicle; `regions`, `heights` and `grid` are those of `RegionsOfInterest`.
+    """Requirements on a rig on any vehicle; `regions`, `heights` and `grid` are those of `RegionsOfInterest`.
 
     Args:
-        name: What tables call them.
-        description: What they are, and where their numbers come from.
-        scenario: The world; not given, regions are in that of `evaluate`, and bodies on flat ground.
-        position_sets: By name.
-        requirements: All of them must be kept.
+        name: Name in tables.
+        description: Content, and the sources of the numbers.
+        scenario: Scenario; if not given, regions use that of `evaluate`, and test targets stand on flat ground.
+        position_sets: Name -> positions.
+        requirements: Requirements, all of which must be met.
+
+    Raises:
+        ValueError: Unknown names, requirements that contradict or repeat each other.
+
+    Example:
+        >>> child = {"target": "child", "positions": {"within_m": 2.0}, "points": 5}
+        >>> Requirements.model_validate({"requirements": [child]}).requirements[0].text
+        'child_110cm, within_m 2.0'
     """
 
     kind: ClassVar[str] = "a set of requirements"
@@ -481,16 +486,19 @@ class Requirements(BuiltInDocument, RegionsOfInterest):
     requirements: Annotated[tuple[AnyRequirement, ...], Field(min_length=1)]
 
     @model_validator(mode="after")
-    def _check_names(self) -> Self:
-        with warnings.catch_warnings(action="ignore"):  # of what lies within a vehicle, which is not known yet
-            asked = self.build_query_plan(SOME_VEHICLE.outline_m)
-        for one in self.requirements:
-            if isinstance(one, TargetRequirement) and isinstance(one.positions, str):
-                _check_called("place", [one.positions], self.position_sets)
-            if isinstance(one, RegionRequirement):
-                _check_called("region", [one.region], [region.name for region in asked.regions])
-                _check_called("height band", [one.band], asked.grid.heights)
-        told = Counter(f"{one.text}: {bound.text}" for one in self.requirements for bound in one.bounds)
-        if (twice := told.most_common(1)[0])[1] > 1:
-            raise ValueError(f"several requirements read {twice[0]!r}; give each a name, or leave all but one out")
+    def _check_references(self) -> Self:
+        with warnings.catch_warnings(action="ignore"):  # regions inside the vehicle, which is not known yet
+            query_plan = self.build_query_plan(EXAMPLE_VEHICLE.outline_m)
+        region_names = [region.name for region in query_plan.regions]
+        texts = Counter[str]()
+        for requirement in self.requirements:
+            if isinstance(requirement, TargetRequirement) and isinstance(requirement.positions, str):
+                _check_names("position set", [requirement.positions], self.position_sets)
+            if isinstance(requirement, RegionRequirement):
+                _check_names("region", [requirement.region], region_names)
+                _check_names("height band", [requirement.band], query_plan.grid.heights)
+            texts.update(f"{requirement.text}: {bound.text}" for bound in requirement.bounds)
+        text, count = texts.most_common(1)[0]
+        if count > 1:
+            raise ValueError(f"several requirements read {text!r}; give each a name, or remove all but one")
         return self

@@ -28,7 +28,7 @@ from torchcover.estimation import (
     estimate_blocks_needed,
 )
 from torchcover.evaluation.config import STUDY_SETTINGS
-from torchcover.evaluation.measuring import measure_coverage
+from torchcover.evaluation.measurement import measure_coverage
 from torchcover.evaluation.settings import Settings
 from torchcover.evaluation.target_error import MIN_STEPS, round_up_frames
 from torchcover.evaluation.task import build_simulation_task

@@ -11,7 +11,7 @@ from torch.utils.data import DataLoader, Dataset
 from torchcover.coverage import Average
 from torchcover.estimation import Estimate
 from torchcover.evaluation import CoverageObserver
-from torchcover.evaluation.cores import get_start_method
+from torchcover.evaluation.cpu_cores import get_start_method
 from torchcover.evaluation.pipeline import FramesOrErrors, MeasuredFrame, find_killed_worker, iterate_batches
 from torchcover.frames import Frame
 from torchcover.placement.host_vehicle import HostVehicle

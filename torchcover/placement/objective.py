@@ -11,9 +11,10 @@ from pydantic import Field, NonNegativeFloat, model_validator
 from torchcover.coverage import Region
 from torchcover.coverage.grid import PAPER_HEIGHTS
 from torchcover.estimation import Estimate, Quantity
-from torchcover.evaluation.checking import check
-from torchcover.evaluation.requirements import AnyRequirement, RegionRequirement, Requirements, Verdict
-from torchcover.evaluation.target_survey import build_flat_ground
+from torchcover.evaluation.requirements_check import check
+from torchcover.evaluation.requirements import AnyRequirement, RegionRequirement, Requirements
+from torchcover.evaluation.verdicts import Verdict
+from torchcover.evaluation.target_visibility import build_flat_ground
 from torchcover.simulation import Document, Rig, Scenario
 from torchcover.simulation.regions_of_interest import RegionOfInterest
 
@@ -47,7 +48,7 @@ class Objective(Document):
 
     Args:
         number: Key of the number: "radius_m", "detection_0.4m"; "cells_radius_m" averages over observed cells even if
-            the search averages by area; "radius_maximum_m" of an aggregation; "seen_by_two_0.4m" or
+            the search averages by area; "radius_maximum_m" of an aggregation; "detected_by_two_0.4m" or
             "detection_0.4m_without_roof" of redundancy, where "any" stands for the sensor whose failure is worst.
         threshold_m: Threshold in meters of the number `detection_*m`; 0.4 if no number is given.
         band: Height band of the paper, "ground" or "obstacle", or several; both by default.
@@ -171,7 +172,7 @@ class Objective(Document):
         """
         if self.key.startswith("cells_"):
             return "cells"
-        has_both_averages = re.match(r"(radius_m|(detection|sensors|seen_by_two)_[\d.]+m)(_without_|$)", self.key)
+        has_both_averages = re.match(r"(radius_m|(detection|sensors|detected_by_two)_[\d.]+m)(_without_|$)", self.key)
         return "" if has_both_averages else "-"
 
     @property

@@ -16,14 +16,14 @@ from torchcover.coverage.grid import PAPER_HEIGHTS
 from torchcover.coverage.quantity import RADIUS, make_detection_quantity, make_failure_quantity
 from torchcover.estimation import Estimate
 from torchcover.evaluation import CoverageObserver
-from torchcover.evaluation.measuring import BLOCKS
+from torchcover.evaluation.measurement import BLOCKS
 from torchcover.geometry.arrays import Float64
 from torchcover.placement.objective import DEFAULT_THRESHOLD_M, Objective
 from torchcover.simulation import Areas, RegionsOfInterest, Rig, SurfaceReference
 from torchcover.simulation.regions_of_interest import RegionOfInterest
 
 ANY = "any"  # stands in a key for the sensor whose failure is worst
-DETECTION_KEY = re.compile(r"(?:detection|sensors|seen_by_two)_(\d+(?:\.\d+)?)m")
+DETECTION_KEY = re.compile(r"(?:detection|sensors|detected_by_two)_(\d+(?:\.\d+)?)m")
 FAILURE_KEY = re.compile(r"(.+)_without_(.+)")
 
 

@@ -320,7 +320,7 @@ class PlacementSearch:
         if requirements is None:
             return shortfalls
         for verdict in check_requirements(rig, requirements, self.space.scenarios[0], self.plan.sensor_model):
-            if verdict.state == "kept":
+            if verdict.state == "met":
                 continue
             margin = -verdict.margin / (abs(verdict.bound.value) or 1.0)
             worst = 1.0 if math.isnan(margin) else max(margin, 0.0)

@@ -13,7 +13,7 @@ from torchcover.coverage.grid import PAPER_HEIGHTS
 from torchcover.coverage.quantity import make_detection_quantity
 from torchcover.estimation import Difference, Estimate, Quantity
 from torchcover.estimation.errors import ROUND_OFF
-from torchcover.evaluation.target_survey import build_flat_ground
+from torchcover.evaluation.target_visibility import build_flat_ground
 from torchcover.placement.common_frames import CommonFrames
 from torchcover.placement.host_vehicle import NOT_WORSE
 from torchcover.placement.objective import DEFAULT_THRESHOLD_M, Objective

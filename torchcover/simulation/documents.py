@@ -48,18 +48,18 @@ SETTINGS_KIND = "a file of settings"
 KINDS = {
     SETTINGS_KIND: (
         "",
-        "scenario steps seed vehicle sensor_model weather ask probe cell_m thresholds_m aggregations reference rays "
-        "estimate band_frame frame_interval_s target_error only_detection redundancy metrics device workers no_cache "
-        "skip_bad_frames rerun recording",
+        "scenario num_frames seed vehicle sensor_model weather regions test_targets cell_m thresholds_m aggregations "
+        "reference num_rays average band_frame frame_interval_s target_error only_detection redundancy metrics device "
+        "num_workers no_cache skip_bad_frames rerun recording",
     ),
     "a rig": ("sensors", "vehicle weather bodies"),
     "a vehicle": ("parts", "extends mount_regions"),
     "a scenario": ("", "ego bodies actors boxes time_step_s duration_s weather traffic"),
     "a search space": (
         "scenario objectives",
-        "vehicle not_worse requirements start free constraints cost always candidates choose now",
+        "vehicle not_worse requirements start free constraints prices_eur fixed_rig candidates baseline",
     ),
-    "a set of requirements": ("requirements", "regions heights grid scenario places"),
+    "a set of requirements": ("requirements", "regions heights grid scenario position_sets"),
     "a set of encounters": ("encounters", "draws seed"),
     "a file of regions": ("", "regions heights grid"),
 }

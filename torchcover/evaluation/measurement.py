@@ -9,7 +9,7 @@ from pathlib import Path
 
 from torchcover.coverage import CoverageSums
 from torchcover.evaluation.checkpoint import Checkpoint, CheckpointManager
-from torchcover.evaluation.cores import compute_num_workers
+from torchcover.evaluation.cpu_cores import compute_num_workers
 from torchcover.evaluation.observers import AnyObserver, CoverageObserver
 from torchcover.evaluation.pipeline import Run, StoppingRule, observe
 from torchcover.evaluation.ranks import Ranks

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from torchcover.coverage import Coverage, CoverageMixture
 from torchcover.evaluation.checkpoint import Checkpoint
-from torchcover.evaluation.measuring import measure_coverage
+from torchcover.evaluation.measurement import measure_coverage
 from torchcover.evaluation.progress import defer_signals
 from torchcover.evaluation.result import Result
 from torchcover.evaluation.result_page import build_result_tables

@@ -25,7 +25,7 @@ from torchcover.encounters.traffic import Drive, DriveSensors, detect_approach, 
 from torchcover.evaluation.progress import Progress, defer_signals
 from torchcover.evaluation.result_page import format_facts
 from torchcover.evaluation.settings import FILES, parse_file_kinds
-from torchcover.evaluation.target_survey import build_flat_ground
+from torchcover.evaluation.target_visibility import build_flat_ground
 from torchcover.evaluation.task import AnyRig, load_named_rig
 from torchcover.files import AtomicOutput
 from torchcover.geometry import invert, transform_outline
