@@ -104,14 +104,14 @@ def test_workers_and_checkpoints_change_no_bit(both, tmp_path):
 
 def test_a_mixture_is_the_weighted_mean(both):
     other = evaluate(RIGS, yard("other"), **{**SMALL, "seed": 1})
-    mixed = MixedResult.from_results({"yard": both, "other": other}, {"yard": 0.75, "other": 0.25})
+    mixed = MixedResult.from_results({"yard": both, "road_user": other}, {"yard": 0.75, "road_user": 0.25})
     for row, first, second in zip(of_bodies(mixed), of_bodies(both), of_bodies(other), strict=True):
         value = 0.75 * first["target_positions_5_points"] + 0.25 * second["target_positions_5_points"]
         assert row["target_positions_5_points"] == pytest.approx(value)
         assert row["observed_cells"] == first["observed_cells"] + second["observed_cells"]
     without = evaluate(RIGS, yard("other"), **{**SMALL, "num_frames": 1, "test_targets": "none"})
     with pytest.raises(ValueError, match="other bodies"):
-        _ = MixedResult.from_results({"yard": both, "other": without}, {"yard": 0.75, "other": 0.25})
+        _ = MixedResult.from_results({"yard": both, "road_user": without}, {"yard": 0.75, "road_user": 0.25})
 
 
 def test_who_asks_about_other_regions_asks_for_bodies_by_name_or_has_none():

@@ -323,7 +323,7 @@ def box(tmp_path):
 
 def test_times_to_collision_are_the_latest_of_all_phases(box):
     walker = {"body": "child_120cm", "speed_kmh": 5, "from_m": 4}
-    crossings = {"name": "two", "encounters": [{"name": "a", "ego": {"speed_kmh": [10, 30]}, "other": walker}]}
+    crossings = {"name": "two", "encounters": [{"name": "a", "ego": {"speed_kmh": [10, 30]}, "road_user": walker}]}
     criterion = {"points": 1, "pixels": 20}
     one = {
         "encounters": crossings,
@@ -348,7 +348,7 @@ def test_times_to_collision_are_the_latest_of_all_phases(box):
 
 def test_who_is_seen_from_the_beginning_may_have_been_before(box):
     """So more than that is neither kept nor not, with a sensor lost, too; and nothing has more than the whole."""
-    way = {"name": "a", "ego": {"speed_kmh": 20}, "other": {"body": "adult", "speed_kmh": 5}, "seconds": 1.2}
+    way = {"name": "a", "ego": {"speed_kmh": 20}, "road_user": {"body": "adult", "speed_kmh": 5}, "duration_s": 1.2}
     one = {
         "encounters": {"name": "short", "encounters": [way]},
         "points": 2,
@@ -369,7 +369,7 @@ def test_who_is_seen_from_the_beginning_may_have_been_before(box):
     assert [cell.text for cell in table.rows[1]][2:5] == ["not decided", f"{ttc.value:.4g} or more", "-"]
     with pytest.raises(ValueError, match=r"1\.5 s are required, and encounter 'a' at 20 km/h .* lasts 1\.1\d s"):
         check(two, asked({**one, "ttc_s": 1.5}), vehicle=box)
-    way["other"]["from_m"] = 1.65  # comes then
+    way["road_user"]["from_m"] = 1.65  # comes then
     assert check(two, asked({**one, "ttc_s": 1.1}), vehicle=box).is_met is False
 
 
