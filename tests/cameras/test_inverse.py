@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq
 
 from torchcover.cameras import Camera, inverse
-from torchcover.cameras.inverse import build_start_table, find_valid_region
+from torchcover.cameras.inverse import build_start_table
 from torchcover.cameras.models import build_lens
+from torchcover.cameras.valid_region import find_valid_region
 
 
 def grid(camera):
@@ -221,7 +222,7 @@ def test_nan_pixels_have_no_ray(camera):
 
 def test_the_size_of_the_chunks_changes_nothing(make_camera, monkeypatch):
     whole = make_camera("crooked fold").rays(dtype=torch.float64)
-    monkeypatch.setattr(inverse, "_CHUNK", 1000)
+    monkeypatch.setattr(inverse, "_PIXELS_PER_CHUNK", 1000)
     pieces = make_camera("crooked fold").rays(dtype=torch.float64)
     assert torch.equal(whole[1], pieces[1])
     assert torch.equal(whole[0].nan_to_num(9.0), pieces[0].nan_to_num(9.0))

@@ -389,4 +389,5 @@ def _spread_indices(count: int, max_indices: int) -> list[int]:
     """Spread at most `max_indices` indices below `count`, from the first to the last."""
     if not count:
         return []
-    return np.unique(np.linspace(0, count - 1, min(count, max_indices)).round().astype(int)).tolist()
+    indices: list[int] = np.unique(np.linspace(0, count - 1, min(count, max_indices)).round().astype(int)).tolist()
+    return indices
