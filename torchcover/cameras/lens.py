@@ -1,8 +1,8 @@
-"""What a lens model is made of: a chart of the directions, and a distortion of that chart: Brown-Conrady and fisheyes.
+"""Lens models: charts of directions, and distortions of these charts (Brown-Conrady and fisheye lenses).
 
-A direction (x, y, z) is drawn on a plane by a *chart* (`a`, `b`); the *distortion* moves the drawn point to the
-normalised image (`u`, `v`); focal lengths and principal point make pixels of it. Every model is such a pair, so the
-inverse of the lens is one problem, solved once (`inverse.py`), and the chart goes back in closed form.
+A *chart* maps a direction (x, y, z) to a plane (`a`, `b`); the *distortion* moves that point to the normalized image
+(`u`, `v`); focal lengths and principal point convert it to pixels. Every model is such a pair, so that the inverse of a
+lens is one problem, solved once (`inverse.py`), and the chart has an inverse in closed form.
 """
 
 from collections.abc import Sequence
@@ -18,26 +18,49 @@ from torch import Tensor
 import torchcover.geometry.tensors  # noqa: F401
 from torchcover.geometry.arrays import Float64
 
-# A coefficient is a float where a lens is only evaluated, and a 0-d tensor where gradients flow into it.
+# Coefficients are floats if a lens is only evaluated, and 0-d tensors if gradients flow into them.
 Scalar = float | Tensor
 
 
 class Chart(Protocol):
-    """How directions are drawn on a plane, and read back from it."""
+    """Map between directions and a plane."""
 
     @property
     def limit(self) -> float:
-        """Radius on the plane at which the drawing ends; infinity where it does not."""
+        """Radius on the plane at which the chart ends, or infinity."""
 
     def project(self, x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Points (N,) each -> `a`, `b` (N,) and a mask (N,) of those that the chart can show."""
+        """Map directions of any length to the plane.
+
+        Args:
+            x: (N,) components to the right.
+            y: (N,) components downwards.
+            z: (N,) components forward.
+
+        Returns:
+            `a` and `b` (N,), and a mask (N,) of the directions that the chart can show.
+        """
 
     def unproject(self, a: Tensor, b: Tensor) -> Tensor:
-        """Drawn points (N,) each -> unit directions (N, 3)."""
+        """Map points of the plane to (N, 3) unit directions.
+
+        Args:
+            a: (N,) first coordinates.
+            b: (N,) second coordinates.
+        """
 
 
 class Linearization(NamedTuple):
-    """A distortion at a point: the value (`u`, `v`) and the four partial derivatives."""
+    """Distortion at N points.
+
+    Args:
+        u: (N,) first coordinate of the image.
+        v: (N,) second coordinate.
+        u_a: (N,) partial derivative of `u` by `a`, and likewise the others.
+        u_b: (N,) of `u` by `b`.
+        v_a: (N,) of `v` by `a`.
+        v_b: (N,) of `v` by `b`.
+    """
 
     u: Float64
     v: Float64
@@ -48,40 +71,59 @@ class Linearization(NamedTuple):
 
     @property
     def determinant(self) -> Float64:
-        """Area that the distortion makes of a unit of area; it changes sign at a fold."""
+        """Determinant of the Jacobian: area per unit of area, which changes its sign at a fold."""
         return self.u_a * self.v_b - self.u_b * self.v_a
 
 
 class Distortion(Protocol):
-    """A smooth map of the plane that keeps the origin in place.
+    """Smooth map of the plane that keeps the origin in place.
 
-    `distort` is torch's, for users and gradients. The rest is the solver's, in numpy: on chunks that fit into the
-    cache its plain loops beat torch's, which wait for each other at the end of every operation.
+    `distort` uses torch, for users and gradients. The other methods serve the solver and use numpy: on chunks that fit
+    into the cache its loops are faster than those of torch, whose threads synchronize after every operation.
     """
 
     @property
     def is_radial(self) -> bool:
-        """Whether it only moves points along their radius, the same in all directions."""
+        """Whether points only move along their radius, equally in all directions."""
 
     def distort(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-        """The map, differentiable in the points and in the coefficients."""
+        """Distort points, differentiably in the points and in the coefficients.
+
+        Args:
+            a: (N,) first coordinates on the chart.
+            b: (N,) second coordinates.
+
+        Returns:
+            `u` and `v`, (N,) coordinates of the normalized image.
+        """
 
     def linearize(self, a: Float64, b: Float64) -> Linearization:
-        """The map with its exact Jacobian; for coefficients that are floats."""
+        """Compute the map with its exact Jacobian; coefficients are floats.
+
+        Args:
+            a: (N,) first coordinates on the chart.
+            b: (N,) second coordinates.
+        """
 
     def distort_radius(self, radius: Float64) -> Float64:
-        """Distorted radius of the radial part; for coefficients that are floats."""
+        """Compute the distorted radius of the radial part; coefficients are floats.
+
+        Args:
+            radius: (N,) radii on the chart.
+        """
 
     def find_critical_radii(self) -> Float64:
-        """Every radius at which the radial part may stop being monotonic, in any order."""
+        """Find every radius at which the radial part may stop being monotonic, in any order."""
 
 
 @dataclass(frozen=True)
 class Lens:
-    """A lens model with its coefficients.
+    """Lens model with its coefficients.
 
-    `chart`: directions <-> plane; `distortion`: plane -> normalised image; None where they are the same, and then no
-    solver ever runs; `tilt`: tilt of the sensor; None where there is none.
+    Args:
+        chart: Map between directions and plane.
+        distortion: Map from the plane to the normalized image; None for the identity, which needs no solver.
+        tilt: Tilt of the sensor; None without one.
     """
 
     chart: Chart
@@ -90,25 +132,38 @@ class Lens:
 
 
 def to_vector(values: Sequence[Scalar], like: Tensor | None = None) -> Tensor:
-    """Numbers, or tensors with their gradients, as a vector, float64 or beside another tensor."""
+    """Stack numbers, or 0-d tensors with their gradients, to a vector.
+
+    Args:
+        values: The numbers.
+        like: Tensor whose type and device the vector gets; float64 on the CPU if not given.
+    """
     empty = torch.empty(0, dtype=torch.float64, device="cpu") if like is None else like.new_empty(0)
     parts = [torch.as_tensor(value, dtype=empty.dtype, device=empty.device) for value in values]
     return torch.stack(parts) if parts else empty
 
 
 def to_float(value: Scalar) -> float:
-    """A coefficient's value, whether or not gradients flow into it."""
+    """Convert a coefficient to a float.
+
+    Args:
+        value: A number, or a 0-d tensor with or without gradients.
+    """
     return float(value.detach()) if isinstance(value, Tensor) else float(value)
 
 
 def find_positive_roots(coefficients: Sequence[float]) -> Float64:
-    """Positive real roots of a polynomial whose coefficients start with the constant term.
+    """Find the positive real roots of a polynomial.
 
-    Nearly real pairs are kept: a double root comes out of the eigenvalue solver as a pair with a tiny imaginary part,
-    and a radius that turns out to be harmless costs nothing. Leading coefficients below 1e-60 only make roots farther
-    out than any ray, and overflows.
+    Nearly real pairs are included: the eigenvalue solver returns a double root as a pair with a tiny imaginary part,
+    and a superfluous radius does no harm. Leading coefficients below 1e-60 only cause roots farther out than any ray,
+    and overflows.
+
+    Args:
+        coefficients: Coefficients, the constant term first.
     """
-    significant = np.array([value if abs(value) > 1e-60 else 0.0 for value in coefficients] + [0.0])
+    significant = np.append(coefficients, 0.0)
+    significant[~(np.abs(significant) > 1e-60)] = 0.0
     roots = np.polynomial.Polynomial(np.trim_zeros(significant, "b")).roots()
     near_real = np.abs(roots.imag) < 1e-6 * (1.0 + np.abs(roots.real))
     return np.asarray(roots.real[near_real & (roots.real > 0)], dtype=np.float64)
@@ -116,34 +171,35 @@ def find_positive_roots(coefficients: Sequence[float]) -> Float64:
 
 @dataclass(frozen=True)
 class PlaneChart:
-    """The plane z = 1 of pinhole and Brown-Conrady lenses: a = x / z, b = y / z, for z > 0, before 90 degrees."""
+    """Plane z = 1 of pinhole and Brown-Conrady lenses: a = x / z, b = y / z, for z > 0, up to 90 degrees."""
 
     limit: float = torch.inf
 
     def project(self, x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Points in front of the camera, drawn where their ray meets z = 1."""
-        front = z > 0
-        depth = torch.where(front, z, 1.0)  # a division by 0 behind the camera would put NaN into the gradients
-        return x / depth, y / depth, front
+        """Map directions in front of the camera to the intersection of their ray with z = 1; see `Chart`."""
+        is_in_front = z > 0
+        depth = torch.where(is_in_front, z, 1.0)  # a division by 0 behind the camera would put NaN into the gradients
+        return x / depth, y / depth, is_in_front
 
     def unproject(self, a: Tensor, b: Tensor) -> Tensor:
-        """(a, b, 1), normalised."""
+        """Normalize (a, b, 1); see `Chart`."""
         norm = torch.sqrt(a * a + b * b + 1.0)
         return torch.stack((a / norm, b / norm, 1.0 / norm), dim=-1)
 
 
 @dataclass(frozen=True)
 class BrownConrady:
-    """Brown-Conrady distortion with up to twelve coefficients in OpenCV's order.
+    """Brown-Conrady distortion with up to twelve coefficients in the order of OpenCV.
 
     u = a g + 2 p1 a b + p2 (s + 2 a^2) + s1 s + s2 s^2, v likewise, with s = a^2 + b^2.
 
     g = (1 + k1 s + k2 s^2 + k3 s^3) / (1 + k4 s + k5 s^2 + k6 s^3).
 
-    The forward model is kornia's `distort_points`. The solver needs the Jacobian with the value, which kornia does not
-    give, so `linearize` states the formula once more; a test holds the two together.
+    The forward model is `distort_points` of kornia. The solver needs the Jacobian with the value, which kornia does not
+    provide, so `linearize` repeats the formula; a test compares both.
 
-    `coefficients`: k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]]: 4, 5, 8 or 12 numbers.
+    Args:
+        coefficients: k1 k2 p1 p2 [k3 [k4 k5 k6 [s1 s2 s3 s4]]]: 4, 5, 8 or 12 numbers.
     """
 
     coefficients: Sequence[Scalar]
@@ -159,7 +215,7 @@ class BrownConrady:
         return not any((*self._padded[2:4], *self._padded[8:]))
 
     def distort(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-        """By kornia, with the identity for its camera matrix."""
+        """Distort points with kornia and the identity as camera matrix; see `Distortion`."""
         from kornia.geometry.calibration import distort_points
 
         points = torch.stack((a, b), dim=-1)
@@ -168,10 +224,10 @@ class BrownConrady:
         return distorted[..., 0], distorted[..., 1]
 
     def linearize(self, a: Float64, b: Float64) -> Linearization:
-        """Value and Jacobian; the terms of coefficients that are zero are left out."""
+        """Compute value and Jacobian without the terms of coefficients that are zero; see `Distortion`."""
         _, _, p1, p2, *_ = self._padded
         s = a * a + b * b
-        gain, slope = self._gain(s)
+        gain, slope = self._compute_gain(s)
         slope = 2.0 * slope
         along = slope * a  # dg/da, and dg/db = slope * b
         twist = along * b
@@ -183,9 +239,9 @@ class BrownConrady:
             u, v = u + a * shift + p2 * s, v + b * shift + p1 * s
             u_a, u_b = u_a + shift + (4.0 * p2) * a, u_b + cross
             v_a, v_b = v_a + cross, v_b + shift + (4.0 * p1) * b
-        return self._with_prism(Linearization(u, v, u_a, u_b, v_a, v_b), a, b, s)
+        return self._add_prism(Linearization(u, v, u_a, u_b, v_a, v_b), a, b, s)
 
-    def _with_prism(self, bare: Linearization, a: Float64, b: Float64, s: Float64) -> Linearization:
+    def _add_prism(self, bare: Linearization, a: Float64, b: Float64, s: Float64) -> Linearization:
         s1, s2, s3, s4 = self._padded[8:]
         if not any((s1, s2, s3, s4)):
             return bare
@@ -199,8 +255,8 @@ class BrownConrady:
             bare.v_b + b * v_slope,
         )
 
-    def _gain(self, s: Float64) -> tuple[Float64, Float64]:
-        """g(s) and dg/ds."""
+    def _compute_gain(self, s: Float64) -> tuple[Float64, Float64]:
+        """Compute g(s) and dg/ds."""
         k1, k2, _, _, k3, k4, k5, k6, *_ = self._padded
         gain = 1.0 + s * (k1 + s * (k2 + s * k3))
         slope = k1 + s * (2.0 * k2 + s * (3.0 * k3))
@@ -211,13 +267,13 @@ class BrownConrady:
         return gain, (slope - gain * (k4 + s * (2.0 * k5 + s * (3.0 * k6)))) / below
 
     def distort_radius(self, radius: Float64) -> Float64:
-        """The radius times g."""
+        """Multiply the radius by g; see `Distortion`."""
         k1, k2, _, _, k3, k4, k5, k6, *_ = self._padded
         s = radius * radius
         return radius * (1.0 + s * (k1 + s * (k2 + s * k3))) / (1.0 + s * (k4 + s * (k5 + s * k6)))
 
     def find_critical_radii(self) -> Float64:
-        """Where d(r g)/dr is 0, where g is, and the poles."""
+        """Find the zeros of d(r g)/dr and of g, and the poles."""
         k1, k2, _, _, k3, k4, k5, k6, *_ = self._padded
         above = np.polynomial.Polynomial([1.0, k1, k2, k3])
         below = np.polynomial.Polynomial([1.0, k4, k5, k6])
@@ -229,51 +285,66 @@ class BrownConrady:
 
 @dataclass(frozen=True)
 class SensorTilt:
-    """The projective map of a sensor turned by tau_x about x, then tau_y about y, from kornia's `tilt_projection`."""
+    """Projective map of a tilted sensor, from `tilt_projection` of kornia.
+
+    Args:
+        tau_x: Rotation about x in radians, applied first.
+        tau_y: Rotation about y in radians.
+    """
 
     tau_x: Scalar
     tau_y: Scalar
 
     def apply(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Distorted points -> tilted ones and a mask of those in front of the tilted plane."""
+        """Map distorted points to the tilted sensor.
+
+        Args:
+            u: (N,) first coordinates of the normalized image.
+            v: (N,) second coordinates.
+
+        Returns:
+            (N,) and (N,) coordinates, and a mask (N,) of the points in front of the tilted plane.
+        """
         return self._map(u, v, inverse=False)
 
     def remove(self, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Tilted points -> distorted ones and a mask of those that come from the front."""
+        """Map points of the tilted sensor back, the inverse of `apply`.
+
+        Args:
+            u: (N,) first coordinates on the tilted sensor.
+            v: (N,) second coordinates.
+
+        Returns:
+            (N,) and (N,) coordinates, and a mask (N,) of the points that come from the front.
+        """
         return self._map(u, v, inverse=True)
 
     def _map(self, u: Tensor, v: Tensor, inverse: bool) -> tuple[Tensor, Tensor, Tensor]:
         from kornia.geometry.calibration import tilt_projection
 
         tau_x, tau_y = to_vector([self.tau_x, self.tau_y], u)
-        # Of kornia's two maps this one is right in all versions; the other turns the wrong way before 0.9.
-        undo = tilt_projection(tau_x, tau_y, True)
-        rows = undo if inverse else torch.linalg.inv(undo)
+        # This map of kornia is right in all versions; its inverse rotates the wrong way before 0.9.
+        inverse_tilt = tilt_projection(tau_x, tau_y, True)
+        rows = inverse_tilt if inverse else torch.linalg.inv(inverse_tilt)
         x, y, w = (row[0] * u + row[1] * v + row[2] for row in rows)
-        front = w > 0
-        w = torch.where(front, w, 1.0)
-        return x / w, y / w, front
-
-
-# Below this squared angle sine and cosine are taken from their series: exact in float64, and smooth at the axis.
-_SERIES = 1e-8
-# Odd powers of the angle have a kink at the axis; this floor, far below any pixel, keeps their derivatives finite.
-_KINK = 1e-40
+        is_in_front = w > 0
+        w = torch.where(is_in_front, w, 1.0)
+        return x / w, y / w, is_in_front
 
 
 @dataclass(frozen=True)
 class AngleChart:
-    """(a, b) = angle from the axis times the unit vector towards (x, y): equidistant, up to 180 degrees off axis.
+    """Equidistant chart up to 180 degrees: (a, b) is the angle from the axis times the unit vector towards (x, y).
 
-    Nothing here passes through z = 1, so 180 degrees are nothing special. kornia's `distort_points_kannala_brandt`
-    starts from z = 1 and cannot show 90 degrees off the axis; below a radius of 1e-4 it drops the polynomial, which is
-    7e-9 px off at a focal length of 20,000 px. Where both are defined a test holds the two together.
+    It does not use the plane z = 1. `distort_points_kannala_brandt` of kornia does, and cannot show directions of 90
+    degrees and more; below a radius of 1e-4 it ignores the polynomial, an error of 7e-9 px at a focal length of
+    20,000 px. A test compares both where both are defined.
     """
 
     limit: float = pi
 
     def project(self, x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Every direction but the one straight back, whose azimuth is unknown."""
+        """Map every direction except the one straight back, whose azimuth is undefined; see `Chart`."""
         squared = x * x + y * y
         off_axis = squared > 0
         radius = torch.sqrt(torch.where(off_axis, squared, 1.0))
@@ -282,82 +353,92 @@ class AngleChart:
         return x * stretch, y * stretch, off_axis | (z > 0)
 
     def unproject(self, a: Tensor, b: Tensor) -> Tensor:
-        """(a sin(t)/t, b sin(t)/t, cos t) with t = |(a, b)|."""
+        """Compute (a sin(t)/t, b sin(t)/t, cos t) with t = |(a, b)|; see `Chart`."""
         squared = a * a + b * b
-        small = squared < _SERIES
+        small = squared < 1e-8  # there the first terms of the series are exact in float64, and smooth at the axis
         angle = torch.sqrt(torch.where(small, 1.0, squared))
         ratio = torch.where(small, 1.0 - squared / 6.0, torch.sin(angle) / angle)
         forward = torch.where(small, 1.0 - squared / 2.0, torch.cos(angle))
         return torch.stack((a * ratio, b * ratio, forward), dim=-1)
 
 
-def _stretched(a: Float64, b: Float64, gain: Float64, slope: Float64) -> Linearization:
-    """A radial map (a, b) * gain whose gain has the gradient slope * (a, b)."""
+def _linearize_radial(a: Float64, b: Float64, gain: Float64, slope: Float64) -> Linearization:
+    """Linearize the radial map (a, b) * gain, where gain has the gradient slope * (a, b)."""
     twist = slope * a * b
     return Linearization(a * gain, b * gain, gain + slope * a * a, twist, twist, gain + slope * b * b)
 
 
 @dataclass(frozen=True)
 class KannalaBrandt:
-    """t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8): OpenCV's fisheye, Kalibr's equidistant."""
+    """Distortion t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8): fisheye of OpenCV, equidistant of Kalibr.
+
+    Args:
+        coefficients: k1 k2 k3 k4.
+        is_radial: Always True.
+    """
 
     coefficients: Sequence[Scalar]
     is_radial: bool = True
 
     def distort(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-        """The map, along the radius."""
+        """Distort points along their radius; see `Distortion`."""
         k1, k2, k3, k4 = self.coefficients
         s = a * a + b * b
         gain = 1.0 + s * (k1 + s * (k2 + s * (k3 + s * k4)))
         return a * gain, b * gain
 
     def linearize(self, a: Float64, b: Float64) -> Linearization:
-        """Value and Jacobian."""
+        """Compute value and Jacobian; see `Distortion`."""
         k1, k2, k3, k4 = (to_float(k) for k in self.coefficients)
         s = a * a + b * b
         gain = 1.0 + s * (k1 + s * (k2 + s * (k3 + s * k4)))
         slope = 2.0 * (k1 + s * (2.0 * k2 + s * (3.0 * k3 + s * (4.0 * k4))))
-        return _stretched(a, b, gain, slope)
+        return _linearize_radial(a, b, gain, slope)
 
     def distort_radius(self, radius: Float64) -> Float64:
-        """Distorted angle."""
+        """Compute the distorted angle; see `Distortion`."""
         k1, k2, k3, k4 = (to_float(k) for k in self.coefficients)
         s = radius * radius
         return radius * (1.0 + s * (k1 + s * (k2 + s * (k3 + s * k4))))
 
     def find_critical_radii(self) -> Float64:
-        """Where the derivative of the distorted angle is 0."""
+        """Find the zeros of the derivative of the distorted angle."""
         k1, k2, k3, k4 = (to_float(k) for k in self.coefficients)
         return np.sqrt(find_positive_roots([1.0, 3.0 * k1, 5.0 * k2, 7.0 * k3, 9.0 * k4]))
 
 
 @dataclass(frozen=True)
 class ThetaPolynomial:
-    """k1 t + k2 t^2 + k3 t^3 + k4 t^4: WoodScape's surround-view fisheyes (there in pixels, with fx = fy = 1)."""
+    """Distortion k1 t + k2 t^2 + k3 t^3 + k4 t^4: fisheyes of WoodScape (there in pixels, with fx = fy = 1).
+
+    Args:
+        coefficients: k1 k2 k3 k4.
+        is_radial: Always True.
+    """
 
     coefficients: Sequence[Scalar]
     is_radial: bool = True
 
     def distort(self, a: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-        """The map, along the radius."""
+        """Distort points along their radius; see `Distortion`."""
         k1, k2, k3, k4 = self.coefficients
-        angle = torch.sqrt((a * a + b * b).clamp(min=_KINK))
+        angle = torch.sqrt((a * a + b * b).clamp(min=1e-40))  # keeps derivatives finite at the kink of odd powers
         gain = k1 + angle * (k2 + angle * (k3 + angle * k4))
         return a * gain, b * gain
 
     def linearize(self, a: Float64, b: Float64) -> Linearization:
-        """Value and Jacobian."""
+        """Compute value and Jacobian; see `Distortion`."""
         k1, k2, k3, k4 = (to_float(k) for k in self.coefficients)
-        angle = np.sqrt(np.maximum(a * a + b * b, _KINK))
+        angle = np.sqrt(np.maximum(a * a + b * b, 1e-40))  # as in `distort`
         gain = k1 + angle * (k2 + angle * (k3 + angle * k4))
-        return _stretched(a, b, gain, (k2 + angle * (2.0 * k3 + angle * (3.0 * k4))) / angle)
+        return _linearize_radial(a, b, gain, (k2 + angle * (2.0 * k3 + angle * (3.0 * k4))) / angle)
 
     def distort_radius(self, radius: Float64) -> Float64:
-        """Distorted angle."""
+        """Compute the distorted angle; see `Distortion`."""
         k1, k2, k3, k4 = (to_float(k) for k in self.coefficients)
         return radius * (k1 + radius * (k2 + radius * (k3 + radius * k4)))
 
     def find_critical_radii(self) -> Float64:
-        """Where the derivative of the distorted angle is 0."""
+        """Find the zeros of the derivative of the distorted angle."""
         k1, k2, k3, k4 = (to_float(k) for k in self.coefficients)
         return find_positive_roots([k1, 2.0 * k2, 3.0 * k3, 4.0 * k4])
