@@ -61,7 +61,7 @@ STUDENT_T = {2: 12.71, 3: 4.30, 4: 3.18, 5: 2.78, 6: 2.57, 7: 2.45, 8: 2.36}
 
 def in_region(boxes, categories=("car",)):
     """The cars whose centre lies in the region; `categories` is what they are called."""
-    x, y, _ = boxes.centre_m.T
+    x, y, _ = boxes.center_m.T
     inside = (x >= X_M[0]) & (x < X_M[1]) & (y >= Y_M[0]) & (y < Y_M[1])
     return boxes.select(inside).of_category(*categories)
 
@@ -190,7 +190,7 @@ def average_precision(counts, at=None):
 
     Of a bin of visibility, by its number: over the recalls of its objects, with the precision of all detections.
     """
-    curve, of_bin = counts.overall(), counts.over("visibility").recall
+    curve, of_bin = counts.compute_overall(), counts.compute_curve("visibility").recall
     recalls = curve.recall.value[:, 0] if at is None else of_bin.value[:, at]
     columns = (recalls, curve.precision.value[:, 0], curve.precision.trials[:, 0])
     recall, precision, detections = (column.cpu().numpy() for column in columns)
@@ -233,7 +233,7 @@ class Training(lightning.LightningModule):
 
     def validation_step(self, batch, _):
         """Count what was found, of what was visible."""
-        heat, boxes = self.detector(batch.clouds_of(f"network {self.rig}"))
+        heat, boxes = self.detector(batch.get_clouds(f"network {self.rig}"))
         for frame, frame_heat, frame_boxes in zip(batch.frames, heat, boxes, strict=True):
             rows, scores = decode(frame_heat, frame_boxes)
             seen = self.visibility[frame.index]
@@ -241,7 +241,7 @@ class Training(lightning.LightningModule):
             chosen = match_detections(rows, scores, frame.boxes.rows, "distance", MATCH_M)
             found = torch.zeros(len(frame.boxes))
             found[chosen[chosen >= 0]] = scores.cpu()[chosen >= 0]
-            columns = [frame.boxes.centre_m[:, 0], frame.boxes.centre_m[:, 1], seen.share.cpu(), found]
+            columns = [frame.boxes.center_m[:, 0], frame.boxes.centre_m[:, 1], seen.share.cpu(), found]
             world = torch.full((len(found),), float(frame.index // 4))
             self.objects.append(torch.stack([world, *(column.cpu().float() for column in columns)], dim=1))
 
@@ -390,7 +390,7 @@ def report(results, console):
     table = Table("rig", "AP", *(f"seen within 0.4 m, {region.name} (%)" for region in REGIONS), "recall", "precision")
     row = SCORES.index(OPERATING_SCORE)
     for rig, (module, coverage) in results.items():
-        curve = module.counts.overall()
+        curve = module.counts.compute_overall()
         numbers = [line.numbers["detection_0.4m"] for line in coverage.summary(REGIONS)]
         seen = map(format_number, numbers)
         shares = [f"{ratio.value[row, 0]:.3f}" for ratio in (curve.recall, curve.precision)]
@@ -415,7 +415,7 @@ def draw(results, path):
     figure, (left, middle, right) = plt.subplots(1, 3, figsize=(14.0, 4.4), layout="constrained")
     row = SCORES.index(OPERATING_SCORE)
     for ax, axis in ((left, "visibility"), (middle, "distance")):
-        curves = [module.counts.over(axis) for module, _ in results.values()]
+        curves = [module.counts.compute_curve(axis) for module, _ in results.values()]
         cars = torch.stack([curve.recall.trials[row] for curve in curves], dim=1)
         seen = [k for k in range(len(cars)) if cars[k].any()]
         on_the_axis = sum(curves[0].bins[k][0].isdigit() for k in seen)  # hidden cars have a point, but no place on it

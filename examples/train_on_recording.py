@@ -55,7 +55,7 @@ def read(frames):
     for frame in track(frames, description="accumulating the reference", total=len(frames)):
         if frame.boxes is None:
             raise SystemExit(f"{frames.recording.path}: no labelled boxes, and recall is about objects")
-        fed, boxes = {f"network {rig}": thinned(frame.landed(rig))}, in_region(frame.boxes, CARS)
+        fed, boxes = {f"network {rig}": thinned(frame.get_measured_points(rig))}, in_region(frame.boxes, CARS)
         if len(kept) < trained:
             kept.append(replace(frame, clouds=fed, reference=frame.reference[:0], boxes=boxes))
         else:
@@ -70,7 +70,7 @@ def report(module, coverage, path, console):
         console.print(
             f"{line.region}: {seen:.1%} within 0.4 m, of the {line.observed_share:.1%} of the cells that are known"
         )
-    recall = module.counts.over("visibility").recall
+    recall = module.counts.compute_curve("visibility").recall
     table = Table("visibility", "cars", "recall", "95 % interval", title=f"recall at score {OPERATING_SCORE}")
     row = SCORES.index(OPERATING_SCORE)
     for column, name in enumerate(module.counts.visibility_bins):

@@ -81,7 +81,7 @@ def test_intervals_are_over_judges_over_worlds_and_over_placements_if_they_are_d
     assert width(sure, alike) == 0.0
     assert width(sure, unlike) > 0.05
     assert width(noisy, alike) > 0.1
-    assert width(sure, unlike, placements=True) > width(sure, unlike)
+    assert width(sure, unlike, resample_placements=True) > width(sure, unlike)
 
 
 def test_the_lead_is_the_difference_and_what_is_shared_cancels_out():

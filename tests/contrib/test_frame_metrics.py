@@ -45,7 +45,7 @@ def test_the_entropy_of_points_of_a_lidar(points, nats):
     assert float(compute_entropy_nats(compute_standard_deviation(torch.tensor(points), "lidar"))) == pytest.approx(
         nats, abs=1e-6
     )
-    box = replace(frame_of([], boxes=[CAR]).boxes, hits={"rig": torch.tensor([points])})
+    box = replace(frame_of([], boxes=[CAR]).boxes, points_in_box={"rig": torch.tensor([points])})
     metric = PerceptionEntropy()
     metric.update(replace(frame_of([]), boxes=box))
     assert values(metric)["perception_entropy"] == pytest.approx(nats, abs=1e-6)
@@ -253,18 +253,18 @@ def test_a_number_that_few_worlds_know_has_no_error_and_none_to_race_with_unless
 def test_what_a_draw_of_worlds_gives_is_what_the_metric_gives_over_them():
     case = CASES["object coverage"]
     estimate = case.over(case.steps).estimate()
-    assert len(estimate.steps) == len(case.steps)  # a world each
+    assert len(estimate.frame_counts) == len(case.steps)  # a world each
     drawn = case.over([case.steps[0], case.steps[0], case.steps[3]]).compute()
     weights = torch.zeros(1, len(case.steps))
     weights[0, 0], weights[0, 3] = 2, 1
     again = torch.tensor([[number.value for number in drawn]]).double()
-    torch.testing.assert_close(estimate.resampled(weights), again, equal_nan=True)
+    torch.testing.assert_close(estimate.resample(weights), again, equal_nan=True)
 
 
 @pytest.mark.parametrize("name", OF_FRAMES)
 def test_without_a_world_it_is_what_the_other_frames_say_and_errors_come_from_that(name):
     case = CASES[name]
-    telling = [step["frame"] for step in case.steps if case.over([step]).compute()[0].known]
+    telling = [step["frame"] for step in case.steps if case.over([step]).compute()[0].has_value]
     frames = [
         replace(frame, block_index=world) for world, frame in zip(range(10), itertools.cycle(telling), strict=False)
     ]
@@ -277,11 +277,11 @@ def test_without_a_world_it_is_what_the_other_frames_say_and_errors_come_from_th
     metric = over(frames)
     estimate = metric.estimate()
     assert [number.value for number in metric.compute()] == pytest.approx(estimate.value.tolist(), abs=0, nan_ok=True)
-    assert estimate.steps.tolist() == [1] * 10
-    for world, row in enumerate(estimate.left_out):
+    assert estimate.frame_counts.tolist() == [1] * 10
+    for world, row in enumerate(estimate.jackknife_values):
         expected = over(frames[:world] + frames[world + 1 :]).estimate().value
         torch.testing.assert_close(row, expected.where(row.isfinite(), math.nan), equal_nan=True)
-    errors = estimate.error.where(estimate.error > 1e-12, math.nan)
+    errors = estimate.error.where(estimate.compute_errors() > 1e-12, math.nan)
     assert [number.error for number in metric.compute()] == pytest.approx(errors.tolist(), nan_ok=True)
     assert errors.isfinite().any()
 
@@ -295,7 +295,7 @@ def test_the_order_of_points_boxes_and_frames_does_not_matter(case):
         frame = step["frame"]
         generator = torch.Generator().manual_seed(7)
         order = torch.randperm(len(frame.reference), generator=generator)
-        parts = torch.split(frame.sensor, list(frame.sensor_points["rig"].values()))
+        parts = torch.split(frame.sensor, list(frame.sensor_point_counts["rig"].values()))
         cloud = torch.cat([part[torch.randperm(len(part), generator=generator)] for part in parts])
         return {
             "frame": replace(
@@ -315,11 +315,11 @@ def test_the_order_of_points_boxes_and_frames_does_not_matter(case):
 
 @EVERY
 def test_metrics_that_share_a_search_find_what_each_finds_alone(case):
-    sights = FrameQueryCache()
+    query_cache = FrameQueryCache()
     together = {name: CASES[name].make() for name in OF_FRAMES}
     for metric in together.values():
-        metric.sights = sights
-    sights.searches_by_sensor = True
+        metric.query_cache = query_cache
+    query_cache.searches_by_sensor = True
     for step in case.steps:
         for metric in together.values():
             metric.update(**step)
@@ -342,20 +342,20 @@ def test_frames_without_boxes_are_refused_with_the_way_to_them(name):
     metric = CASES[name].make()
     with pytest.raises(ValueError, match=r"no boxes.*SimulatedFrames\(\.\.\., boxes=True\)"):
         metric.update(replace(CASES[name].steps[0]["frame"], boxes=None))
-    assert metric.steps == 0
+    assert metric.num_frames == 0
 
 
 def test_square_metres_that_are_missing_are_refused():
     frame = replace(CASES["k-cover"].steps[0]["frame"], reference_weights=None)
     with pytest.raises(ValueError, match="square metres"):
         CASES["k-cover"].make().update(frame)
-    CASES["k-cover"].make(square_metres=False).update(frame)
+    CASES["k-cover"].make(has_area_weights=False).update(frame)
     CASES["object coverage"].make().update(frame)
 
 
 def test_sensors_that_nobody_can_tell_apart_are_refused():
-    with pytest.raises(ValueError, match="sensor_points"):
-        CASES["k-cover"].make().update(replace(CASES["k-cover"].steps[0]["frame"], sensor_points=None))
+    with pytest.raises(ValueError, match="sensor_point_counts"):
+        CASES["k-cover"].make().update(replace(CASES["k-cover"].steps[0]["frame"], sensor_point_counts=None))
 
 
 def test_a_rig_of_which_nobody_knows_the_sensors_has_no_field_of_view():
@@ -365,7 +365,7 @@ def test_a_rig_of_which_nobody_knows_the_sensors_has_no_field_of_view():
 
 def test_another_rig_is_refused():
     with pytest.raises(ValueError, match="no rig 'other'"):
-        ObjectCoverage(rig="other").update(CASES["k-cover"].steps[0]["frame"])
+        ObjectCoverage(rig_name="other").update(CASES["k-cover"].steps[0]["frame"])
 
 
 @pytest.mark.parametrize(

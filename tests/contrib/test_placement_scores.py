@@ -18,9 +18,11 @@ def test_own_numbers_are_those_of_compare_over_both_measures():
         "regions": {"front": {"x_m": (0, 20), "y_m": (-10, 10)}},
         "grid": {"x_m": (0, 20), "y_m": (-10, 10), "cell_m": 1.0},
     }
-    result = evaluate(list(RIGS.values()), "courtyard", ask=RegionsOfInterest.model_validate(asked), steps=8, seed=3)
+    result = evaluate(
+        list(RIGS.values()), "courtyard", regions=RegionsOfInterest.model_validate(asked), num_frames=8, seed=3
+    )
     found = {one.name: one for one in scores.rankings}
-    for measure, words in (("area", "visible surface"), ("known", "known cells")):
+    for measure, words in (("area", "visible surface"), ("cells", "observed cells")):
         each = [
             [float(coverage.estimate(region, band, measure).value[1]) for coverage in result.coverages.values()]
             for band in ("ground", "obstacle")

@@ -84,7 +84,7 @@ def random_boxes(generator, count):
 
 def slowly(objects, grid):
     """(X, Y, Z) whether each centre is in any box."""
-    x, y, z = np.meshgrid(*grid.centres_m(), indexing="ij")
+    x, y, z = np.meshgrid(*grid.compute_centers_m(), indexing="ij")
     inside = np.zeros(grid.shape, dtype=bool)
     for row in objects.rows.double().numpy():
         dx, dy, dz = x - row[0], y - row[1], z - row[2]
@@ -142,7 +142,7 @@ def test_errors_over_worlds_are_the_jackknife_by_hand_and_none_below_eight():
     assert whole.estimate().resample(torch.zeros(1, 16)).isnan().all()
     assert math.isnan(value(s_mig(sensors, frames[:7])).error)
     hits = {"beam": torch.tensor([[9.0, 0.0, 1.0]])}
-    occluded = s_mig(sensors, [frame(one.index, one.boxes, clouds=hits) for one in frames], occlusion=True)
+    occluded = s_mig(sensors, [frame(one.index, one.boxes, clouds=hits) for one in frames], ends_at_hits=True)
     assert value(occluded).value < 0
     assert math.isnan(value(occluded).error)
 
@@ -151,12 +151,12 @@ def test_with_occlusion_rays_end_at_what_was_measured_and_without_points_nowhere
     before = torch.tensor([[5.0, 0.0, 1.25]])
     clouds = {"beam": before}
     frames = [frame(0, boxes(AHEAD), clouds=clouds), frame(1, NONE)]
-    number = value(s_mig([beam(z_m=1.25)], frames, occlusion=True))
+    number = value(s_mig([beam(z_m=1.25)], frames, ends_at_hits=True))
     # From 3 to 5 m, in one of two frames.
     assert number.quantity.key == "s_mig_occluded_0.5m:car"
     assert number.value == pytest.approx(-4 * math.log(2) / 2)
     assert math.isnan(number.error)
-    assert s_mig([beam(z_m=1.25)], frames, occlusion=True).estimate().resample(torch.ones(1, 2)) is None
+    assert s_mig([beam(z_m=1.25)], frames, ends_at_hits=True).estimate().resample(torch.ones(1, 2)) is None
 
 
 def test_with_occlusion_it_is_the_mean_over_frames_of_the_entropy_on_their_way():
@@ -173,10 +173,10 @@ def test_with_occlusion_it_is_the_mean_over_frames_of_the_entropy_on_their_way()
         )
         for index in range(4)
     ]
-    together = value(s_mig(sensors, frames, occlusion=True)).value
-    each = [replace(one, clouds={"rig": one.clouds["rig"][:0]}, sensor_points={"rig": {}}) for one in frames]
+    together = value(s_mig(sensors, frames, ends_at_hits=True)).value
+    each = [replace(one, clouds={"rig": one.clouds["rig"][:0]}, sensor_point_counts={"rig": {}}) for one in frames]
     alone = [
-        value(s_mig(sensors, [*each[:index], frames[index], *each[index + 1 :]], occlusion=True)).value
+        value(s_mig(sensors, [*each[:index], frames[index], *each[index + 1 :]], ends_at_hits=True)).value
         for index in range(4)
     ]
     assert together == pytest.approx(sum(alone))
@@ -207,11 +207,11 @@ def test_parameters_that_cannot_be_are_refused(options, message):
 
 
 def test_frames_that_cannot_say_it_are_refused_and_add_nothing():
-    metric = s_mig([beam()], [frame(0, NONE)], occlusion=True)
+    metric = s_mig([beam()], [frame(0, NONE)], ends_at_hits=True)
     without = frame(1, None)
-    nobody = replace(frame(1, NONE), sensor_points=None)
+    nobody = replace(frame(1, NONE), sensor_point_counts=None)
     other = frame(1, NONE, clouds={"rear": torch.ones(1, 3)})
-    for given, message in ((without, "has no boxes"), (nobody, "it is unknown which points"), (other, "sensor 'rear'")):
+    for given, message in ((without, "has no boxes"), (nobody, "set sensor_point_counts"), (other, "sensor 'rear'")):
         with pytest.raises(ValueError, match=message):
             metric.update(given)
     assert (int(metric.num_frames), len(metric.boxes), int(metric.crossings.sum())) == (1, 1, 0)

@@ -127,7 +127,7 @@ def exr(folder):
 def coverage(folder):
     """A saved result with blocks and sums over the surface."""
     grid = BevGrid(x_m=(0.0, 4.0), y_m=(0.0, 2.0), cell_m=0.5)
-    metric = CoverageMetric(grid, blocks=8, max_radius=9.0, square_metres=True)
+    metric = CoverageMetric(grid, num_blocks=8, max_radius_m=9.0, has_area_weights=True)
     random = torch.Generator().manual_seed(0)
     for _ in range(8):
         reference = torch.rand(60, 3, generator=random) * torch.tensor([4.0, 2.0, 1.0])

@@ -14,14 +14,14 @@ RANDOM = np.random.default_rng(11)
 
 
 def test_upright_boxes_keep_their_places_and_headings_in_another_frame():
-    centre_m, size_m = RANDOM.normal(size=(6, 3)), RANDOM.uniform(1.0, 5.0, (6, 3))
+    center_m, size_m = RANDOM.normal(size=(6, 3)), RANDOM.uniform(1.0, 5.0, (6, 3))
     yaw = RANDOM.uniform(-3.0, 3.0, 6)
     heading = np.stack([np.cos(yaw), np.sin(yaw), np.zeros(6)], axis=1)
-    same = build_upright_rows(centre_m, size_m, heading, None)
-    assert same.numpy() == pytest.approx(np.column_stack([centre_m, size_m, yaw]), abs=1e-6)
+    same = build_upright_rows(center_m, size_m, heading, None)
+    assert same.numpy() == pytest.approx(np.column_stack([center_m, size_m, yaw]), abs=1e-6)
     vehicle_T_source = build_transform(convert_euler_to_rotation(90.0, 0.0, 0.0), np.array([10.0, 0.0, 1.0]))
-    turned = build_upright_rows(centre_m, size_m, heading, vehicle_T_source).numpy()
-    x, y, z = centre_m.T
+    turned = build_upright_rows(center_m, size_m, heading, vehicle_T_source).numpy()
+    x, y, z = center_m.T
     assert turned[:, :3] == pytest.approx(np.column_stack([10.0 - y, x, 1.0 + z]), abs=1e-5)
     assert turned[:, 3:6] == pytest.approx(size_m, abs=1e-6)
     assert np.cos(turned[:, 6] - yaw - np.pi / 2) == pytest.approx(1.0)

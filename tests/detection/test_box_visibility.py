@@ -73,7 +73,7 @@ def test_a_box_that_only_the_rig_saw_is_known_by_the_sides_that_face_the_vehicle
     boxes = Boxes.from_rows(torch.tensor(rows))
     # In the middle of the side towards the vehicle; in that of the third's top.
     sensor = torch.tensor([[8.0, 0.0, 1.0], [0.0, 19.0, 1.0], [30.0, 0.0, 1.0], [90.0, 0.0, 0.0]])
-    seen = unweighted(sensor, torch.tensor([[90.0, 0.0, 1.0]]), boxes, threshold=0.5)
+    seen = unweighted(sensor, torch.tensor([[90.0, 0.0, 1.0]]), boxes, threshold_m=0.5)
     circle = math.pi * 0.5**2
     expected = [circle / (2 * 2), circle / (4 * 2), circle / (4 * 2 + 2 * 1), math.nan]
     np.testing.assert_allclose(seen.share, expected, atol=0.03)
@@ -102,7 +102,7 @@ def test_of_a_box_that_only_the_rig_saw_as_much_is_seen_wherever_it_stands_aroun
         centre = around(torch.tensor([row[:3]]).double(), turn)
         boxes = Boxes.from_rows(torch.cat([centre, torch.tensor([[*row[3:6], row[6] + turn]]).double()], dim=1))
         sensor = around(sides, row[6] + turn) + centre
-        found.append(unweighted(sensor, torch.tensor([[90.0, 0.0, 1.0]]).double(), boxes, threshold=0.5))
+        found.append(unweighted(sensor, torch.tensor([[90.0, 0.0, 1.0]]).double(), boxes, threshold_m=0.5))
     circles, areas = 2 * math.pi * 0.5**2, 2 * 2 + 4 * 2
     assert found[0].share.item() == pytest.approx(circles / areas, abs=0.03)
     assert found[1].share.item() == pytest.approx(found[0].share.item(), abs=0.01)
@@ -120,7 +120,7 @@ def test_the_nearest_sensor_point_may_lie_outside_the_box():
 @pytest.mark.parametrize("threshold", [0.5, 0.0])
 def test_a_radius_of_exactly_the_threshold_counts_as_seen(threshold):
     sensor = torch.tensor([[8.0 + threshold, 0.0, 1.0]])
-    assert unweighted(sensor, torch.tensor([[8.0, 0.0, 1.0]]), TWO, threshold=threshold).share[0] == 1.0
+    assert unweighted(sensor, torch.tensor([[8.0, 0.0, 1.0]]), TWO, threshold_m=threshold).share[0] == 1.0
 
 
 def test_a_rig_that_saw_nothing_is_blind():
@@ -136,7 +136,7 @@ def test_no_boxes_give_an_empty_answer():
 
 
 def test_a_box_that_points_were_drawn_on_and_none_seen_is_hidden_and_one_without_is_not_sampled():
-    boxes = Boxes.from_rows(TWO.rows.repeat(2, 1), drawn_points=torch.tensor([0, 7, 9, 0]))
+    boxes = Boxes.from_rows(TWO.rows.repeat(2, 1), sampled_points=torch.tensor([0, 7, 9, 0]))
     seen = unweighted(torch.rand(5, 3), torch.tensor([[10.0, 0.0, 1.0]]), boxes)
     assert seen.observed.tolist() == [True, False, True, False]
     assert seen.hidden.tolist() == [False, True, False, False]
@@ -180,8 +180,8 @@ def test_without_a_point_in_it_a_box_is_unknown_and_so_is_one_that_the_vehicle_s
     [
         ({"sensor": torch.full((5, 3), math.nan)}, "sensor: 5 of 5 points have NaN"),
         ({"reference": torch.zeros(5, 4)}, r"reference: shape \(N, 3\) is needed; got \(5, 4\)"),
-        ({"threshold": -0.1}, "threshold: a distance >= 0 in metres is needed; got -0.1"),
-        ({"threshold": math.nan}, "threshold: .* got nan"),
+        ({"threshold_m": -0.1}, "threshold: a distance >= 0 in metres is needed; got -0.1"),
+        ({"threshold_m": math.nan}, "threshold: .* got nan"),
         ({"reference_weights": torch.ones(4)}, r"reference_weights: shape \(5,\), one for each .*got \(4,\)"),
         ({"reference_weights": torch.zeros(5)}, "reference_weights: finite weights > 0"),
         ({"reference_weights": torch.full((5,), math.nan)}, "reference_weights: finite weights > 0"),

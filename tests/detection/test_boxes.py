@@ -121,7 +121,7 @@ def test_membership_does_not_change_when_everything_is_moved_together():
 
 
 def rows(**changes):
-    fields = {"centre_m": torch.zeros(2, 3), "size_m": torch.ones(2, 3), "yaw_rad": torch.zeros(2)}
+    fields = {"center_m": torch.zeros(2, 3), "size_m": torch.ones(2, 3), "yaw_rad": torch.zeros(2)}
     return Boxes(**{**fields, **changes})
 
 
@@ -134,15 +134,19 @@ def rows(**changes):
             r"1 of 2 boxes .* box 1 with \[4.0, 0.0, 1.0\]",
         ),
         ({"size_m": -torch.ones(2, 3)}, ValueError, "2 of 2 boxes have a length, width or height that is not positive"),
-        ({"centre_m": torch.full((2, 3), math.nan)}, ValueError, "centre_m: 2 of 2 boxes have NaN or infinite"),
+        ({"center_m": torch.full((2, 3), math.nan)}, ValueError, "center_m: 2 of 2 boxes have NaN or infinite"),
         ({"yaw_rad": torch.tensor([0.0, math.inf])}, ValueError, "yaw_rad: 1 of 2 boxes have NaN or infinite"),
-        ({"centre_m": torch.zeros(3, 3)}, ValueError, r"centre_m: shape \(2, 3\) is needed for 2 boxes; got \(3, 3\)"),
+        ({"center_m": torch.zeros(3, 3)}, ValueError, r"center_m: shape \(2, 3\) is needed for 2 boxes; got \(3, 3\)"),
         ({"velocity_mps": torch.zeros(2, 3)}, ValueError, r"velocity_mps: shape \(2, 2\) is needed"),
         ({"ids": ("a",)}, ValueError, "ids: one entry for each of 2 boxes is needed; got 1"),
-        ({"drawn_points": torch.zeros(3)}, ValueError, r"drawn_points: shape \(2,\) is needed"),
-        ({"hits": {"roof": torch.zeros(3)}}, ValueError, r"hits\['roof'\]: one entry for each of 2 boxes"),
+        ({"sampled_points": torch.zeros(3)}, ValueError, r"sampled_points: shape \(2,\) is needed"),
+        (
+            {"points_in_box": {"roof": torch.zeros(3)}},
+            ValueError,
+            r"points_in_box\['roof'\]: one entry for each of 2 boxes",
+        ),
         ({"yaw_rad": torch.zeros(2, dtype=torch.int64)}, TypeError, "yaw_rad: a floating-point torch tensor is needed"),
-        ({"centre_m": [[0.0] * 3] * 2}, TypeError, "centre_m: a floating-point torch tensor is needed; got list"),
+        ({"center_m": [[0.0] * 3] * 2}, TypeError, "center_m: a floating-point torch tensor is needed; got list"),
     ],
 )
 def test_boxes_that_cannot_be_are_refused(changes, error, message):
@@ -174,11 +178,11 @@ def test_unknown_velocities_are_nan_unknown_names_empty_and_nothing_was_drawn():
 
 def test_selecting_keeps_everything_together():
     made = rows(
-        centre_m=torch.arange(6.0).view(2, 3),
+        center_m=torch.arange(6.0).view(2, 3),
         ids=("a", "b"),
         categories=("car", "bus"),
-        hits={"r": torch.tensor([3, 4])},
-        drawn_points=torch.tensor([5, 6]),
+        points_in_box={"r": torch.tensor([3, 4])},
+        sampled_points=torch.tensor([5, 6]),
     )
     for chosen in (
         made.select(torch.tensor([False, True])),
@@ -208,9 +212,14 @@ def frames():
 
 
 def same(a, b):
-    tensors = ("centre_m", "size_m", "yaw_rad", "velocity_mps", "drawn_points")
+    tensors = ("center_m", "size_m", "yaw_rad", "velocity_mps", "sampled_points")
     alike = all(torch.equal(getattr(a, name), getattr(b, name)) for name in tensors)
-    return alike and a.ids == b.ids and a.categories == b.categories and torch.equal(a.hits["r"], b.hits["r"])
+    return (
+        alike
+        and a.ids == b.ids
+        and a.categories == b.categories
+        and torch.equal(a.points_in_box["r"], b.points_in_box["r"])
+    )
 
 
 def test_boxes_do_not_depend_on_order_or_workers_and_leave_the_clouds_alone(frames):
@@ -227,14 +236,14 @@ def test_boxes_do_not_depend_on_order_or_workers_and_leave_the_clouds_alone(fram
 
 def test_an_object_keeps_its_name_and_moves_as_its_velocity_says(frames):
     first, second = frames[2].boxes, frames[3].boxes
-    world = frames.simulator.scene_of(0)[0].world
-    poses = [world.ego.trajectory.at(0.5 * step) for step in (2, 3)]
+    world = frames.simulator.get_scene_geometry(0)[0].scene
+    poses = [world.ego.trajectory.interpolate(0.5 * step) for step in (2, 3)]
     moved = 0
     for k, name in enumerate(first.ids):
         if first.categories[k] == "pedestrian" or name not in second.ids:
             continue  # people turn on the spot
         places = [
-            pose[:3, :3] @ boxes.centre_m[boxes.ids.index(name)].double().numpy() + pose[:3, 3]
+            pose[:3, :3] @ boxes.center_m[boxes.ids.index(name)].double().numpy() + pose[:3, 3]
             for pose, boxes in zip(poses, (first, second), strict=True)
         ]
         velocity = [
@@ -250,9 +259,9 @@ def test_an_object_keeps_its_name_and_moves_as_its_velocity_says(frames):
 def test_hits_are_the_points_in_the_box_and_no_body_sticks_out_of_its_box(frames):
     frame = frames[1]
     inside = find_points_in_boxes(frame.sensor, frame.boxes)
-    assert torch.equal(torch.bincount(inside.box_indices, minlength=len(frame.boxes)), frame.boxes.hits["r"])
-    assert frame.boxes.hits["r"].sum() > 500
-    grown = Boxes(frame.boxes.centre_m, frame.boxes.size_m + torch.tensor([0.3, 0.3, 0.0]), frame.boxes.yaw_rad)
+    assert torch.equal(torch.bincount(inside.box_indices, minlength=len(frame.boxes)), frame.boxes.points_in_box["r"])
+    assert frame.boxes.points_in_box["r"].sum() > 500
+    grown = Boxes(frame.boxes.center_m, frame.boxes.size_m + torch.tensor([0.3, 0.3, 0.0]), frame.boxes.yaw_rad)
     around = find_points_in_boxes(frame.sensor, grown).point_indices
     just_outside = around[~torch.isin(around, inside.point_indices)]
     # Within 15 cm of a box but not in it: a few points of the ground, the ego is tilted, or of a wheel stop.
@@ -282,7 +291,7 @@ def test_frames_without_objects_pad_to_nothing_and_frames_without_boxes_say_what
     assert collate_frames([empty, empty]).pad_boxes(["car"]).shape == (2, 0, 8)
     nobody_looked = Frame({"r": torch.zeros(2, 3)}, torch.zeros(2, 3), 0, "night 8")
     with pytest.raises(
-        ValueError, match=r"1 of 2 frames have no boxes, such as 'night 8': SimulatedFrames\(.*boxes=True"
+        ValueError, match=r"1 of 2 frames have no boxes, for example 'night 8': use SimulatedFrames\(.*boxes=True"
     ):
         _ = collate_frames([empty, nobody_looked]).boxes
 
@@ -294,7 +303,10 @@ def test_a_world_without_objects_has_no_boxes_which_is_not_the_same_as_none():
 
 
 MOVING = rows(
-    velocity_mps=torch.ones(2, 2), ids=("a", "b"), hits={"r": torch.tensor([1, 2])}, drawn_points=torch.tensor([3, 4])
+    velocity_mps=torch.ones(2, 2),
+    ids=("a", "b"),
+    points_in_box={"r": torch.tensor([1, 2])},
+    sampled_points=torch.tensor([3, 4]),
 )
 
 
@@ -337,7 +349,7 @@ def test_a_warning_of_degrees_names_the_line_that_made_the_boxes():
 def test_boxes_and_what_was_seen_of_them_stay_as_they_are():
     boxes = Boxes.from_rows(torch.tensor([[5.0, 0.0, 0.75, 4.0, 2.0, 1.5, 0.0]]))
     one = torch.ones(1)
-    for made, name in ((boxes, "centre_m"), (BoxVisibility(one, one, one, one, one, 0.4), "share")):
+    for made, name in ((boxes, "center_m"), (BoxVisibility(one, one, one, one, one, 0.4), "share")):
         with pytest.raises(dataclasses.FrozenInstanceError):
             setattr(made, name, one)
 

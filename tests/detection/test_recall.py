@@ -196,7 +196,7 @@ def slow_counts(frames, scores_at):
     objects = np.zeros((7, 4), dtype=int)
     found, detected, true = (np.zeros((len(scores_at), 7, 4), dtype=int) for _ in range(3))
     for detections, boxes, seen, scores, own in frames:
-        objects_seen = list(zip(seen.share.tolist(), seen.drawn_points.tolist(), strict=True))
+        objects_seen = list(zip(seen.share.tolist(), seen.sampled_points.tolist(), strict=True))
         truth = boxes.rows.double().tolist()
         chosen = slow_match(detections.double().tolist(), scores.tolist(), truth, "distance", 2.0)
         for k, box in enumerate(truth):
@@ -212,7 +212,7 @@ def slow_counts(frames, scores_at):
 
 
 FRAMES = [random_frame(seed) for seed in range(40)]
-NAMES = ("objects", "found", "detections", "true_detections")
+NAMES = ("objects", "detected_objects", "detections", "true_detections")
 
 
 def filled(frames, **options):
@@ -345,9 +345,9 @@ def test_intervals_are_wilson_s_and_unknown_without_trials():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"by": "height"}, "by: 'distance' or 'iou' is needed; got 'height'"),
+        ({"match_by": "height"}, "by: 'distance' or 'iou' is needed; got 'height'"),
         ({"threshold": 0.0}, "threshold: metres > 0"),
-        ({"by": "iou", "threshold": 2.0}, r"threshold: .* a share in \(0, 1\] for 'iou', is needed; got 2.0"),
+        ({"match_by": "iou", "threshold": 2.0}, r"threshold: .* a share in \(0, 1\] for 'iou', is needed; got 2.0"),
         ({"visibility_borders": (0.4, 0.4)}, r"visibility_borders: ascending numbers within \(0, 1\)"),
         ({"visibility_borders": (0.5, 1.0)}, "visibility_borders: ascending"),
         ({"distance_borders": (-5.0, 20.0)}, r"distance_borders: ascending numbers within \(0, inf\)"),

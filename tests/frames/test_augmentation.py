@@ -44,14 +44,14 @@ def test_where_points_landed_moves_with_where_they_are(move, factor):
     frame = make_frame()
     error_m = torch.linspace(-1, 1, 500)
     off = torch.nn.functional.normalize(frame.clouds["b"]) * error_m[:, None]
-    frame = replace(frame, measured={"b": Measurement(frame.clouds["b"] + off, error_m)})
+    frame = replace(frame, measurements={"b": Measurement(frame.clouds["b"] + off, error_m)})
     moved = move(frame)
-    torch.testing.assert_close(moved.measured["b"].error_m, factor * error_m)
-    distance = torch.linalg.vector_norm(moved.landed("b") - moved.clouds["b"], dim=1)
+    torch.testing.assert_close(moved.measurements["b"].error_m, factor * error_m)
+    distance = torch.linalg.vector_norm(moved.get_measured_points("b") - moved.clouds["b"], dim=1)
     torch.testing.assert_close(distance, factor * error_m.abs(), atol=1e-5, rtol=1e-4)
-    assert moved.landed("a") is moved.clouds["a"]
-    assert len(moved.cloud_of("b", within_m=0.5 * factor)) == int((error_m.abs() <= 0.5).sum())
-    with pytest.raises(ValueError, match=r"'b' has 9 points, 500 that were measured and 500 errors; give `clouds` and"):
+    assert moved.get_measured_points("a") is moved.clouds["a"]
+    assert len(moved.get_cloud("b", max_error_m=0.5 * factor)) == int((error_m.abs() <= 0.5).sum())
+    with pytest.raises(ValueError, match=r"'b' has 9 points, 500 measured points and 500 errors; set `clouds` and"):
         replace(frame, clouds={"b": torch.zeros(9, 3)})
 
 
@@ -76,18 +76,20 @@ def test_velocity_points_where_the_box_goes(move, factor):
     """A frame a second later: the moved centre less the centre moved is the moved velocity."""
     frame = make_frame()
     later = torch.cat([frame.boxes.velocity_mps, torch.zeros(9, 1)], dim=1)
-    then = replace(frame, boxes=replace(frame.boxes, centre_m=frame.boxes.center_m + later))
-    went = move(then).boxes.centre_m - move(frame).boxes.centre_m
+    then = replace(frame, boxes=replace(frame.boxes, center_m=frame.boxes.center_m + later))
+    went = move(then).boxes.center_m - move(frame).boxes.center_m
     torch.testing.assert_close(went[:, :2], move(frame).boxes.velocity_mps, atol=1e-5, rtol=1e-5)
 
 
 @pytest.mark.parametrize(("move", "factor"), MOVES.values(), ids=MOVES)
 def test_square_metres_scale_with_a_scaling_and_counts_stay(move, factor):
     frame = make_frame()
-    frame = replace(frame, boxes=replace(frame.boxes, drawn_points=torch.arange(9)), reference_weights=torch.rand(700))
+    frame = replace(
+        frame, boxes=replace(frame.boxes, sampled_points=torch.arange(9)), reference_weights=torch.rand(700)
+    )
     moved = move(frame)
     torch.testing.assert_close(moved.reference_weights, factor**2 * frame.reference_weights)
-    assert torch.equal(moved.boxes.drawn_points, torch.arange(9))
+    assert torch.equal(moved.boxes.sampled_points, torch.arange(9))
 
 
 def test_twice_a_flip_and_back_and_forth_is_nothing():

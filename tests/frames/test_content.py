@@ -31,7 +31,7 @@ def written(folder):
 
 
 def content(folder, **settings):
-    settings = {"steps": 2, "frame_interval_s": 0.1, **settings}
+    settings = {"num_frames": 2, "frame_interval_s": 0.1, **settings}
     return json.dumps(SimulatedFrames(folder / "road.yaml", folder / "low.yaml", **settings).content)
 
 
@@ -53,7 +53,7 @@ def test_of_a_simulation_it_is_what_stands_in_the_files(tmp_path):
         {"boxes": True},
     ):
         assert content(tmp_path, **changed) != before
-    assert content(tmp_path, steps=9) == before
+    assert content(tmp_path, num_frames=9) == before
 
 
 def test_where_the_files_are_and_what_they_say_of_themselves_does_not_matter(tmp_path):

@@ -85,7 +85,7 @@ def test_a_source_is_a_map_style_dataset_that_knows_whose_frames_they_are(tmp_pa
 @pytest.mark.parametrize("scenario", ["courtyard", "parking"])
 def test_the_outline_of_a_simulation_is_that_of_its_ego_and_needs_no_world(monkeypatch, scenario):
     expected = Scenario.load(scenario).build_scene().ego.mesh.vertices_m[:, :2]
-    monkeypatch.setattr(Scenario, "world", lambda *_: pytest.fail("a world was built"))
+    monkeypatch.setattr(Scenario, "build_scene", lambda *_: pytest.fail("a world was built"))
     outline_m = SimulatedFrames(scenario, "front_roof_32", num_frames=1).ego_outline_m
     np.testing.assert_allclose(outline_m.max(axis=0), expected.max(axis=0))
     np.testing.assert_allclose(outline_m.min(axis=0), expected.min(axis=0))
@@ -149,7 +149,9 @@ def test_a_batch_has_weights_of_all_its_frames_or_of_none():
     assert torch.equal(collate_frames([area, area]).weights[1], weights)
     assert collate_frames([none, none]).weights is None
     for mixed in ([area, none], [none, area]):
-        with pytest.raises(ValueError, match=r"weights: frame 'a' has the square metres .*, and 'b' has none; batch"):
+        with pytest.raises(
+            ValueError, match=r"weights: frame 'a' has the areas .*, frame 'b' has none; use separate batches"
+        ):
             _ = collate_frames(mixed).weights
 
 

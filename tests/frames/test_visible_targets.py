@@ -17,8 +17,8 @@ def a_frame(**others):
     boxes = Boxes.from_rows(
         torch.tensor([[x, 0.0, 1.0, 4.0, 2.0, 2.0, 0.0] for x in PLACES_M]),
         categories=("car", "van", "car", "car"),
-        hits={"rig": torch.tensor([3, 1, 0, 0])},
-        drawn_points=torch.tensor([4, 4, 4, 4]),
+        points_in_box={"rig": torch.tensor([3, 1, 0, 0])},
+        sampled_points=torch.tensor([4, 4, 4, 4]),
     )
     of_box = torch.tensor([[0.0, 0.5, 0.0], [0.0, -0.9, 0.0], [0.0, 0.9, 0.0], [0.0, 0.0, 0.9]])
     middles = torch.tensor([[x, 0.0, 1.0] for x in PLACES_M])

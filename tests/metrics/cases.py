@@ -321,7 +321,7 @@ CASES = {
     ),
     "false visible": of_frames(
         FalseVisible,
-        {"sensors": SENSORS, "ego": None, "grid": PLACES["grid"]},
+        {"sensors": SENSORS, "ego_mesh": None, "grid": PLACES["grid"]},
         {
             "grid": OTHER_GRID,
             "threshold_m": {"threshold_m": 0.2},
@@ -330,7 +330,7 @@ CASES = {
         },
     ),
     "s-mig": of_frames(
-        SMig, VOXELS, {**OF_VOXELS, "categories": {"categories": ("car",)}, "occlusion": {"occlusion": True}}
+        SMig, VOXELS, {**OF_VOXELS, "categories": {"categories": ("car",)}, "occlusion": {"ends_at_hits": True}}
     ),
     "s-mig, occluded": of_frames(SMig, {**VOXELS, "occlusion": True}, OF_VOXELS),
     "m-sog": of_frames(MSog, VOXELS, {**OF_VOXELS, "category": {"category": "pedestrian"}}),

@@ -17,8 +17,8 @@ from torchcover.data import Frame
 from torchcover.training import FrameDeduplicator, MMEngineCoverage, convert_batch_dict, convert_data_batch
 from torchcover.training import mmengine as adapter
 
-GRID = {"x": (0.0, 8.0), "y": (-2.0, 2.0), "cell": 1.0}
-REGION = {"name": "all", "x": GRID["x"], "y": GRID["y"]}
+GRID = {"x_m": (0.0, 8.0), "y_m": (-2.0, 2.0), "cell_m": 1.0}
+REGION = {"name": "all", "x_m": GRID["x_m"], "y_m": GRID["y_m"]}
 # 1.7 m above the ground, turned by 90 degrees to the left.
 VEHICLE_T_LIDAR = torch.tensor(
     [[0.0, -1.0, 0.0, 0.5], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 1.7], [0.0, 0.0, 0.0, 1.0]]
@@ -36,7 +36,7 @@ def cloud(points, seed, columns=4):
 
 
 def make_metric():
-    return CoverageMetric(BevGrid(**GRID), max_radius=9.0)
+    return CoverageMetric(BevGrid(**GRID), max_radius_m=9.0)
 
 
 def truth_of(pairs):
@@ -149,7 +149,7 @@ def test_packed_with_the_reference_a_sample_keeps_the_default_meta_keys(augmente
 
 
 def test_by_area_too_a_process_that_was_dealt_nothing_evaluates():
-    metric = MMEngineCoverage({"grid": GRID, "square_metres": True})
+    metric = MMEngineCoverage({"grid": GRID, "has_area_weights": True})
     assert all(math.isnan(value) for name, value in metric.evaluate(0).items() if "radius_m" in name)
     assert metric.coverage.average == "area"
 
@@ -157,7 +157,7 @@ def test_by_area_too_a_process_that_was_dealt_nothing_evaluates():
 def test_mmengine_needs_the_square_metres_that_the_metric_wants():
     frame = Frame({"rig": cloud(9, 0, 3)}, cloud(9, 1, 3), 0, "0")
     without, metric = (
-        MMEngineCoverage({"grid": GRID, "square_metres": True}, get_frames=lambda batch, _: batch) for _ in range(2)
+        MMEngineCoverage({"grid": GRID, "has_area_weights": True}, get_frames=lambda batch, _: batch) for _ in range(2)
     )
     without.process([frame], [{}])
     with pytest.raises(ValueError, match="the square metres of each reference point are needed"):
@@ -225,7 +225,7 @@ def test_mmengine_adds_up_where_its_processes_exchange_tensors(monkeypatch):
             return super().compute()
 
     monkeypatch.setattr(adapter, "get_comm_device", lambda: torch.device("cuda", 1))
-    metric = MMEngineCoverage(Spy(BevGrid(**GRID), max_radius=9.0), regions=[REGION])
+    metric = MMEngineCoverage(Spy(BevGrid(**GRID), max_radius_m=9.0), regions=[REGION])
     metric.process(*data_batch([0]))
     metric.evaluate(1)
     assert calls == [torch.device("cuda", 1), "compute"]
@@ -251,7 +251,7 @@ class Hidden:
 sys.meta_path.insert(0, Hidden())
 import torchcover.training
 assert not {"lightning", "mmengine", "tensorboard", "matplotlib"} & set(sys.modules)
-torchcover.training.frames_of_batch_dict, torchcover.training.frames_of_data_batch, torchcover.training.CountOnce
+torchcover.training.convert_batch_dict, torchcover.training.convert_data_batch, torchcover.training.FrameDeduplicator
 assert not {"lightning", "mmengine", "tensorboard", "matplotlib"} & set(sys.modules)
 for name in ("CoverageCallback", "MMEngineCoverage"):
     try:

@@ -16,8 +16,8 @@ from torchcover.data import Frame, collate_frames
 from torchcover.training import FrameDeduplicator, convert_batch_dict, find_shard
 from torchcover.training.counting import Shard
 
-GRID = {"x": (0.0, 8.0), "y": (-2.0, 2.0), "cell": 1.0}
-REGION = Region("all", x_m=GRID["x"], y_m=GRID["y"])
+GRID = {"x_m": (0.0, 8.0), "y_m": (-2.0, 2.0), "cell_m": 1.0}
+REGION = Region("all", x_m=GRID["x_m"], y_m=GRID["y_m"])
 
 
 def clouds(seed):
@@ -47,7 +47,7 @@ def test_two_processes_give_the_numbers_of_one(tmp_path):
             os.killpg(run.pid, signal.SIGKILL)
     assert run.returncode == 0, output
 
-    metric = CoverageMetric(BevGrid(**GRID), max_radius=9.0, blocks=8)
+    metric = CoverageMetric(BevGrid(**GRID), max_radius_m=9.0, num_blocks=8)
     for index, (sensor, reference) in enumerate(frames):
         metric.update(sensor, reference, block_index=index)
     truth = metric.compute()

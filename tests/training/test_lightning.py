@@ -20,7 +20,7 @@ from torchcover import BevGrid, CoverageMetric, Region
 from torchcover.data import Frame, collate_frames
 from torchcover.training import CoverageCallback
 
-GRID = {"x": (0.0, 8.0), "y": (-2.0, 2.0), "cell": 1.0}
+GRID = {"x_m": (0.0, 8.0), "y_m": (-2.0, 2.0), "cell_m": 1.0}
 REGIONS = [Region("near", x_m=(0.0, 4.0), y_m=(-2.0, 2.0)), Region("all", x_m=(0.0, 8.0), y_m=(-2.0, 2.0))]
 SIZE = torch.tensor([8.0, 4.0, 2.0])
 CORNER = torch.tensor([0.0, -2.0, -0.2])
@@ -79,7 +79,7 @@ def loader(frames, batch_size=2, **options):
 
 
 def make_metric(**options):
-    return CoverageMetric(BevGrid(**GRID), max_radius=9.0, **options)
+    return CoverageMetric(BevGrid(**GRID), max_radius_m=9.0, **options)
 
 
 def expected(frames):
@@ -140,7 +140,7 @@ def test_every_epoch_starts_anew_and_those_between_cost_nothing(tmp_path):
             seen.append((trainer.current_epoch, len(sensor)))
             super().update(sensor, *arguments, **options)
 
-    callback = CoverageCallback(Spy(BevGrid(**GRID), max_radius=9.0), every_n_epochs=2)
+    callback = CoverageCallback(Spy(BevGrid(**GRID), max_radius_m=9.0), every_n_epochs=2)
     trainer = make_trainer(tmp_path, callback, max_epochs=5)
     trainer.fit(Validated(), loader(2), loader(5))
     measured = [epoch for epoch, frames in seen if frames]
@@ -249,7 +249,7 @@ def test_the_sums_are_where_the_model_is_even_if_no_frame_is_new(tmp_path):
             self.devices = (*self.devices, str(device))
             return super().to(device)
 
-    callback = CoverageCallback(Moved(BevGrid(**GRID), max_radius=9.0))
+    callback = CoverageCallback(Moved(BevGrid(**GRID), max_radius_m=9.0))
     padding = DistributedSampler(range(1), num_replicas=2, rank=1, shuffle=False)
     with pytest.warns(UserWarning, match="no reference point lies in the grid"):
         make_trainer(tmp_path, callback, use_distributed_sampler=False).fit(
@@ -272,7 +272,7 @@ def test_the_weights_of_reference_points_count(tmp_path):
 
 
 def test_every_frame_has_the_square_metres_that_the_metric_wants(tmp_path):
-    callback = CoverageCallback(make_metric(square_metres=True))
+    callback = CoverageCallback(make_metric(has_area_weights=True))
     without, other = RandomFrames(2)
     weighted = replace(other, reference_weights=torch.ones(40))
     for frames in ([without], [without, weighted], [weighted, without]):
@@ -329,7 +329,7 @@ class TakesImages(Logger):
 
 def test_tensorboard_holds_the_tags_values_and_maps(tmp_path):
     logger = TensorBoardLogger(tmp_path, name="", version="run")
-    callback = CoverageCallback(make_metric(thresholds=(0.4, 0.8)), regions=REGIONS)
+    callback = CoverageCallback(make_metric(thresholds_m=(0.4, 0.8)), regions=REGIONS)
     make_trainer(tmp_path, callback, logger=logger).fit(Validated(), loader(4), loader(5))
     events = EventAccumulator(str(tmp_path / "run"))
     events.Reload()
@@ -551,7 +551,7 @@ def test_memory_does_not_grow_over_epochs(tmp_path, blank_maps):
         ({"every_n_epochs": 0}, "at least 1"),
         ({"stage": "train", "every_n_steps": 0}, "at least 1"),
         ({"every_n_steps": 5}, "needs stage='train'"),
-        ({"stage": "train", "fixed_frames": True}, "needs stage='validation'"),
+        ({"stage": "train", "has_fixed_frames": True}, "needs stage='validation'"),
     ],
 )
 def test_wrong_arguments_are_refused(options, complaint):
@@ -580,10 +580,12 @@ class LogsOwn(Validated):
 
 @pytest.mark.parametrize("precision", ["64-true", "bf16-true", "16-true", "bf16-mixed"])
 def test_a_batch_is_left_as_it_is_in_any_precision(tmp_path, precision):
-    wanted = CoverageMetric(BevGrid(**GRID), max_radius=9.0)
+    wanted = CoverageMetric(BevGrid(**GRID), max_radius_m=9.0)
     for frame in RandomFrames(5):
         wanted.update(frame.sensor, frame.reference)
-    callback = CoverageCallback(CoverageMetric(BevGrid(**GRID), max_radius=9.0), regions=REGIONS, should_log_maps=False)
+    callback = CoverageCallback(
+        CoverageMetric(BevGrid(**GRID), max_radius_m=9.0), regions=REGIONS, should_log_maps=False
+    )
     trainer = make_trainer(tmp_path, callback, precision=precision)
     trainer.fit(LogsOwn(), loader(3), loader(5))
     assert callback.coverage.scalars(REGIONS) == wanted.compute().scalars(REGIONS)
@@ -604,10 +606,12 @@ def test_a_test_is_measured_under_a_name_of_its_own(tmp_path):
         def test_step(self, batch, batch_idx):
             pass
 
-    wanted = CoverageMetric(BevGrid(**GRID), max_radius=9.0)
+    wanted = CoverageMetric(BevGrid(**GRID), max_radius_m=9.0)
     for frame in RandomFrames(5):
         wanted.update(frame.sensor, frame.reference)
-    callback = CoverageCallback(CoverageMetric(BevGrid(**GRID), max_radius=9.0), regions=REGIONS, should_log_maps=False)
+    callback = CoverageCallback(
+        CoverageMetric(BevGrid(**GRID), max_radius_m=9.0), regions=REGIONS, should_log_maps=False
+    )
     trainer = make_trainer(tmp_path, callback)
     trainer.test(Tested(), loader(5), verbose=False)
     logged = {name: float(value) for name, value in trainer.callback_metrics.items()}

@@ -15,7 +15,7 @@ def test_a_placement_depends_on_seed_and_number_and_keeps_its_rays_and_limits():
     assert {name: many[name] for name in few} == few
     assert few != other
     for name, rig in many.items():
-        assert sum(sensor.rays for sensor in rig.sensors) == example.LIDARS * 16 * 500
+        assert sum(sensor.num_rays for sensor in rig.sensors) == example.LIDARS * 16 * 500
         for sensor in rig.sensors:
             place = sensor.mount.x_m, sensor.mount.y_m, sensor.mount.z_m
             within = [

@@ -186,7 +186,7 @@ def random_frames(steps, seed, reference, name, keep_clouds):
         hits = {
             rig: find_points_in_boxes(cloud, boxes).box_indices.bincount(minlength=8) for rig, cloud in sensors.items()
         }
-        boxes = Boxes.from_rows(rows, categories=("car",) * 8, hits=hits)
+        boxes = Boxes.from_rows(rows, categories=("car",) * 8, points_in_box=hits)
         clouds = {**sensors, **{f"network {rig}": cloud for rig, cloud in sensors.items()}}
         weights = torch.rand(160, generator=generator) + 0.1
         reference = points[:, 40:].reshape(-1, 3)

@@ -56,7 +56,7 @@ def test_the_last_fifth_has_the_reference_and_cars_of_any_data_set_count(example
     assert all(len(frame.reference) == 0 for frame in trained)
     for frame in validated:
         assert torch.equal(frame.reference, frames[frame.index].reference)
-        assert torch.equal(frame.cloud_of(rig), frames[frame.index].cloud_of(rig))
+        assert torch.equal(frame.get_cloud(rig), frames[frame.index].get_cloud(rig))
 
 
 def test_a_small_run_on_a_drive_of_kitti_logs_and_ends_with_table_and_figure(

@@ -71,9 +71,9 @@ class Resumable(DataLoader):
 
 def fit(name, *callbacks, ckpt_path=None):
     def metric():
-        return CoverageMetric(BevGrid(**job["grid"]), max_radius=9.0, blocks=8)
+        return CoverageMetric(BevGrid(**job["grid"]), max_radius_m=9.0, num_blocks=8)
 
-    regions = [Region("all", **{axis: job["grid"][axis] for axis in "xy"})]
+    regions = [Region("all", job["grid"]["x_m"], job["grid"]["y_m"])]
     train = CoverageCallback(metric(), regions=regions, stage="train", should_log_maps=False)
     validation = CoverageCallback(metric(), regions=regions, has_fixed_frames=True)
     logger = TakesImages(folder, name="", version=name)

@@ -112,7 +112,7 @@ class Boxes:
         lengths = {
             "ids": self.ids,
             "categories": self.categories,
-            **{f"hits[{rig!r}]": n for rig, n in self.points_in_box.items()},
+            **{f"points_in_box[{rig!r}]": n for rig, n in self.points_in_box.items()},
         }
         for name, entries in lengths.items():
             if len(entries) != count:

@@ -1,4 +1,4 @@
-"""What the metrics are fed with: frames, batches of them, their augmentation, and what a source of them is."""
+"""Frames, batches of frames, augmentation, and the interface of sources of frames."""
 
 import lazy_loader
 

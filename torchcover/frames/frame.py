@@ -1,4 +1,4 @@
-"""One instant: what the rig saw and what was there to be seen."""
+"""Frames: the sensor points of rigs and the reference points of one time step."""
 
 import math
 import operator
@@ -16,11 +16,11 @@ from torchcover.notebooks import format_short_repr
 
 
 class Measurement(NamedTuple):
-    """What sensors that err made of the points of a rig.
+    """Points of a rig as sensors with measurement errors report them.
 
     Args:
-        points: (N, 3) float32 where they landed, in the vehicle frame.
-        error_m: (N,) float32 how far off they were measured, along their rays.
+        points: (N, 3) float32 measured positions in the vehicle frame in meters.
+        error_m: (N,) float32 range error of each point along its ray.
     """
 
     points: Tensor
@@ -29,28 +29,32 @@ class Measurement(NamedTuple):
 
 @dataclass(frozen=True, repr=False)
 class Frame:
-    """The clouds of one time step, in the vehicle frame (x forward, y left, z up, metres).
+    """Clouds of one time step in the vehicle frame (x forward, y left, z up, meters).
 
-    A point is a place on a surface, measured with an error. What it covers is what was truly hit: a point that lands in
-    a gap fills none.
+    Coverage is computed from the true hit points: a point that noise moves into a gap does not cover the gap.
 
     Args:
-        clouds: Name of each rig -> (N, 3) float32 points of all its sensors, where they truly are; one rig, unless
-            several were simulated side by side. Of a recording only `get_measured_points` is known, and stands for it.
+        clouds: Name of each rig -> (N, 3) float32 true hit points of all its sensors. A recording has no true hit
+            points; its measured points take their place.
         reference: (M, 3) float32 points of the reference sensor.
-        index: Position in its dataset.
-        name: What a user calls it: a file stem, or scenario and step.
-        counts: What was left out on the way here, by name (`sensor_self_hits`, `reference_nonfinite`, ...).
-        reference_weights: (M,) float32 visible square metres that each reference point stands for, as a
-            `SurfaceReference` gives them; None if they are unknown, and all points count the same.
-        reference_heights_m: (M,) float32 heights of the reference points above the local ground, NaN where there is
-            none at or below; None if they are unknown: then height bands are those of the vehicle frame.
-        boxes: The objects of that instant; None if they are unknown, which is not the same as none being there.
-        sensor_point_counts: Name of each rig -> name of each of its sensors -> how many of the rig's points are its own, in
-            their order; None if it is unknown which points are whose.
-        block_index: Number of what it shows, for standard errors: frames that share it, as of an instant that is
-            seen again or of one city, do not count as independent. Not given: `index`, every frame is its own.
-        measurements: Name of a rig -> what its sensors made of its points, if they err; the others land where they are.
+        index: Index in the dataset.
+        name: Name for users: a file stem, or scenario and frame number.
+        counts: Number of points or objects that were excluded, by reason (`sensor_self_hits`,
+            `reference_nonfinite`, ...).
+        reference_weights: (M,) float32 visible area in square meters that each reference point represents (see
+            `SurfaceReference`); None if unknown: all points then weigh the same.
+        boxes: Objects of the frame; None if unknown, which differs from an empty list of boxes.
+        block_index: Number of the content of the frame, for standard errors: frames that share it (a repeated frame,
+            the same city) are not independent. Default: `index`, each frame is independent.
+        sensor_point_counts: Name of each rig -> name of each sensor -> number of its points; `clouds` holds the points
+            in this order. None if unknown.
+        reference_heights_m: (M,) float32 heights of the reference points above local ground, NaN without ground at or
+            below; None if unknown: height bands are then intervals of z in the vehicle frame.
+        measurements: Name of a rig -> its measured points, if its sensors have measurement errors. Other rigs measure
+            the true hit points.
+
+    Raises:
+        ValueError: Clouds and measurements of a rig differ in length.
     """
 
     clouds: Mapping[str, Tensor]
@@ -60,7 +64,7 @@ class Frame:
     counts: Mapping[str, int] = field(default_factory=dict)
     reference_weights: Tensor | None = None
     boxes: Boxes | None = None
-    block_index: int = None  # type: ignore[assignment]  # filled in at once
+    block_index: int = None  # type: ignore[assignment]  # set in __post_init__
     sensor_point_counts: Mapping[str, Mapping[str, int]] | None = None
     reference_heights_m: Tensor | None = None
     measurements: Mapping[str, Measurement] = field(default_factory=dict)
@@ -68,128 +72,159 @@ class Frame:
     __repr__ = format_short_repr
 
     def __post_init__(self) -> None:
-        # Plain numbers: those of NumPy would not be equal to them as text, nor load with `weights_only=True`.
+        # NumPy integers have another text and do not load with `weights_only=True`, hence plain integers.
         for name in ("index", "block_index"):
             number = getattr(self, name)
             object.__setattr__(self, name, self.index if number is None else operator.index(number))
-        for rig in self.measurements.keys() & self.clouds.keys():
-            sizes = [len(self.clouds[rig]), *map(len, self.measurements[rig])]
+        for rig_name in self.measurements.keys() & self.clouds.keys():
+            measurement = self.measurements[rig_name]
+            sizes = (len(self.clouds[rig_name]), len(measurement.points), len(measurement.error_m))
             if len(set(sizes)) > 1:
                 raise ValueError(
-                    f"frame {self.name!r}: {rig!r} has {sizes[0]} points, {sizes[1]} that were measured and {sizes[2]} "
-                    "errors; give `clouds` and `measured` together"
+                    f"frame {self.name!r}: {rig_name!r} has {sizes[0]} points, {sizes[1]} measured points and {sizes[2]} "
+                    "errors; set `clouds` and `measurements` together"
                 )
 
     @property
     def sensor(self) -> Tensor:
-        """(N, 3) points of the only rig, where they truly are.
+        """(N, 3) true hit points of the only rig.
 
         Raises:
-            ValueError: There are several rigs: say which, `frame.cloud_of(name)`.
+            ValueError: The frame has several rigs; use `frame.get_cloud(rig_name)`.
         """
         return self.get_cloud()
 
     def get_cloud(self, rig_name: str | None = None, *, max_error_m: float = math.inf) -> Tensor:
-        """(N, 3) points of one rig, where they truly are.
+        """Return the true hit points of one rig.
 
         Args:
-            rig_name: Which of several rigs; the only one if not given.
-            max_error_m: Only those that were measured with no larger error.
+            rig_name: Name of the rig; may be omitted if there is only one.
+            max_error_m: Points with a larger measurement error are excluded.
+
+        Returns:
+            (N, 3) points in the vehicle frame.
 
         Raises:
-            ValueError: The frame has no such rig, or several, and none was named.
+            ValueError: The frame has no such rig, or several rigs and `rig_name` is None.
         """
-        rig_name = self._named(rig_name)
+        rig_name = self._resolve_rig_name(rig_name)
         cloud = self.clouds[rig_name]
-        return (
-            cloud[self._is_within(rig_name, max_error_m)]
-            if rig_name in self.measurements and max_error_m < math.inf
-            else cloud
-        )
+        if rig_name not in self.measurements or max_error_m == math.inf:
+            return cloud
+        return cloud[self._is_accurate(rig_name, max_error_m)]
 
     def get_errors_m(self, rig_name: str | None = None) -> Tensor | None:
-        """(N,) how far off the points of one rig were measured, along their rays; None if where they are.
+        """Return the measurement errors of the points of one rig.
 
-        It takes and refuses a `rig_name` as `get_cloud` does.
+        Args:
+            rig_name: Name of the rig; may be omitted if there is only one.
+
+        Returns:
+            (N,) range error of each point along its ray; None if the sensors measure the true hit points.
+
+        Raises:
+            ValueError: Same conditions as `get_cloud`.
         """
-        rig_name = self._named(rig_name)
+        rig_name = self._resolve_rig_name(rig_name)
         return self.measurements[rig_name].error_m if rig_name in self.measurements else None
 
     def get_measured_points(self, rig_name: str | None = None) -> Tensor:
-        """(N, 3) points of one rig as they were measured: what a network is fed with, or a file holds.
+        """Return the points of one rig with measurement errors, the input of a network or the content of a file.
 
         Args:
-            rig_name: Which of several rigs; the only one if not given.
+            rig_name: Name of the rig; may be omitted if there is only one.
+
+        Returns:
+            (N, 3) points in the vehicle frame.
 
         Raises:
-            ValueError: As `get_cloud`.
+            ValueError: Same conditions as `get_cloud`.
 
         Example:
-            >>> true, off = torch.tensor([[5.0, 0.0, 0.0]]), torch.tensor([[5.1, 0.0, 0.0]])
-            >>> measured = {"rig": Measured(off, torch.tensor([0.1]))}
-            >>> frame = Frame({"rig": true}, torch.zeros(1, 3), index=0, name="a", measured=measured)
-            >>> frame.landed() is off, frame.cloud_of(within_m=0.4), len(frame.cloud_of(within_m=0.05))
+            >>> hits, measured = torch.tensor([[5.0, 0.0, 0.0]]), torch.tensor([[5.1, 0.0, 0.0]])
+            >>> measurements = {"rig": Measurement(measured, torch.tensor([0.1]))}
+            >>> frame = Frame({"rig": hits}, torch.zeros(1, 3), index=0, name="a", measurements=measurements)
+            >>> frame.get_measured_points() is measured, frame.get_cloud(), len(frame.get_cloud(max_error_m=0.05))
             (True, tensor([[5., 0., 0.]]), 0)
         """
-        rig_name = self._named(rig_name)
+        rig_name = self._resolve_rig_name(rig_name)
         return self.measurements[rig_name].points if rig_name in self.measurements else self.clouds[rig_name]
 
-    def _named(self, rig: str | None) -> str:
-        if rig is None and len(self.clouds) != 1:
-            raise ValueError(f"the frame has clouds of {len(self.clouds)} rigs ({', '.join(self.clouds)}): say which")
-        if rig is not None and rig not in self.clouds:
-            raise ValueError(f"frame {self.name!r} has no rig {rig!r}; it has {', '.join(self.clouds)}")
-        return next(iter(self.clouds)) if rig is None else rig
+    def _resolve_rig_name(self, rig_name: str | None) -> str:
+        """Return the name of an existing rig; the only rig if the name is None."""
+        if rig_name is None and len(self.clouds) != 1:
+            raise ValueError(f"the frame has clouds of {len(self.clouds)} rigs ({', '.join(self.clouds)}): name one")
+        if rig_name is not None and rig_name not in self.clouds:
+            raise ValueError(f"frame {self.name!r} has no rig {rig_name!r}; it has {', '.join(self.clouds)}")
+        return next(iter(self.clouds)) if rig_name is None else rig_name
 
-    def _is_within(self, rig: str, within_m: float) -> Tensor:
-        return self.measurements[rig].error_m.abs() <= within_m
+    def _is_accurate(self, rig_name: str, max_error_m: float) -> Tensor:
+        """(N,) bool: the point of a rig with measurements has at most this error."""
+        return self.measurements[rig_name].error_m.abs() <= max_error_m
 
     def get_clouds_by_sensor(self, rig_name: str | None = None, *, max_error_m: float = math.inf) -> dict[str, Tensor]:
-        """(N, 3) points of each sensor of a rig, where they truly are.
+        """Return the true hit points of each sensor of a rig.
 
         Args:
-            rig_name: Which of several rigs; the only one if not given.
-            max_error_m: As in `get_cloud`.
+            rig_name: Name of the rig; may be omitted if there is only one.
+            max_error_m: Points with a larger measurement error are excluded.
+
+        Returns:
+            Name of each sensor -> (N, 3) points in the vehicle frame.
 
         Raises:
-            ValueError: No such rig, or it is unknown which points are whose.
+            ValueError: The frame has no such rig, or `sensor_point_counts` is unknown.
         """
-        name = self._named(rig_name)
+        name = self._resolve_rig_name(rig_name)
         if self.sensor_point_counts is None or name not in self.sensor_point_counts:
             raise ValueError(
-                f"frame {self.name!r}: it is unknown which points of {name!r} are of which sensor (sensor_points), as "
-                "redundancy needs"
+                f"frame {self.name!r}: redundancy needs the points of each sensor of {name!r}; set sensor_point_counts"
             )
-        points = self.sensor_point_counts[name]
-        sizes = list(points.values())
-        clouds = dict(zip(points, torch.split(self.clouds[name], sizes), strict=True))
+        point_counts = self.sensor_point_counts[name]
+        sizes = list(point_counts.values())
+        clouds = dict(zip(point_counts, torch.split(self.clouds[name], sizes), strict=True))
         if name not in self.measurements or max_error_m == math.inf:
             return clouds
-        within = torch.split(self._is_within(name, max_error_m), sizes)
-        return {sensor: cloud[kept] for (sensor, cloud), kept in zip(clouds.items(), within, strict=True)}
+        masks = torch.split(self._is_accurate(name, max_error_m), sizes)
+        return {sensor: cloud[mask] for (sensor, cloud), mask in zip(clouds.items(), masks, strict=True)}
 
     def pin_memory(self) -> "Frame":
-        """A copy in page-locked memory; DataLoader calls it when `pin_memory=True`."""
-        return self._each(Tensor.pin_memory, None if self.boxes is None else self.boxes.pin_memory())
+        """Copy the frame to page-locked memory; DataLoader calls this if `pin_memory=True`."""
+        return self._transform_tensors(Tensor.pin_memory, None if self.boxes is None else self.boxes.pin_memory())
 
     def to(self, device: torch.device | str) -> "Frame":
-        """A copy on another device, in float32 where that has no float64."""
-        return self._each(
-            lambda cloud: move_tensor(cloud, device), None if self.boxes is None else self.boxes.to(device)
-        )
+        """Copy the frame to a device.
+
+        Args:
+            device: Target device.
+
+        Returns:
+            The copy; its tensors are float32 if the device does not support float64.
+        """
+
+        def move(tensor: Tensor) -> Tensor:
+            return move_tensor(tensor, device)
+
+        return self._transform_tensors(move, None if self.boxes is None else self.boxes.to(device))
 
     def get_heights_m(self, band_frame: BandFrame) -> Tensor | None:
-        """The heights of the reference points that such height bands need: None for those over z of the vehicle.
+        """Return the heights by which reference points are assigned to height bands.
+
+        Args:
+            band_frame: "ground": bands above local ground; "vehicle": bands of z in the vehicle frame.
+
+        Returns:
+            (M,) heights above local ground; None for "vehicle".
 
         Raises:
-            ValueError: Bands over the ground, and the heights above it are unknown; bands over z, and the points have
-                square metres and heights: that is how points are drawn within bands over the ground.
+            ValueError: "ground", but the heights are unknown; or "vehicle", but the points were sampled within bands
+                above local ground (they have weights and heights).
         """
         if band_frame == "vehicle":
             if None not in (self.reference_weights, self.reference_heights_m):
                 raise ValueError(
-                    f"frame {self.name!r}: its reference points have heights above the ground, and square metres: they "
-                    "were drawn for bands over the ground; use the band frame ground"
+                    f"frame {self.name!r}: its reference points have areas and heights above the ground, so they were "
+                    "sampled for bands above the ground; use the band frame ground"
                 )
             return None
         if self.reference_heights_m is None:
@@ -199,28 +234,34 @@ class Frame:
             )
         return self.reference_heights_m
 
-    def _each(self, change: Callable[[Tensor], Tensor], boxes: Boxes | None) -> "Frame":
-        clouds = {name: change(cloud) for name, cloud in self.clouds.items()}
+    def _transform_tensors(self, transform: Callable[[Tensor], Tensor], boxes: Boxes | None) -> "Frame":
+        """Copy the frame with every tensor transformed and with other boxes."""
         weights, heights_m = self.reference_weights, self.reference_heights_m
+        measurements = {}
+        for name, measurement in self.measurements.items():
+            measurements[name] = Measurement(transform(measurement.points), transform(measurement.error_m))
         return replace(
             self,
-            clouds=clouds,
-            reference=change(self.reference),
-            reference_weights=None if weights is None else change(weights),
-            reference_heights_m=None if heights_m is None else change(heights_m),
+            clouds={name: transform(cloud) for name, cloud in self.clouds.items()},
+            reference=transform(self.reference),
+            reference_weights=None if weights is None else transform(weights),
+            reference_heights_m=None if heights_m is None else transform(heights_m),
             boxes=boxes,
-            measurements={name: Measurement(*map(change, measured)) for name, measured in self.measurements.items()},
+            measurements=measurements,
         )
 
 
 class FrameBatch:
-    """Frames side by side, in order, as `CoverageMetric.update` takes them.
+    """Batch of frames whose clouds differ in size, as `CoverageMetric.update` accepts them.
 
-    It is no dataclass and cannot be iterated over, so that Lightning neither casts the clouds to the precision of the
-    model nor takes their sizes for the size of the batch: give `self.log(..., batch_size=len(batch))`.
+    The class is neither a dataclass nor iterable, so that Lightning does not cast the clouds to the precision of the
+    model and does not infer a batch size from their lengths: use `self.log(..., batch_size=len(batch))`.
 
-    `metric.update(batch.sensor, batch.reference, error=batch.errors_of(), weights=batch.weights,
-    height=batch.heights_in(grid.band_frame), block_index=batch.block_index)`.
+    `metric.update(batch.sensor, batch.reference, errors_m=batch.get_errors_m(), weights=batch.weights,
+    heights_m=batch.get_heights_m(grid.band_frame), block_index=batch.block_indices)`.
+
+    Args:
+        frames: Frames in the order of the batch.
     """
 
     def __init__(self, frames: Sequence[Frame]) -> None:
@@ -231,11 +272,17 @@ class FrameBatch:
 
     @property
     def sensor(self) -> list[Tensor]:
-        """One (N, 3) cloud a frame, of the only rig, where its points truly are; N differs."""
+        """(N, 3) true hit points of the only rig for each frame; N differs."""
         return [frame.sensor for frame in self.frames]
 
     def get_clouds(self, rig_name: str | None = None) -> list[Tensor]:
-        """One (N, 3) cloud a frame, as `Frame.cloud_of`.
+        """Return the true hit points of one rig for each frame.
+
+        Args:
+            rig_name: Name of the rig; may be omitted if there is only one.
+
+        Returns:
+            (N, 3) points for each frame, see `Frame.get_cloud`.
 
         Raises:
             ValueError: A frame has no such rig.
@@ -243,18 +290,35 @@ class FrameBatch:
         return [frame.get_cloud(rig_name) for frame in self.frames]
 
     def get_errors_m(self, rig_name: str | None = None) -> list[Tensor] | None:
-        """One (N,) tensor a frame, as `Frame.error_of`, zeros of points that are where they were; None if all are.
+        """Return the measurement errors of one rig for each frame.
+
+        Args:
+            rig_name: Name of the rig; may be omitted if there is only one.
+
+        Returns:
+            (N,) errors for each frame, see `Frame.get_errors_m`; zeros for frames without measurement errors; None if
+            no frame has any.
 
         Raises:
             ValueError: A frame has no such rig.
         """
-        pairs = [(frame.get_cloud(rig_name), frame.get_errors_m(rig_name)) for frame in self.frames]
-        if all(error is None for _, error in pairs):
+        errors_m = [frame.get_errors_m(rig_name) for frame in self.frames]
+        if all(error_m is None for error_m in errors_m):
             return None
-        return [cloud.new_zeros(len(cloud)) if error is None else error for cloud, error in pairs]
+        filled_m = []
+        for frame, error_m in zip(self.frames, errors_m, strict=True):
+            cloud = frame.get_cloud(rig_name)
+            filled_m.append(cloud.new_zeros(len(cloud)) if error_m is None else error_m)
+        return filled_m
 
     def get_measured_points(self, rig_name: str | None = None) -> list[Tensor]:
-        """One (N, 3) cloud a frame, as `Frame.landed`.
+        """Return the measured points of one rig for each frame.
+
+        Args:
+            rig_name: Name of the rig; may be omitted if there is only one.
+
+        Returns:
+            (N, 3) points for each frame, see `Frame.get_measured_points`.
 
         Raises:
             ValueError: A frame has no such rig.
@@ -263,95 +327,109 @@ class FrameBatch:
 
     @property
     def reference(self) -> list[Tensor]:
-        """One (M, 3) cloud a frame; M differs."""
+        """(M, 3) reference points for each frame; M differs."""
         return [frame.reference for frame in self.frames]
 
     @property
     def weights(self) -> list[Tensor] | None:
-        """One (M,) tensor a frame, the square metres of its reference points; None if no frame has any.
+        """(M,) visible areas of the reference points in square meters for each frame; None if no frame has any.
 
         Raises:
-            ValueError: Some frames have them, and others have not.
+            ValueError: Only some of the frames have areas.
         """
-        given = [frame.reference_weights for frame in self.frames if frame.reference_weights is not None]
-        if given and len(given) < len(self.frames):
-            named = {frame.reference_weights is None: frame.name for frame in self.frames}
+        weights = [frame.reference_weights for frame in self.frames if frame.reference_weights is not None]
+        if weights and len(weights) < len(self.frames):
+            names = {frame.reference_weights is None: frame.name for frame in self.frames}
             raise ValueError(
-                f"weights: frame {named[False]!r} has the square metres of its reference points, and {named[True]!r} "
-                "has none; batch each kind of frames by itself"
+                f"weights: frame {names[False]!r} has the areas of its reference points (square meters), frame "
+                f"{names[True]!r} has none; use separate batches"
             )
-        return given or None
+        return weights or None
 
     def get_heights_m(self, band_frame: BandFrame) -> list[Tensor] | None:
-        """One (M,) tensor a frame, as `Frame.heights_in`; None for bands over z of the vehicle.
+        """Return the heights by which reference points are assigned to height bands, for each frame.
+
+        Args:
+            band_frame: "ground" or "vehicle", see `Frame.get_heights_m`.
+
+        Returns:
+            (M,) heights for each frame; None for "vehicle".
 
         Raises:
-            ValueError: As there.
+            ValueError: Same conditions as `Frame.get_heights_m`.
         """
-        given = [frame.get_heights_m(band_frame) for frame in self.frames]
-        return [heights_m for heights_m in given if heights_m is not None] or None
+        heights_m = [frame.get_heights_m(band_frame) for frame in self.frames]
+        return [height_m for height_m in heights_m if height_m is not None] or None
 
     @property
     def block_indices(self) -> list[int]:
-        """That of each frame."""
+        """Block index of each frame."""
         return [frame.block_index for frame in self.frames]
 
     @property
     def boxes(self) -> list[Boxes]:
-        """The objects of each frame.
+        """Objects of each frame.
 
         Raises:
-            ValueError: A frame has no boxes, not even an empty list of them.
+            ValueError: The boxes of a frame are None.
         """
-        found = [frame.boxes for frame in self.frames if frame.boxes is not None]
-        if len(found) < len(self.frames):
-            without = next(frame.name for frame in self.frames if frame.boxes is None)
+        boxes = [frame.boxes for frame in self.frames if frame.boxes is not None]
+        if len(boxes) < len(self.frames):
+            example = next(frame.name for frame in self.frames if frame.boxes is None)
             raise ValueError(
-                f"{len(self.frames) - len(found)} of {len(self.frames)} frames have no boxes, such as {without!r}: "
-                "SimulatedFrames(..., boxes=True) makes them; for a recording use dataclasses.replace(frame, boxes=...)"
+                f"{len(self.frames) - len(boxes)} of {len(self.frames)} frames have no boxes, for example {example!r}: "
+                "use SimulatedFrames(..., boxes=True), for a recording dataclasses.replace(frame, boxes=...)"
             )
-        return found
+        return boxes
 
     def pad_boxes(self, categories: Sequence[str]) -> Tensor:
-        """The objects as one tensor, as OpenPCDet's detectors take them.
+        """Stack the objects into one tensor, the input of detectors of OpenPCDet.
 
         Args:
-            categories: The classes, from number 1; objects of other categories are left out.
+            categories: Classes, numbered from 1; objects of other categories are excluded.
 
         Returns:
-            (B, most boxes of a frame, 8): x, y, z of the centre, length, width, height, yaw, class; zeros where a frame
-            has fewer.
+            (B, K, 8) center x, y, z, length, width, height, yaw, class; K is the largest number of objects in a frame,
+            missing objects are zeros.
         """
         rows = []
         for boxes in self.boxes:
-            wanted = boxes.select_categories(*categories)
-            numbers = [categories.index(category) + 1 for category in wanted.categories]
-            rows.append(torch.cat([wanted.rows, wanted.rows.new_tensor(numbers)[:, None]], dim=1))
+            selected = boxes.select_categories(*categories)
+            classes = [categories.index(category) + 1 for category in selected.categories]
+            rows.append(torch.cat([selected.rows, selected.rows.new_tensor(classes)[:, None]], dim=1))
         return torch.nn.utils.rnn.pad_sequence(rows, batch_first=True)
 
     def stack_points(self, rig_name: str | None = None) -> Tensor:
-        """The clouds of one rig as they landed in one tensor, as voxel and pillar encoders take them.
+        """Stack the measured points of one rig into one tensor, the input of voxel and pillar encoders.
 
         Args:
-            rig_name: Which of several rigs; the only one if not given.
+            rig_name: Name of the rig; may be omitted if there is only one.
 
         Returns:
-            (points of all frames, 4): number of the frame in the batch, x, y, z.
+            (points of all frames, 4) index of the frame in the batch, x, y, z.
         """
-        landed = enumerate(self.get_measured_points(rig_name))
-        numbered = [torch.nn.functional.pad(cloud, (1, 0), value=number) for number, cloud in landed]
-        return torch.cat(numbered)
+        clouds = []
+        for index, cloud in enumerate(self.get_measured_points(rig_name)):
+            clouds.append(torch.nn.functional.pad(cloud, (1, 0), value=index))
+        return torch.cat(clouds)
 
     def __len__(self) -> int:
         return len(self.frames)
 
     def pin_memory(self) -> "FrameBatch":
-        """A copy in page-locked memory; DataLoader calls it when `pin_memory=True`."""
-        return FrameBatch(tuple(frame.pin_memory() for frame in self.frames))
+        """Copy the batch to page-locked memory; DataLoader calls this if `pin_memory=True`."""
+        return FrameBatch([frame.pin_memory() for frame in self.frames])
 
     def to(self, device: torch.device | str) -> "FrameBatch":
-        """A copy on another device."""
-        return FrameBatch(tuple(frame.to(device) for frame in self.frames))
+        """Copy the batch to a device.
+
+        Args:
+            device: Target device.
+
+        Returns:
+            The copy, see `Frame.to`.
+        """
+        return FrameBatch([frame.to(device) for frame in self.frames])
 
 
 def collate_frames(frames: Sequence[Frame]) -> FrameBatch:
@@ -361,7 +439,7 @@ def collate_frames(frames: Sequence[Frame]) -> FrameBatch:
         frames: Frames whose clouds may differ in size.
 
     Returns:
-        A `FrameBatch` of all of them.
+        Batch of all frames.
 
     Example:
         >>> frame = Frame({"rig": torch.zeros(5, 3)}, torch.zeros(9, 3), index=0, name="a")
@@ -371,5 +449,5 @@ def collate_frames(frames: Sequence[Frame]) -> FrameBatch:
     return FrameBatch(tuple(frames))
 
 
-# `torch.load` gives them back with weights_only=True, its default.
+# Classes on this list load with `torch.load(weights_only=True)`, the default.
 torch.serialization.add_safe_globals([Frame, FrameBatch, Measurement])
