@@ -127,6 +127,7 @@ def run(command, out, *options):
     if "space.yaml" in command:  # frames are made up
         makes = lambda space, plan, seed, num_scenes: Surface(seed, num_scenes, plan.frames_per_scene)  # noqa: E731
         search_run.SearchPlan = partial(SearchPlan, make_frames=makes)
+        search_run.SearchPlan.num_scenes = SearchPlan.num_scenes
     if command is not REAL:  # drawing takes most of the time
         result.plot_maps = lambda *_, **__: [("map1", Figure((1, 1)))]
     try:

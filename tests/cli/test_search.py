@@ -26,7 +26,9 @@ def space(tmp_path, monkeypatch):
     """A file; frames are surfaces, and one target is looked at in the end."""
     monkeypatch.setattr("torchcover.placement.validation.TARGETS", ("pole",))
     makes = lambda space, plan, seed, num_scenes: Surface(seed, num_scenes, plan.frames_per_scene)  # noqa: E731
-    monkeypatch.setattr(search_run, "SearchPlan", partial(SearchPlan, make_frames=makes))
+    create_plan = partial(SearchPlan, make_frames=makes)
+    create_plan.num_scenes = SearchPlan.num_scenes
+    monkeypatch.setattr(search_run, "SearchPlan", create_plan)
     (tmp_path / "space.yaml").write_text(SPACE)
     return tmp_path / "space.yaml"
 
@@ -44,7 +46,7 @@ def test_a_search_ends_with_its_gain_and_that_of_random_candidates(torchcover, s
     assert again.splitlines()[-1] == last
     code, _, said = torchcover("search", space, "--num-evaluations", 12, "--out", out, "--resume")
     assert code == 2
-    assert "the journal of another search: seed (3 there, 0 here)" in said
+    assert "the journal belongs to another search: seed (3 there, 0 here)" in said
 
 
 @pytest.mark.parametrize(
@@ -53,8 +55,8 @@ def test_a_search_ends_with_its_gain_and_that_of_random_candidates(torchcover, s
         (("--budget", "30"), "--budget: a time is needed, as in 90s, 30min or 2h; got '30'"),
         (("--budget", "1h", "--num-evaluations", "3"), "one of them; both are given"),
         (("--num-evaluations", "3", "--sensor-model", "real"), "no LiDAR of the rig 'front_roof_32' has a range_at_10"),
-        (("--budget", "0s"), "more than 0 s is needed; got 0"),
-        (("--budget", "0.00001s"), "are less than two evaluations"),
+        (("--budget", "0s"), "budget: got 0 s; give more than 0 s"),
+        (("--budget", "0.00001s"), "is too short for two evaluations"),
     ],
 )
 def test_a_mistake_is_one_line(torchcover, space, tmp_path, options, message):
@@ -67,8 +69,8 @@ def test_a_mistake_is_one_line(torchcover, space, tmp_path, options, message):
 @pytest.mark.parametrize(
     ("objective", "message"),
     [
-        ("number: radius, region: 20m", "objective 'near': no result has a number 'radius'; near is 'radius_m'"),
-        ("number: radius_m", "objectives.near: region: it is needed"),
+        ("number: radius, region: 20m", "objective 'near': results have no number 'radius'; did you mean 'radius_m'?"),
+        ("number: radius_m", "objectives.near: region: 'radius_m' needs one"),
     ],
 )
 def test_an_objective_that_no_result_has_is_one_line(torchcover, tmp_path, objective, message):

@@ -91,9 +91,9 @@ def test_numbers_are_those_of_evaluate_on_the_same_frames_to_the_last_bit():
     for measure, frames_of in held_by.items():
         own = frames_of.score(TWO).estimate
         for column, objective in enumerate(OBJECTIVES.values()):
-            rows = {(row.region, row.height): row for row in result.coverage.summary()}
+            rows = {(row.region, row.band): row for row in result.coverage.summary()}
             numbers = [
-                (rows[place].numbers if measure == "area" else rows[place].known)[objective.key]
+                (rows[place].numbers if measure == "area" else rows[place].cell_averages)[objective.key]
                 for place in objective.region_bands
             ]
             values = torch.tensor([number.value for number in numbers], dtype=torch.float64)

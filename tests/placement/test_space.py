@@ -312,7 +312,7 @@ def test_a_space_can_be_sent_to_another_process():
     again = pickle.loads(pickle.dumps(searched))
     assert again == searched
     values = next(drawn(searched))
-    assert again.rig(values, "found") == searched.build_rig(values, "found")
+    assert again.build_rig(values, "found") == searched.build_rig(values, "found")
 
 
 def test_a_rig_is_written_with_what_it_names_by_file(tmp_path):
