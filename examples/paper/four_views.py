@@ -8,7 +8,7 @@ from matplotlib.patches import Patch, Wedge
 
 from torchcover.coverage.quantity import RADIUS
 from torchcover.report.colors import (
-    NEVER_PROBED,
+    UNOBSERVED,
     ColorScale,
     build_cell_legend,
     build_color_scale,
@@ -54,7 +54,7 @@ def draw_four_views(radius, points, grid, *, steps, title, ego_outline_m, sensor
     for sheet, values, name in zip(maps, together, grid.heights, strict=True):
         plot_color_bar(sheet, plot_cells(sheet.axes, values, scale), together, scale)
         write_heading(sheet.axes, f"blind spot radius, {name}: {format_height_band(grid, name)}")
-    entries += build_cell_legend(together, NEVER_PROBED)
+    entries += build_cell_legend(together, UNOBSERVED)
     for sheet in (histogram, *maps):
         entries += plot_sensors(sheet, sensors, show_names=False)
     for sheet in (sectors, histogram, *maps):

@@ -15,7 +15,7 @@ from torchcover.coverage import BevGrid
 from torchcover.coverage.quantity import RADIUS, make_detection_quantity
 from torchcover.geometry import build_transform, convert_euler_to_rotation
 from torchcover.report import ColorScale, SensorView, build_color_scale, plot_side_by_side
-from torchcover.report.colors import INFINITE, UNKNOWN
+from torchcover.report.colors import INFINITE_COLOR, UNOBSERVED_STYLE
 
 SCALE = ColorScale("blind spot radius", "m", "viridis_r", 0.0, 1.0)
 SQUARE = BevGrid(x_m=(-20.0, 20.0), y_m=(-10.0, 10.0), cell_m=1.0)
@@ -116,7 +116,7 @@ def test_infinite_cells_have_a_colour_of_their_own_and_leave_the_scale_alone():
     values = flat(0.5)
     values[:, 20:] = math.inf
     picture = draw(values, scale=build_color_scale(RADIUS, values))
-    assert picture.at(10.5, 3.5) == pytest.approx(to_rgb(INFINITE), abs=0.01)
+    assert picture.at(10.5, 3.5) == pytest.approx(to_rgb(INFINITE_COLOR), abs=0.01)
     assert "infinite: a step saw nothing (50.0 % of the cells)" in picture.legend
     assert picture.bar.get_ylim() == (0.0, 0.5)
     assert not any("infinite" in entry for entry in draw(flat()).legend)
@@ -252,7 +252,7 @@ def test_less_opaque_cells_are_nearer_to_the_grey_of_unknown_ones():
     values, opacity = flat(1.0), torch.linspace(0.0, 1.0, 40).expand(20, 40)
     picture = draw(values, opacity=opacity)
     grey, pale, full = (picture.at(x_m, 3.3) for x_m in (-19.6, 0.5, 19.5))
-    assert grey == pytest.approx(to_rgb(UNKNOWN["facecolor"]), abs=0.1)
+    assert grey == pytest.approx(to_rgb(UNOBSERVED_STYLE["facecolor"]), abs=0.1)
     assert full == pytest.approx(draw(values).at(19.5, 3.3))
     # The hatch of the ground shows through: by less than what is compared.
     greens = picture.map[40, 10:-10, 1]
@@ -267,7 +267,7 @@ def test_what_is_unknown_or_infinite_is_so_whatever_its_opacity():
     values[:, :10], values[:, 30:] = math.nan, math.inf
     opaque, none = torch.ones(20, 40), torch.zeros(20, 40)
     assert draw(values, opacity=opaque).at(-15.3, 3.3) == pytest.approx(draw(values).at(-15.3, 3.3))
-    assert draw(values, opacity=opaque).at(15.5, 3.3) == pytest.approx(to_rgb(INFINITE), abs=0.01)
+    assert draw(values, opacity=opaque).at(15.5, 3.3) == pytest.approx(to_rgb(INFINITE_COLOR), abs=0.01)
     for x_m in (-15.3, 0.5, 15.5):
         assert np.ptp(draw(values, opacity=none).at(x_m, 3.3)) < 0.01
 

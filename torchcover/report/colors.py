@@ -1,7 +1,7 @@
-"""Colours: how the numbers of a map become colours, and what says what they mean.
+"""Color scales and cells of maps, and legends that explain them.
 
-Dark means blind. In a difference blue means better, red means worse. Unknown cells are hatched, and show through those
-where little surface is seen.
+Dark colors mean poor coverage. In a difference blue means better, red means worse. Unobserved cells are hatched, and
+show through cells with little visible surface.
 """
 
 import math
@@ -35,29 +35,26 @@ from torchcover.report.plot_layout import (
     write_title,
 )
 
-# A few cells far behind an obstacle must not take the colours away from all others.
-ROBUST_PERCENTILE = 98
-UNKNOWN: dict[str, Any] = {"facecolor": "#c4c4c4", "edgecolor": "#b2b2b2", "hatch": "////"}
-INFINITE = "#d55e00"
-NEVER_PROBED = "never probed"
-PALER = "paler: less visible surface in a step than open ground has"
+UNOBSERVED_STYLE: dict[str, Any] = {"facecolor": "#c4c4c4", "edgecolor": "#b2b2b2", "hatch": "////"}
+INFINITE_COLOR = "#d55e00"
+UNOBSERVED = "unobserved"
 
 
 @dataclass(frozen=True)
 class ColorScale:
-    """What a colour says.
+    """Mapping from numbers to colors.
 
     Args:
-        quantity: What is measured, for the colour bar.
-        unit: Its unit, for the colour bar.
-        colormap: Name of a matplotlib colour map.
-        low: Value of the first colour.
-        high: Value of the last colour. Values beyond either end keep its colour, and the colour bar says so.
-        logarithmic: Whether equal ratios, rather than equal differences, are equally far apart in colour.
+        quantity: Measured quantity, for the color bar.
+        unit: Its unit, for the color bar.
+        colormap: Name of a matplotlib colormap.
+        low: Value of the first color.
+        high: Value of the last color. Values beyond an end have its color, and the color bar shows their share.
+        logarithmic: Whether colors are uniform in the logarithm of the value.
 
     Raises:
-        ValueError: `low` is not below `high`, or one of them is not finite; a logarithmic scale that does not begin
-            above 0.
+        ValueError: `low` is not below `high`, one of them is not finite, or `low` of a logarithmic scale is not
+            positive.
 
     Example:
         >>> ColorScale("change of the blind spot radius", "m", "PuOr", -1.0, 1.0).label
@@ -73,9 +70,9 @@ class ColorScale:
 
     def __post_init__(self) -> None:
         if not (-math.inf < self.low < self.high < math.inf):
-            raise ValueError(f"a colour scale needs finite low < high; got {self.low} and {self.high}")
+            raise ValueError(f"low, high: got {self.low} and {self.high}; a color scale needs finite low < high")
         if self.logarithmic and not self.low > 0:
-            raise ValueError(f"a logarithmic colour scale needs low > 0; got {self.low}")
+            raise ValueError(f"low: got {self.low}; a logarithmic color scale needs low > 0")
 
     @property
     def label(self) -> str:
@@ -84,11 +81,11 @@ class ColorScale:
 
 
 def build_color_scale(quantity: Quantity, values: Tensor) -> ColorScale:
-    """Scale for a quantity as it is shown: shares from 0 to 100 %, others from 0 to the 98th percentile of the known.
+    """Build the color scale of a quantity: shares from 0 to 100 %, others from 0 to the 98th percentile.
 
     Args:
-        quantity: What is shown; dark is the worse end.
-        values: Any shape, in the unit that is shown: those of every map that shall be compared by eye. NaN is unknown.
+        quantity: Quantity; dark colors are its worse end.
+        values: Values of all maps that share the scale, of any shape, in the shown unit. NaN is ignored.
 
     Example:
         >>> import torch
@@ -98,28 +95,33 @@ def build_color_scale(quantity: Quantity, values: Tensor) -> ColorScale:
     """
     unit = get_display_unit(quantity.unit)
     colormap = "viridis_r" if quantity.lower_is_better else "viridis"
-    high = unit.max_value if math.isfinite(unit.max_value) else _robust_end(values)
+    high = unit.max_value if math.isfinite(unit.max_value) else _find_robust_end(values)
     return ColorScale(quantity.title, unit.name, colormap, 0.0, high)
 
 
 def build_difference_scale(quantity: Quantity, differences: Tensor) -> ColorScale:
-    """Scale for differences: white is none, blue is better, red is worse, both to the 98th percentile of the size."""
-    end = _robust_end(differences.abs())
+    """Build the color scale of differences: white is 0, blue better, red worse, up to the 98th percentile of the size.
+
+    Args:
+        quantity: Quantity of the difference.
+        differences: Differences of all maps that share the scale, of any shape, in the shown unit.
+    """
+    end = _find_robust_end(differences.abs())
     colormap = "RdBu_r" if quantity.lower_is_better else "RdBu"
-    return ColorScale(
-        f"difference, {quantity.title}", get_display_unit(quantity.unit).difference_name, colormap, -end, end
-    )
+    unit = get_display_unit(quantity.unit).difference_name
+    return ColorScale(f"difference, {quantity.title}", unit, colormap, -end, end)
 
 
-def _robust_end(values: Tensor) -> float:
-    each = values.cpu().numpy()
-    known = each[np.isfinite(each)]
-    high = float(np.percentile(known, ROBUST_PERCENTILE) or known.max()) if len(known) else 0.0
+def _find_robust_end(values: Tensor) -> float:
+    """Return the 98th percentile of finite values, since a few cells behind obstacles must not dominate the colors."""
+    array = values.cpu().numpy()
+    finite = array[np.isfinite(array)]
+    high = float(np.percentile(finite, 98) or finite.max()) if len(finite) else 0.0
     return _round_up(high) or 1.0
 
 
 def _round_up(value: float) -> float:
-    """To two digits, so that the end of the colour bar is a number one can say."""
+    """Round up to two digits, for a short label of the color bar."""
     if value <= 0:
         return 0.0
     step = 10.0 ** (math.floor(math.log10(value)) - 1)
@@ -132,65 +134,82 @@ def plot_cells(
     scale: ColorScale,
     *,
     opacity: NDArray[np.float64] | None = None,
-    infinite_color: str = INFINITE,
+    infinite_color: str = INFINITE_COLOR,
 ) -> AxesImage:
-    """Colour (Y, X) cells; unknown ones, NaN, are hatched grey, infinite ones have a colour of their own.
+    """Plot colored cells over the limits of the axes; NaN is hatched gray, infinity has its own color.
 
-    The axes have the grid's bounds as limits. Cells are opaque but for an `opacity` from 0 to 1 of each. Returns the
-    image, for the colour bar.
+    Args:
+        axes: Axes of a map.
+        array: (Y, X) values.
+        scale: Color scale.
+        opacity: (Y, X) opacity in [0, 1]; None for opaque cells.
+        infinite_color: Color of infinity.
+
+    Returns:
+        The image, for the color bar.
     """
-    # Each is drawn with several copies of all pixels, half as large as in float64.
+    # matplotlib holds several copies of all pixels, half as large as in float64.
     array, opacity = array.astype(np.float32), None if opacity is None else opacity.astype(np.float32)
-    # Unknown cells are holes through which the ground of the axes shows.
-    axes.patch.set(**UNKNOWN, linewidth=0)
+    # Unobserved cells are holes through which the background of the axes shows.
+    axes.patch.set(**UNOBSERVED_STYLE, linewidth=0)
     norm = (LogNorm if scale.logarithmic else Normalize)(scale.low, scale.high)
-    image = _draw_image(axes, np.ma.masked_invalid(array), alpha=opacity, cmap=scale.colormap, norm=norm)
-    endless = np.isinf(array)
-    if endless.any():
-        _draw_image(axes, np.ma.masked_where(~endless, endless), alpha=opacity, cmap=ListedColormap([infinite_color]))
+    image = _plot_image(axes, np.ma.masked_invalid(array), alpha=opacity, cmap=scale.colormap, norm=norm)
+    is_infinite = np.isinf(array)
+    if is_infinite.any():
+        masked = np.ma.masked_where(~is_infinite, is_infinite)
+        _plot_image(axes, masked, alpha=opacity, cmap=ListedColormap([infinite_color]))
     return image
 
 
-def build_cell_legend(array: NDArray[np.float64], unobserved_label: str = NEVER_PROBED) -> list[Artist]:
-    """The legend entries for cells without a colour of the scale.
+def build_cell_legend(array: NDArray[np.float64], unobserved_label: str = UNOBSERVED) -> list[Artist]:
+    """Build the legend entries of cells that have no color of the scale.
 
-    `array`: values of one map, or of several, NaN where unknown; `unobserved_label`: why they are.
+    Args:
+        array: Values of one map, or of several; NaN is unobserved.
+        unobserved_label: Label of unobserved cells.
     """
-    unknown_share = format_percent(float(np.isnan(array).mean()))
-    entries: list[Artist] = [Patch(label=f"unknown: {unobserved_label} ({unknown_share} % of the cells)", **UNKNOWN)]
-    infinite = np.isinf(array)
-    if infinite.any():
-        label = f"infinite: a step saw nothing ({format_percent(float(infinite.mean()))} % of the cells)"
-        entries.append(Patch(facecolor=INFINITE, label=label))
+    unobserved_share = format_percent(float(np.isnan(array).mean()))
+    entries: list[Artist] = [Patch(label=f"{unobserved_label} ({unobserved_share} % of the cells)", **UNOBSERVED_STYLE)]
+    is_infinite = np.isinf(array)
+    if is_infinite.any():
+        share = format_percent(float(is_infinite.mean()))
+        label = f"infinite: no sensor points in some frame ({share} % of the cells)"
+        entries.append(Patch(facecolor=INFINITE_COLOR, label=label))
     return entries
 
 
 def plot_color_bar(sheet: Sheet, image: AxesImage, array: NDArray[np.float64], scale: ColorScale) -> None:
-    """Draw the colour bar with quantity and unit; if values lie beyond an end, an arrow and how many there are.
+    """Plot the color bar with quantity and unit, and with the share of values beyond its ends.
 
-    Maps that share it are beside each other on the sheet; `array` has the values of all.
+    Args:
+        sheet: Sheet of a map; maps that share the color bar are next to each other.
+        image: Result of `plot_cells`.
+        array: Values of all maps.
+        scale: Color scale.
     """
-    known = array[np.isfinite(array)]
-    rounding = 1e-6 * (scale.high - scale.low)
-    below, above = (known < scale.low - rounding).sum(), (known > scale.high + rounding).sum()
-    extend = {(False, False): "neither", (True, False): "min", (False, True): "max", (True, True): "both"}
+    finite = array[np.isfinite(array)]
+    tolerance = 1e-6 * (scale.high - scale.low)
+    below_count, above_count = (finite < scale.low - tolerance).sum(), (finite > scale.high + tolerance).sum()
+    extensions = {(False, False): "neither", (True, False): "min", (False, True): "max", (True, True): "both"}
+    extend = extensions[bool(below_count), bool(above_count)]
     label = scale.label
-    if beyond := below + above:
-        label += f"\n{format_percent(float(beyond / len(known)))} % of the known cells lie beyond"
-    sheet.figure.colorbar(image, cax=sheet.color_bar_axes, extend=extend[bool(below), bool(above)], label=label)
+    if below_count + above_count:
+        share = format_percent(float((below_count + above_count) / len(finite)))
+        label += f"\n{share} % of the observed cells lie beyond"
+    sheet.figure.colorbar(image, cax=sheet.color_bar_axes, extend=extend, label=label)
 
 
-def _draw_image(axes: Axes, array: NDArray[Any], **colours: Any) -> AxesImage:  # noqa: ANN401  (imshow's own)
+def _plot_image(axes: Axes, array: NDArray[Any], **options: Any) -> AxesImage:  # noqa: ANN401  (options of imshow)
     # A cell is a whole number of pixels, or smaller than a pixel: then they are averaged.
-    larger_than_pixel = axes.get_window_extent().width > 0.99 * array.shape[1]
+    is_larger_than_pixel = axes.get_window_extent().width > 0.99 * array.shape[1]
     return axes.imshow(
         array,
         extent=(*axes.get_xlim(), *axes.get_ylim()),
         origin="lower",
         aspect="equal",
-        interpolation="nearest" if larger_than_pixel else "antialiased",
-        interpolation_stage="data" if larger_than_pixel else None,  # colours of all pixels take 80 MB
-        **colours,
+        interpolation="nearest" if is_larger_than_pixel else "antialiased",
+        interpolation_stage="data" if is_larger_than_pixel else None,  # colors of all pixels need 80 MB
+        **options,
     )
 
 
@@ -204,65 +223,65 @@ def plot_side_by_side(
     ego_outline_m: NDArray[np.floating] | None = None,
     sensors: Mapping[str, Sequence[SensorView]] | None = None,
     show_directions: bool = True,
-    unobserved_label: str = NEVER_PROBED,
+    unobserved_label: str = UNOBSERVED,
     opacity: Mapping[str, Tensor] | None = None,
 ) -> Figure:
-    """Draw arrays over one grid, seen from above, with one colour bar: x forward to the right, y left upwards.
+    """Plot arrays over one grid in bird's-eye view with one color bar: x forward to the right, y left upwards.
 
     Args:
-        values: (Y, X) numbers in the unit of `scale`, by their headings, which may be empty. NaN is unknown and drawn
-            hatched grey; infinity has a colour of its own.
-        grid: The cells.
-        scale: What the colours of all of them mean.
+        values: Heading, which may be empty -> (Y, X) numbers in the unit of `scale`. NaN is hatched gray, infinity has
+            its own color.
+        grid: Grid of the cells.
+        scale: Color scale of all arrays.
         title: First line.
         subtitle: Second line, smaller.
-        ego_outline_m: (K, 2) corners x, y of the ego in the vehicle frame in metres.
-        sensors: What to mark, by the headings.
-        show_directions: Whether to draw directions and fields of view; else the places of the sensors only.
-        unobserved_label: Why a cell is, for the legend.
-        opacity: (Y, X) in [0, 1] by the headings, less where less of the surface is seen in a step; all cells alike if
-            not given.
+        ego_outline_m: (K, 2) corners x, y of the ego vehicle in the vehicle frame in meters.
+        sensors: Heading -> sensors to plot.
+        show_directions: Whether to plot directions and fields of view of the sensors, not only their positions.
+        unobserved_label: Label of unobserved cells in the legend.
+        opacity: Heading -> (Y, X) in [0, 1], less where less surface is visible in a frame; None for opaque cells.
 
     Returns:
-        A figure of its own, outside pyplot: `figure.savefig(path)`, or hand it to a logger.
+        A new figure outside pyplot, for `figure.savefig(path)` or a logger.
 
     Raises:
         ValueError: An array or the outline has another shape.
 
     Example:
         >>> import torch
-        >>> grid = BevGrid(x=(0.0, 2.0), y=(-1.0, 1.0), cell=1.0)
+        >>> grid = BevGrid(x_m=(0.0, 2.0), y_m=(-1.0, 1.0), cell_m=1.0)
         >>> change = torch.tensor([[0.5, -0.5], [float("nan"), 0.0]])
         >>> scale = ColorScale("change of the blind spot radius", "m", "PuOr", -1.0, 1.0)
         >>> plot_side_by_side({"": change}, grid, scale, title="Rig B against rig A").axes[0].get_xlabel()
         'x forward (m)'
     """
-    for name, given in (("values", values), ("opacity", opacity or {})):
-        for one in given.values():
-            if tuple(one.shape) != grid.shape[1:]:
-                wanted = f"shape {grid.shape[1:]} is needed, as of a band of the grid"
-                raise ValueError(f"{name}: {wanted}; got {tuple(one.shape)}")
+    opacity = opacity or {}
+    for name, tensors in (("values", values), ("opacity", opacity)):
+        for tensor in tensors.values():
+            if tuple(tensor.shape) != grid.shape[1:]:
+                raise ValueError(f"{name}: got shape {tuple(tensor.shape)}; give that of a band, {grid.shape[1:]}")
     arrays = {name: to_array(value) for name, value in values.items()}
-    opaque = {name: to_array(value) for name, value in (opacity or {}).items()}
     sheets = create_sheets(grid, len(arrays))
-    images = [
-        plot_cells(sheet.axes, array, scale, opacity=opaque.get(name))
-        for sheet, (name, array) in zip(sheets, arrays.items(), strict=True)
-    ]
-    together = np.stack(list(arrays.values()))
-    plot_color_bar(sheets[0], images[0], together, scale)
-    entries = build_cell_legend(together, unobserved_label)
-    if opacity:
-        entries.append(Line2D([], [], linestyle="none", label=PALER))  # words only, as it is about every colour
+    images = []
+    for sheet, (name, array) in zip(sheets, arrays.items(), strict=True):
+        cell_opacity = to_array(opacity[name]) if name in opacity else None
+        images.append(plot_cells(sheet.axes, array, scale, opacity=cell_opacity))
+    stacked = np.stack(list(arrays.values()))
+    plot_color_bar(sheets[0], images[0], stacked, scale)
+    entries = build_cell_legend(stacked, unobserved_label)
+    if opacity:  # a line of text without a symbol, since it concerns all colors
+        label = "paler: less visible surface per frame than open ground"
+        entries.append(Line2D([], [], linestyle="none", label=label))
     for sheet, name in zip(sheets, values, strict=True):
         if name:
             write_heading(sheet.axes, name)
         if ego_outline_m is not None:
             entries += plot_ego(sheet.axes, ego_outline_m)
-        own = (sensors or {}).get(name, ())
-        entries += (
-            plot_sensors(sheet, own, show_names=not name) if show_directions else plot_sensor_positions(sheet, own)
-        )
+        views = (sensors or {}).get(name, ())
+        if show_directions:
+            entries += plot_sensors(sheet, views, show_names=not name)
+        else:
+            entries += plot_sensor_positions(sheet, views)
     write_title(sheets[0].axes, title, subtitle, lift_points=HEADING_POINTS if any(arrays) else 0.0)
     write_legend(find_lower_left(sheet.axes for sheet in sheets), entries, sheets[0].legend_columns)
     fit_paper(sheets[0].figure)
@@ -270,5 +289,12 @@ def plot_side_by_side(
 
 
 def to_array(values: Tensor) -> NDArray[np.float64]:
-    """Numbers of cells as matplotlib takes them."""
+    """Convert numbers of cells for matplotlib.
+
+    Args:
+        values: Tensor on any device.
+
+    Returns:
+        float64 array of the same shape.
+    """
     return values.detach().cpu().double().numpy()

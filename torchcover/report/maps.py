@@ -1,4 +1,4 @@
-"""All maps of a run: a figure for each quantity and height band, whatever was measured."""
+"""Maps of a run: a figure for each quantity and height band, and differences between rigs."""
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -27,7 +27,6 @@ from torchcover.report.map_layers import (
 from torchcover.report.number_format import capitalize, format_height_band
 from torchcover.report.overlay import SensorView
 
-MAX_FILE_NAME = 48
 NamedFigure = tuple[str, Figure]
 
 
@@ -39,32 +38,30 @@ def plot_maps(
     vehicle: str | None = None,
     quantity_key: str | None = None,
 ) -> Iterator[NamedFigure]:
-    """Draw what was measured in every height band, for one rig or for several.
+    """Plot all quantities in all height bands, for one rig or for several side by side.
 
-    Results over the visible surface are drawn as the ratio of each cell, or of a larger square where points are few;
-    paler where little surface is seen in a step. The bands of a quantity share their colours, so that they can be
-    compared by eye, and so do the rigs, which lie side by side. For every rig but the first there is a figure of its
-    difference to the first too; the differences of a quantity share their colours. Maps show what was asked for and is
-    known; what is near the ego has figures of its own, on which nothing but the sensors' places lies over the cells.
+    Averages over the visible surface are plotted for each cell, or for a larger square where points are few; cells with
+    little visible surface are paler. All bands and rigs of a quantity share a color scale. Each rig but the first has
+    figures of its difference to the first, which share a color scale too. Maps are cropped to the observed part of the
+    regions; the surroundings of the ego vehicle have figures of their own without sensor directions.
 
     Args:
-        coverages: What `CoverageMetric.compute` returned, by the name of the rig; several from the same frames.
-        ego_outline_m: (K, 2) corners x, y of the ego in the vehicle frame in metres.
-        sensors: What to mark, by the name of the rig.
-        vehicle: What the ego is called, for the titles.
-        quantity_key: Key of the only quantity to draw; all if not given.
+        coverages: Name of the rig -> result of `CoverageMetric.compute`; several must be paired.
+        ego_outline_m: (K, 2) corners x, y of the ego vehicle in the vehicle frame in meters.
+        sensors: Name of the rig -> sensors to plot.
+        vehicle: Name of the ego vehicle for the titles.
+        quantity_key: Key of the only quantity to plot; None plots all.
 
     Returns:
-        Pairs, drawn one by one, of a name that is fit for a file and a figure: `radius_m_ground`,
-        `detection_area_0.4m_obstacle`, `difference_radius_m_ground_RIG_minus_FIRST`, `near_radius_m`.
+        Iterator over file stems and figures, plotted one by one: `radius_m_ground`, `detection_area_0.4m_obstacle`,
+        `difference_radius_m_ground_RIG_minus_FIRST`, `near_field_radius_m`.
 
     Raises:
-        ValueError: Several coverages that are not paired, as in `check_paired`; while drawing, an outline of another
-            shape.
+        ValueError: Coverages are not paired (`check_paired`), or the outline has another shape.
 
     Example:
         >>> from torchcover.coverage import CoverageMetric
-        >>> metric = CoverageMetric(BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=1.0, heights={"all": (-1.0, 1.0)}))
+        >>> metric = CoverageMetric(BevGrid(x_m=(0.0, 2.0), y_m=(0.0, 1.0), cell_m=1.0, heights={"all": (-1.0, 1.0)}))
         >>> metric.update(torch.zeros(1, 3), torch.tensor([[0.3, 0.0, 0.0]]))
         >>> [name for name, _ in plot_maps({"my rig": metric.compute()})]
         ['radius_m_all', 'detection_0.4m_all']
@@ -72,37 +69,43 @@ def plot_maps(
     if len(coverages) > 1:
         check_paired(coverages)
     coverages = {name: downsample_coverage(coverage) for name, coverage in coverages.items()}
-    return _figures(coverages, _Setting(ego_outline_m, sensors or {}, vehicle), quantity_key)
+    return _plot_layers(coverages, _MapContext(ego_outline_m, sensors or {}, vehicle), quantity_key)
 
 
 def plot_band_maps(coverage: Coverage) -> Iterator[NamedFigure]:
-    """Draw what was measured, the bands of a quantity side by side: `radius_m`, `detection_0.4m`, ...
+    """Plot the bands of each quantity side by side: `radius_m`, `detection_0.4m`, ...
 
     Args:
-        coverage: What `CoverageMetric.compute` returned.
+        coverage: Result of `CoverageMetric.compute`.
+
+    Returns:
+        Iterator over keys of quantities and figures.
     """
     headings = [f"{name}, {format_height_band(coverage.grid, name)}" for name in coverage.grid.heights]
-    shown = find_observed_window(coverage)
-    for whole in build_map_layers({"": coverage}):
-        subject = _within(whole, shown)
+    window = find_observed_window(coverage)
+    for grid_layer in build_map_layers({"": coverage}):
+        layer = _crop_layer(grid_layer, window)
         figure = plot_side_by_side(
-            dict(zip(headings, subject.values[""], strict=True)),
-            shown.grid,
-            subject.scale,
-            title=capitalize(subject.quantity.title),
-            subtitle=subject.conditions,
-            unobserved_label=subject.unobserved_label,
-            opacity=None if subject.opacity is None else dict(zip(headings, subject.opacity, strict=True)),
+            dict(zip(headings, layer.values[""], strict=True)),
+            window.grid,
+            layer.scale,
+            title=capitalize(layer.quantity.title),
+            subtitle=layer.conditions,
+            unobserved_label=layer.unobserved_label,
+            opacity=None if layer.opacity is None else dict(zip(headings, layer.opacity, strict=True)),
         )
-        yield subject.quantity.key, figure
+        yield layer.quantity.key, figure
 
 
 def write_figures(figures: Iterable[NamedFigure], folder: str | Path) -> list[Path]:
     """Write figures as PNG files, one after the other.
 
     Args:
-        figures: Their names without suffix, and they: what `plot_maps` gives.
-        folder: Where to write; made if it does not exist.
+        figures: File stems and figures, as from `plot_maps`.
+        folder: Folder of the files; it is created if it does not exist.
+
+    Returns:
+        Paths of the files.
     """
     paths = []
     for name, figure in figures:
@@ -112,7 +115,10 @@ def write_figures(figures: Iterable[NamedFigure], folder: str | Path) -> list[Pa
 
 
 def build_file_stems(names: Sequence[str]) -> list[str]:
-    """A name for each that every file system takes and that no other has.
+    """Build distinct file names that every file system accepts, of at most 48 characters without suffix.
+
+    Args:
+        names: Names of rigs, bands or objectives.
 
     Example:
         >>> build_file_stems(["low/high", "low high", "ground"])
@@ -120,129 +126,139 @@ def build_file_stems(names: Sequence[str]) -> list[str]:
     """
     stems: list[str] = []
     for number, name in enumerate(names):
-        stem = re.sub(r"[^\w.-]+", "_", name)[:MAX_FILE_NAME]
-        while stem.lower() in (other.lower() for other in stems):
+        stem = re.sub(r"[^\w.-]+", "_", name)[:48]
+        while stem.lower() in [earlier.lower() for earlier in stems]:
             stem += f"_{number}"
         stems.append(stem)
     return stems
 
 
 @dataclass(frozen=True)
-class _Setting:
+class _MapContext:
+    """Ego vehicle and sensors of all maps of a run."""
+
     ego_outline_m: NDArray[np.floating] | None
     sensors: Mapping[str, Sequence[SensorView]]
     vehicle: str | None
 
-    def told(self, subject: MapLayer) -> MapLayer:
-        """With what carried the rigs."""
+    def add_vehicle(self, layer: MapLayer) -> MapLayer:
+        """Add the name of the vehicle to the conditions of a layer."""
         if self.vehicle is None:
-            return subject
-        return replace(subject, conditions=f"on {self.vehicle}, {subject.conditions}")
+            return layer
+        return replace(layer, conditions=f"on {self.vehicle}, {layer.conditions}")
 
 
 @dataclass(frozen=True)
 class _Band:
-    number: int
+    """Height band: index in the grid, name, file stem and description of its bounds."""
+
+    index: int
     name: str
     stem: str
-    z: str
+    bounds: str
 
-    def subtitle(self, subject: MapLayer) -> str:
-        """Where it is, and under which conditions a subject was measured."""
-        return f"{self.z}; {subject.conditions}"
+    def format_subtitle(self, layer: MapLayer) -> str:
+        """Format the bounds of the band and the conditions of a layer."""
+        return f"{self.bounds}; {layer.conditions}"
 
-    def opacity(self, subject: MapLayer) -> Tensor | None:
-        """(Y, X) that of a subject in this band."""
-        return None if subject.opacity is None else subject.opacity[self.number]
+    def get_opacity(self, layer: MapLayer) -> Tensor | None:
+        """Return the (Y, X) opacity of a layer in this band."""
+        return None if layer.opacity is None else layer.opacity[self.index]
 
 
-def _figures(coverages: Mapping[str, Coverage], setting: _Setting, layer: str | None) -> Iterator[NamedFigure]:
-    first, ego = next(iter(coverages.values())), setting.ego_outline_m
-    named, shown = (
-        zip(first.grid.heights, build_file_stems(list(first.grid.heights)), strict=True),
-        find_observed_window(first, ego),
-    )
-    bands = [_Band(at, name, stem, format_height_band(first.grid, name)) for at, (name, stem) in enumerate(named)]
-    near = None if ego is None else find_near_field_window(first.grid, ego)
-    for whole in map(setting.told, build_map_layers(coverages)):
-        if layer not in (None, whole.quantity.key):
+def _plot_layers(
+    coverages: Mapping[str, Coverage], context: _MapContext, quantity_key: str | None
+) -> Iterator[NamedFigure]:
+    grid, ego_outline_m = next(iter(coverages.values())).grid, context.ego_outline_m
+    window = find_observed_window(next(iter(coverages.values())), ego_outline_m)
+    near_window = None if ego_outline_m is None else find_near_field_window(grid, ego_outline_m)
+    bands = []
+    for index, (name, stem) in enumerate(zip(grid.heights, build_file_stems(list(grid.heights)), strict=True)):
+        bands.append(_Band(index, name, stem, format_height_band(grid, name)))
+    for grid_layer in build_map_layers(coverages):
+        if quantity_key not in (None, grid_layer.quantity.key):
             continue
-        subject = _within(whole, shown)
-        yield from _draw_rigs(subject, shown.grid, bands, setting)
-        yield from _draw_differences(subject, shown.grid, bands, setting)
-        if near is not None:
-            around = _within(whole, near)
-            own = build_color_scale(around.quantity, torch.stack(list(around.values.values())))
-            yield _draw_near(replace(around, scale=own), near.grid, bands, setting)
+        described_layer = context.add_vehicle(grid_layer)
+        layer = _crop_layer(described_layer, window)
+        yield from _plot_rigs(layer, window.grid, bands, context)
+        yield from _plot_differences(layer, window.grid, bands, context)
+        if near_window is not None:
+            near_layer = _crop_layer(described_layer, near_window)
+            scale = build_color_scale(near_layer.quantity, torch.stack(list(near_layer.values.values())))
+            yield _plot_near_field(replace(near_layer, scale=scale), near_window.grid, bands, context)
 
 
-def _within(subject: MapLayer, shown: Window) -> MapLayer:
-    values = {rig: shown.crop(each) for rig, each in subject.values.items()}
-    return replace(subject, values=values, opacity=None if subject.opacity is None else shown.crop(subject.opacity))
+def _crop_layer(layer: MapLayer, window: Window) -> MapLayer:
+    values = {rig: window.crop(rig_values) for rig, rig_values in layer.values.items()}
+    return replace(layer, values=values, opacity=None if layer.opacity is None else window.crop(layer.opacity))
 
 
-def _draw_rigs(subject: MapLayer, grid: BevGrid, bands: Sequence[_Band], setting: _Setting) -> Iterator[NamedFigure]:
-    headings = {rig: rig if len(subject.values) > 1 else "" for rig in subject.values}
+def _plot_rigs(layer: MapLayer, grid: BevGrid, bands: Sequence[_Band], context: _MapContext) -> Iterator[NamedFigure]:
+    headings = {rig: rig if len(layer.values) > 1 else "" for rig in layer.values}
     for band in bands:
-        opacity = band.opacity(subject)
+        opacity = band.get_opacity(layer)
         figure = plot_side_by_side(
-            {headings[rig]: values[band.number] for rig, values in subject.values.items()},
+            {headings[rig]: values[band.index] for rig, values in layer.values.items()},
             grid,
-            subject.scale,
-            title=f"{capitalize(subject.quantity.title)}, {band.name}",
-            subtitle=band.subtitle(subject),
-            ego_outline_m=setting.ego_outline_m,
-            sensors={heading: setting.sensors.get(rig, ()) for rig, heading in headings.items()},
-            unobserved_label=subject.unobserved_label,
+            layer.scale,
+            title=f"{capitalize(layer.quantity.title)}, {band.name}",
+            subtitle=band.format_subtitle(layer),
+            ego_outline_m=context.ego_outline_m,
+            sensors={heading: context.sensors.get(rig, ()) for rig, heading in headings.items()},
+            unobserved_label=layer.unobserved_label,
             opacity=None if opacity is None else dict.fromkeys(headings.values(), opacity),
         )
-        yield f"{subject.quantity.key}_{band.stem}", figure
+        yield f"{layer.quantity.key}_{band.stem}", figure
 
 
-def _draw_near(subject: MapLayer, grid: BevGrid, bands: Sequence[_Band], setting: _Setting) -> NamedFigure:
-    several = len(subject.values) > 1
-    panels = {
-        f"{rig}, {band.name}, {band.z}" if several else f"{band.name}, {band.z}": (rig, band)
-        for rig in subject.values
-        for band in bands
-    }
-    opacity = {heading: band.opacity(subject) for heading, (_, band) in panels.items()}
-    figure = plot_side_by_side(
-        {heading: subject.values[rig][band.number] for heading, (rig, band) in panels.items()},
-        grid,
-        subject.scale,
-        title=f"{capitalize(subject.quantity.title)}, near the ego",
-        subtitle=subject.conditions,
-        ego_outline_m=setting.ego_outline_m,
-        sensors={heading: setting.sensors.get(rig, ()) for heading, (rig, _) in panels.items()},
-        show_directions=False,
-        unobserved_label=subject.unobserved_label,
-        opacity={heading: each for heading, each in opacity.items() if each is not None},
-    )
-    return f"near_{subject.quantity.key}", figure
-
-
-def _draw_differences(
-    subject: MapLayer, grid: BevGrid, bands: Sequence[_Band], setting: _Setting
-) -> Iterator[NamedFigure]:
-    (first, expected), *others = subject.values.items()
-    if not others:
-        return
-    differences = [compute_difference(values, expected) for _, values in others]
-    scale = build_difference_scale(subject.quantity, torch.stack(differences))
-    first_stem, *stems = build_file_stems(list(subject.values))
-    for (rig, _), stem, change in zip(others, stems, differences, strict=True):
+def _plot_near_field(layer: MapLayer, grid: BevGrid, bands: Sequence[_Band], context: _MapContext) -> NamedFigure:
+    values, sensors, opacity = {}, {}, {}
+    for rig, rig_values in layer.values.items():
         for band in bands:
-            opacity = band.opacity(subject)
+            heading = f"{band.name}, {band.bounds}"
+            if len(layer.values) > 1:
+                heading = f"{rig}, {heading}"
+            values[heading] = rig_values[band.index]
+            sensors[heading] = context.sensors.get(rig, ())
+            band_opacity = band.get_opacity(layer)
+            if band_opacity is not None:
+                opacity[heading] = band_opacity
+    figure = plot_side_by_side(
+        values,
+        grid,
+        layer.scale,
+        title=f"{capitalize(layer.quantity.title)}, two vehicle lengths around the ego vehicle",
+        subtitle=layer.conditions,
+        ego_outline_m=context.ego_outline_m,
+        sensors=sensors,
+        show_directions=False,
+        unobserved_label=layer.unobserved_label,
+        opacity=opacity,
+    )
+    return f"near_field_{layer.quantity.key}", figure
+
+
+def _plot_differences(
+    layer: MapLayer, grid: BevGrid, bands: Sequence[_Band], context: _MapContext
+) -> Iterator[NamedFigure]:
+    (first, baseline), *compared = layer.values.items()
+    if not compared:
+        return
+    differences = [compute_difference(values, baseline) for _, values in compared]
+    scale = build_difference_scale(layer.quantity, torch.stack(differences))
+    first_stem, *stems = build_file_stems(list(layer.values))
+    for (rig, _), stem, difference in zip(compared, stems, differences, strict=True):
+        for band in bands:
+            opacity = band.get_opacity(layer)
             figure = plot_side_by_side(
-                # What is infinite takes the last colour: it is better or worse, not a step without a point.
-                {"": change[band.number].clamp(2 * scale.low, 2 * scale.high)},
+                # An infinite difference gets the last color, not that of frames without points.
+                {"": difference[band.index].clamp(2 * scale.low, 2 * scale.high)},
                 grid,
                 scale,
-                title=f"{rig} minus {first}: {subject.quantity.title}, {band.name}",
-                subtitle=f"blue: {rig} is better, red: {first} is better; {band.subtitle(subject)}",
-                ego_outline_m=setting.ego_outline_m,
-                unobserved_label=subject.unobserved_label,
+                title=f"{rig} minus {first}: {layer.quantity.title}, {band.name}",
+                subtitle=f"blue: {rig} is better, red: {first} is better; {band.format_subtitle(layer)}",
+                ego_outline_m=context.ego_outline_m,
+                unobserved_label=layer.unobserved_label,
                 opacity=None if opacity is None else {"": opacity},
             )
-            yield f"difference_{subject.quantity.key}_{band.stem}_{stem}_minus_{first_stem}", figure
+            yield f"difference_{layer.quantity.key}_{band.stem}_{stem}_minus_{first_stem}", figure

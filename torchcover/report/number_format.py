@@ -1,7 +1,7 @@
-"""Numbers in plain words: how they are rounded, and what tables and maps say in the same way."""
+"""Numbers as text: rounding, units and intervals, the same in tables, maps and sentences."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Literal, NamedTuple
 
@@ -10,9 +10,15 @@ from torchcover.estimation import ROUND_OFF, Difference, Number, Quantity, Unit
 
 
 class DisplayUnit(NamedTuple):
-    """How numbers of a unit, and differences of two, are shown: `factor` times what they are, up to the `max_value`.
+    """Unit in which numbers are shown.
 
-    Without an error a number has so many decimals, four digits for None, and never more than anybody can use.
+    Args:
+        name: Name of the unit.
+        difference_name: Name of the unit of differences.
+        factor: Factor from the number to the shown number.
+        decimals: Decimals of a number without standard error; None shows four digits.
+        max_decimals: Maximum number of decimals.
+        max_value: Maximum of the shown number, such as 100 %.
     """
 
     name: str
@@ -33,7 +39,10 @@ _UNITS: Mapping[Unit, DisplayUnit] = MappingProxyType(
 
 
 def get_display_unit(unit: Unit) -> DisplayUnit:
-    """How numbers of a unit are shown: as they are where nothing else is known of it.
+    """Return the unit in which numbers of a unit are shown; unknown units are shown as they are.
+
+    Args:
+        unit: Unit of a quantity.
 
     Example:
         >>> get_display_unit("share").name, get_display_unit("nats").name
@@ -43,10 +52,12 @@ def get_display_unit(unit: Unit) -> DisplayUnit:
 
 
 class RoundedNumber(NamedTuple):
-    """A number as a reader sees it.
+    """Number as it is shown.
 
-    `value`: in the unit that is shown: metres or percent; `decimals`: how many are shown; `relation`: "<" or ">" for a
-    number that is beyond `value`, but would be rounded to an end of the scale.
+    Args:
+        value: Rounded value in the shown unit.
+        decimals: Number of decimals.
+        relation: "<" or ">" if rounding would move the number onto an end of the scale; then `value` is the bound.
     """
 
     value: float
@@ -55,65 +66,74 @@ class RoundedNumber(NamedTuple):
 
 
 def round_number(number: float, error: float, unit: Unit) -> RoundedNumber:
-    """Round a number: to the two digits of its error, or to the usual decimals if it has none.
+    """Round a number to the two digits of its error, or to the default decimals without an error.
 
-    `number`: in its unit; not NaN; `error`: its standard error; NaN for none; `unit`: that of its quantity.
+    Args:
+        number: Number in its unit, not NaN.
+        error: Standard error; NaN if unknown.
+        unit: Unit of the quantity.
     """
-    shown = get_display_unit(unit)
-    value = shown.factor * number
+    display_unit = get_display_unit(unit)
+    value = display_unit.factor * number
     if math.isinf(value):
         return RoundedNumber(value, 0)
     if error > ROUND_OFF:
-        error *= shown.factor
-        rounded_value = _round(value, count_decimals(error, shown.max_decimals))
-        if round_error(error, shown.max_decimals).relation == "<":
-            return _not_to_an_end(rounded_value, value, shown, shown.max_decimals)
-        return rounded_value
-    if value in (0.0, shown.max_value) and math.isfinite(shown.max_value):
+        error *= display_unit.factor
+        rounded = _round(value, count_decimals(error, display_unit.max_decimals))
+        if round_error(error, display_unit.max_decimals).relation == "<":
+            return _keep_off_ends(rounded, value, display_unit, display_unit.max_decimals)
+        return rounded
+    if value in (0.0, display_unit.max_value) and math.isfinite(display_unit.max_value):
         return RoundedNumber(value, 0)
-    decimals = _decimals(value, shown)
-    rounded_value = _round(value, decimals)
-    # A share is told from none; a length below half a centimetre is none.
-    return _not_to_an_end(rounded_value, value, shown, decimals) if math.isfinite(shown.max_value) else rounded_value
+    decimals = _get_default_decimals(value, display_unit)
+    rounded = _round(value, decimals)
+    # A small share is not shown as 0; a length below half a centimeter is.
+    return _keep_off_ends(rounded, value, display_unit, decimals) if math.isfinite(display_unit.max_value) else rounded
 
 
 def round_error(error: float, max_decimals: int) -> RoundedNumber:
-    """Round an error > 0 to two digits.
+    """Round a standard error to two digits.
 
-    `error`: in the unit that is shown; `max_decimals`: no more decimals than these; what they would round to nothing is
-    less than the least.
+    Args:
+        error: Standard error > 0 in the shown unit.
+        max_decimals: Maximum number of decimals; an error that they round to 0 is shown as "<" their smallest number.
     """
-    least = 10.0**-max_decimals
-    if error < least / 2:
-        return RoundedNumber(least, max_decimals, "<")
+    smallest = 10.0**-max_decimals
+    if error < smallest / 2:
+        return RoundedNumber(smallest, max_decimals, "<")
     return _round(error, count_decimals(error, max_decimals))
 
 
 def count_decimals(error: float, max_decimals: int) -> int:
-    """How many decimals show two digits of an error > 0, but at most `max_decimals`.
+    """Count the decimals that show two digits of a standard error.
+
+    Args:
+        error: Standard error > 0.
+        max_decimals: Maximum number of decimals.
 
     Example:
-        >>> [count_decimals(error, most=4) for error in (123.0, 1.23, 0.0123, 0.0996, 1e-9)]
+        >>> [count_decimals(error, max_decimals=4) for error in (123.0, 1.23, 0.0123, 0.0996, 1e-9)]
         [0, 1, 3, 2, 4]
     """
-    # Rounding to two digits may add one in front: 0.0996 is 0.10.
+    # Rounding to two digits may add a leading digit: 0.0996 becomes 0.10.
     exponent = int(f"{error:.1e}".split("e")[1])
     return min(max_decimals, max(0, 1 - exponent))
 
 
-def _decimals(value: float, shown: DisplayUnit) -> int:
-    if shown.decimals is not None:
-        return shown.decimals
-    return min(shown.max_decimals, max(0, 3 - math.floor(math.log10(abs(value))))) if value else 0
+def _get_default_decimals(value: float, display_unit: DisplayUnit) -> int:
+    if display_unit.decimals is not None:
+        return display_unit.decimals
+    return min(display_unit.max_decimals, max(0, 3 - math.floor(math.log10(abs(value))))) if value else 0
 
 
-def _not_to_an_end(number: RoundedNumber, value: float, shown: DisplayUnit, decimals: int) -> RoundedNumber:
-    least = 10.0**-decimals
-    if value < shown.max_value == number.value:
-        return RoundedNumber(float(f"{shown.max_value - least:.{decimals}f}"), decimals, ">")
-    if value > 0 == number.value:
-        return RoundedNumber(least, decimals, "<")
-    return number
+def _keep_off_ends(rounded: RoundedNumber, value: float, display_unit: DisplayUnit, decimals: int) -> RoundedNumber:
+    """Replace a number that was rounded to 0 or to the maximum by a bound."""
+    smallest = 10.0**-decimals
+    if value < display_unit.max_value == rounded.value:
+        return RoundedNumber(float(f"{display_unit.max_value - smallest:.{decimals}f}"), decimals, ">")
+    if value > 0 == rounded.value:
+        return RoundedNumber(smallest, decimals, "<")
+    return rounded
 
 
 def _round(value: float, decimals: int) -> RoundedNumber:
@@ -121,16 +141,17 @@ def _round(value: float, decimals: int) -> RoundedNumber:
 
 
 UNKNOWN = "unknown"
-# An end of an interval beyond is no number for anybody.
-ENDLESS = 1e9
 
 
 def format_number(number: Number) -> str:
-    """A number and its 95 % interval, without the unit.
+    """Format a number with its 95 % confidence interval, without unit.
+
+    Args:
+        number: The number.
 
     Returns:
-        As `format_value` has it; with an error in as many decimals as its two digits need, of lengths and shares at most
-        four and three, and with the interval behind it if there is one.
+        The number as from `format_value`, or with a standard error in the decimals of its two digits, at most four for
+        lengths and three for shares; followed by the interval if there is one.
 
     Example:
         >>> radius = Quantity("radius_m", "mean blind spot radius", "m", lower_is_better=True)
@@ -142,42 +163,58 @@ def format_number(number: Number) -> str:
     unit = number.quantity.unit
     if not math.isfinite(number.value):
         return format_value(number.value, unit)
-    found = round_number(number.value, number.error, unit)
-    return _words(found) + _interval_words(number, found.decimals)
+    rounded = round_number(number.value, number.error, unit)
+    return _format_rounded(rounded) + _format_interval(number, rounded.decimals, is_signed=False)
 
 
 def format_value(value: float, unit: Unit) -> str:
-    """A number alone, without the unit.
+    """Format a number without interval and unit.
 
-    `value`: in its unit; `unit`: its unit. Returns a length with two decimals, a share in percent with one, what has
-    another unit with four digits. A share is never rounded to 0 or 100. "unknown" for NaN, "infinite" for infinity.
+    Args:
+        value: Number in its unit.
+        unit: Unit of the quantity.
+
+    Returns:
+        A length with two decimals, a share in percent with one, any other unit with four digits. A share is never
+        rounded to 0 or 100. "unknown" for NaN, "infinite" for infinity.
     """
     if math.isnan(value):
         return UNKNOWN
-    return "infinite" if math.isinf(value) else _words(round_number(value, math.nan, unit))
+    return "infinite" if math.isinf(value) else _format_rounded(round_number(value, math.nan, unit))
 
 
 def format_percent(share: float) -> str:
-    """A share in percent that rounds neither something to nothing nor nearly all to all.
+    """Format a share in percent that is never rounded to 0 or 100.
+
+    Args:
+        share: Share in [0, 1].
 
     Example:
-        >>> [percent(share) for share in (0.0, 0.0001, 0.123, 0.9999, 1.0, float("nan"))]
+        >>> [format_percent(share) for share in (0.0, 0.0001, 0.123, 0.9999, 1.0, float("nan"))]
         ['0', '<0.1', '12.3', '>99.9', '100', 'unknown']
     """
     return format_value(share, "share")
 
 
-def format_square_meters(m2: float) -> str:
-    """An area with one decimal that rounds nothing to none."""
-    if math.isnan(m2):
+def format_square_meters(area_m2: float) -> str:
+    """Format an area with one decimal that is never rounded to 0.
+
+    Args:
+        area_m2: Area in square meters.
+    """
+    if math.isnan(area_m2):
         return UNKNOWN
-    if m2 < 0.05:
-        return "<0.1" if m2 > 0 else "0"
-    return f"{m2:,.1f}"
+    if area_m2 < 0.05:
+        return "<0.1" if area_m2 > 0 else "0"
+    return f"{area_m2:,.1f}"
 
 
 def format_error(error: float, unit: Unit) -> str:
-    """A standard error alone, with two digits; "unknown" for NaN.
+    """Format a standard error with two digits; "unknown" for NaN.
+
+    Args:
+        error: Standard error in its unit.
+        unit: Unit of the quantity.
 
     Example:
         >>> format_error(0.0123, "m"), format_error(0.0123, "share"), format_error(0.0, "m")
@@ -185,12 +222,17 @@ def format_error(error: float, unit: Unit) -> str:
     """
     if math.isnan(error):
         return UNKNOWN
-    shown = get_display_unit(unit)
-    return _words(round_error(shown.factor * error, shown.max_decimals)) if error > ROUND_OFF else "0"
+    display_unit = get_display_unit(unit)
+    if error <= ROUND_OFF:
+        return "0"
+    return _format_rounded(round_error(display_unit.factor * error, display_unit.max_decimals))
 
 
 def format_difference(difference: Difference) -> str:
-    """A difference and its 95 % interval, with signs: lengths in metres, shares in percentage points.
+    """Format a difference with its 95 % confidence interval and signs: lengths in meters, shares in percentage points.
+
+    Args:
+        difference: The difference.
 
     Example:
         >>> radius = Quantity("radius_m", "mean blind spot radius", "m", lower_is_better=True)
@@ -203,65 +245,86 @@ def format_difference(difference: Difference) -> str:
         return UNKNOWN
     if math.isinf(difference.value):
         return "+infinite" if difference.value > 0 else "-infinite"
-    unit = difference.quantity.unit
-    shown = get_display_unit(unit)
-    value, error = shown.factor * difference.value, shown.factor * difference.error
-    inexact = error > 100 * ROUND_OFF
-    decimals = count_decimals(error, shown.max_decimals) if inexact else _decimals(value, shown)
-    words = _signed(value, decimals) if inexact or value else "0"
-    return words + (_interval_words(difference, decimals, _signed) if inexact else "")
+    display_unit = get_display_unit(difference.quantity.unit)
+    value, error = display_unit.factor * difference.value, display_unit.factor * difference.error
+    if error > 100 * ROUND_OFF:
+        decimals = count_decimals(error, display_unit.max_decimals)
+        return _format_signed(value, decimals) + _format_interval(difference, decimals, is_signed=True)
+    return _format_signed(value, _get_default_decimals(value, display_unit)) if value else "0"
 
 
 def format_heading(quantity: Quantity) -> str:
-    """What a quantity is called, with its unit.
+    """Format the title of a quantity with its unit.
+
+    Args:
+        quantity: The quantity.
 
     Example:
-        >>> heading(Quantity("radius_m", "mean blind spot radius", "m", lower_is_better=True))
+        >>> format_heading(Quantity("radius_m", "mean blind spot radius", "m", lower_is_better=True))
         'mean blind spot radius (m)'
     """
     return f"{quantity.title} ({get_display_unit(quantity.unit).name})"
 
 
 def format_difference_heading(quantity: Quantity) -> str:
-    """What its differences are called, with their unit."""
+    """Format the title of a quantity with the unit of its differences.
+
+    Args:
+        quantity: The quantity.
+    """
     return f"{quantity.title} ({get_display_unit(quantity.unit).difference_name})"
 
 
 def capitalize(text: str) -> str:
-    """With a capital at the beginning, and the rest as it is."""
+    """Capitalize the first character; the others stay as they are.
+
+    Args:
+        text: The text.
+    """
     return text[:1].upper() + text[1:]
 
 
 def format_height_band(grid: BevGrid, band: str) -> str:
-    """The bounds of a height band, as in `z -0.5 to 0.5 m` or `-0.5 to 0.5 m above ground`."""
-    low, high = grid.heights[band]
-    metres = f"{low:g} to {high:g} m"
-    return f"{metres} above ground" if grid.band_frame == "ground" else f"z {metres}"
+    """Format the bounds of a height band, as in `z -0.5 to 0.5 m` or `-0.5 to 0.5 m above ground`.
+
+    Args:
+        grid: Grid with the band.
+        band: Name of the band.
+    """
+    low_m, high_m = grid.heights[band]
+    bounds = f"{low_m:g} to {high_m:g} m"
+    return f"{bounds} above ground" if grid.band_frame == "ground" else f"z {bounds}"
 
 
 def format_resolution(num_frames: int, grid: BevGrid) -> str:
-    """How much was measured and how finely: no number is worth anything without the two."""
-    return f"{num_frames:,} step{'s' * (num_frames != 1)}, cells of {grid.cell_m:g} m"
+    """Format the number of frames and the cell size of a measurement.
+
+    Args:
+        num_frames: Number of frames.
+        grid: The grid.
+    """
+    return f"{num_frames:,} frame{'s' * (num_frames != 1)}, cells of {grid.cell_m:g} m"
 
 
-def _words(number: RoundedNumber) -> str:
+def _format_rounded(number: RoundedNumber) -> str:
     return f"{number.relation}{number.value:.{number.decimals}f}"
 
 
-def _plain(value: float, decimals: int) -> str:
-    return f"{value:.{decimals}f}"
+def _format_signed(value: float, decimals: int) -> str:
+    # A number that is rounded to 0 has no sign. Adding 0 turns -0.0 into 0.0.
+    rounded = round(value, decimals) + 0.0
+    return f"{rounded:{'+' if rounded else ''}.{decimals}f}"
 
 
-def _signed(value: float, decimals: int) -> str:
-    # What rounds to nothing has no sign: a loss too small to be shown is no gain. Adding 0 turns -0.0 into 0.0.
-    shown = round(value, decimals) + 0.0
-    return f"{shown:{'+' if shown else ''}.{decimals}f}"
-
-
-def _interval_words(number: Number | Difference, decimals: int, words: Callable[[float, int], str] = _plain) -> str:
-    """Behind a number, as `  [84.1, 89.0]`; nothing if it has no interval."""
+def _format_interval(number: Number | Difference, decimals: int, *, is_signed: bool) -> str:
+    """Format the interval of a number, as `  [84.1, 89.0]`; empty if it has none."""
     if math.isnan(number.low) or math.isnan(number.high):
         return ""
     factor = get_display_unit(number.quantity.unit).factor
-    low, high = (words(factor * end, decimals) if abs(end) < ENDLESS else "inf" for end in (number.low, number.high))
-    return f"  [{low}, {high}]"
+    texts = []
+    for end in (number.low, number.high):
+        if abs(end) >= 1e9:  # wider than any physical value
+            texts.append("inf")
+        else:
+            texts.append(_format_signed(factor * end, decimals) if is_signed else f"{factor * end:.{decimals}f}")
+    return f"  [{', '.join(texts)}]"

@@ -1,4 +1,4 @@
-"""Renderers: a table as text for a terminal and as Markdown; `RENDERERS` has all formats by name."""
+"""Renderers of a coverage table: text for a terminal and Markdown; `RENDERERS` has all formats by name."""
 
 import errno
 import io
@@ -24,194 +24,224 @@ from torchcover.report.table import CoverageTable
 from torchcover.report.table_layout import BOLD_MARKS, PageTable, TextCell, build_page_tables
 from torchcover.report.table_notes import explain_marks, list_notes, summarize_findings
 
-# Survive files and terminals without bold type.
-SIGNS = {"best": "*", "significant": "!"}
-# More characters than any table has in a line.
-MAX_LINE_CHARS = 10_000
-# Words of headings that are longer may be cut, where there are too many columns.
-LEAST_HEADING_CHARS = 10
+SIGNS = {"best": "*", "significant": "!"}  # marks in text files and terminals without bold type
 
 
 class Terminal(Console):
-    """Rich's console, on which control characters in names of others are shown and not obeyed."""
+    """Console of rich that shows control characters in names instead of executing them."""
 
     def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterator[Segment]:
-        """What is to be printed: our own control codes, such as a cursor's, are segments of their own."""
+        """Render segments, with escaped control characters in text; control codes of rich are separate segments.
+
+        Args:
+            renderable: Object to print.
+            options: Options of rich.
+        """
         for segment in super().render(renderable, options):
             yield segment if segment.control else segment._replace(text=escape_control_chars(segment.text))
 
     def on_broken_pipe(self) -> None:
-        """Raise BrokenPipeError, of which the program makes an exit code; rich would exit with 1."""
+        """Raise BrokenPipeError, which the program turns into an exit code; rich would exit with 1."""
         raise BrokenPipeError(errno.EPIPE, os.strerror(errno.EPIPE))
 
 
 def render_text(table: CoverageTable) -> str:
-    """The table as it is printed where lines may be as long as they like."""
+    """Render a table as text with lines of any length.
+
+    Args:
+        table: The table.
+    """
     file = io.StringIO()
     print_table(table, Terminal(file=file, width=1))
     return file.getvalue()
 
 
 def print_table(table: CoverageTable, console: Console | None = None) -> None:
-    """Print a table, as wide as its numbers need; on a terminal that is narrower, names and intervals are folded.
+    """Print a table as wide as its numbers need; a narrow terminal wraps names and intervals.
 
     Args:
         table: The table.
-        console: Where to; the terminal if not given.
+        console: Console to print to; None takes the terminal.
     """
     console = console or Terminal()
-    folded = table.rigs if console.is_terminal and len(table.rigs) > 1 else ()
-    tables = build_rich_tables(table, console.width if console.is_terminal else None)
-    # Rather lines that are too long than numbers that are cut off; in a file the names are whole too.
-    widths = [max(console.width, compute_min_width([part], folded)) for part in tables]
-    for part, width in zip(tables, widths if console.is_terminal else [max(widths)] * len(tables), strict=True):
+    wrapped_headings = table.rigs if console.is_terminal and len(table.rigs) > 1 else ()
+    rich_tables = build_rich_tables(table, console.width if console.is_terminal else None)
+    # Lines that are too long are better than truncated numbers; in files, names are complete too.
+    widths = [max(console.width, compute_min_width([rich_table], wrapped_headings)) for rich_table in rich_tables]
+    if not console.is_terminal:
+        widths = [max(widths)] * len(rich_tables)
+    for rich_table, width in zip(rich_tables, widths, strict=True):
         console.width = width
-        console.print(part)
+        console.print(rich_table)
 
 
 def build_rich_tables(table: CoverageTable, width: int | None = None) -> list[Table]:
-    """The parts of a table for `rich.console.Console.print`.
+    """Build the tables for `rich.console.Console.print`.
 
-    The best number of each row is bold and marked `*`; a difference that is more than chance is bold and marked `!`.
+    The best number of each row is bold and marked `*`; a significant difference is bold and marked `!`.
 
-    `width`: characters in a line; where more are needed, intervals stand below numbers, and sensors in rows. Returns a
-    table for each part; what they hold under, and what went wrong, is the caption of the last.
+    Args:
+        table: The table.
+        width: Characters per line; in tables that need more, intervals are below numbers and sensors in rows. None
+            allows any width.
+
+    Returns:
+        Tables of rich; the notes are the caption of the last.
     """
-    parts = build_page_tables(table)
-    if width is not None and compute_min_width([*map(_rich_table, parts)]) > width:
-        folded = table.rigs if len(table.rigs) > 1 else ()
-        forms = [[*map(_below, each)] for each in (parts, build_page_tables(table, sensors_in_rows=True))]
-        parts = [
-            form if compute_min_width([_rich_table(form)], folded) <= width else narrow
-            for form, narrow in zip(*forms, strict=True)
-        ]
-    tables = [*map(_rich_table, parts)]
+    page_tables = build_page_tables(table)
+    if width is not None and compute_min_width([_build_rich_table(page_table) for page_table in page_tables]) > width:
+        wrapped_headings = table.rigs if len(table.rigs) > 1 else ()
+        narrow_tables = build_page_tables(table, sensors_in_rows=True)
+        pairs = list(zip(page_tables, narrow_tables, strict=True))
+        page_tables = []
+        for page_table, narrow_table in pairs:
+            wrapped = _wrap_intervals(page_table)
+            fits = compute_min_width([_build_rich_table(wrapped)], wrapped_headings) <= width
+            page_tables.append(wrapped if fits else _wrap_intervals(narrow_table))
+    rich_tables = [_build_rich_table(page_table) for page_table in page_tables]
     marks = [f"{SIGNS[mark]} {meaning}" for mark, meaning in explain_marks(table).items()]
-    tables[-1].caption = Text("\n".join([*marks, *list_notes(table)]))
-    return tables
+    rich_tables[-1].caption = Text("\n".join([*marks, *list_notes(table)]))
+    return rich_tables
 
 
 def print_page_tables(tables: Sequence[PageTable]) -> None:
-    """Print tables, folded between words where the terminal is narrower, or 80 columns if that is not known.
+    """Print tables of text, wrapped between words to the width of the terminal, or 80 columns if it is unknown.
 
-    Rather lines that are too long than words and numbers that are cut.
+    Words and numbers are never truncated; lines may be too long instead.
+
+    Args:
+        tables: The tables.
     """
     console = Terminal()
-    whole = [_in_words(table, console.width) for table in tables]
-    console.width = max(console.width, compute_min_width(whole))
-    for table in whole:
-        console.print(table)
+    rich_tables = [_build_wrapped_table(table, console.width) for table in tables]
+    console.width = max(console.width, compute_min_width(rich_tables))
+    for rich_table in rich_tables:
+        console.print(rich_table)
 
 
-def _in_words(table: PageTable, limit: int) -> Table:
-    """The first column left, the others right; no words are markup. The widest are folded until it is `limit` wide."""
-    columns = [(name, [row[at].text for row in table.rows]) for at, name in enumerate(table.headings)]
-    widths = [_longest([name, *cells], "\n") for name, cells in columns]
-    least = [max(min(_longest([name]), LEAST_HEADING_CHARS), _longest(cells)) for name, cells in columns]
-    beside = int(sum(least) + 3 * len(least) < limit)
-    room = max(limit - 1 - (1 + 2 * beside) * len(least), sum(least))
-    folded = sum(widths) > room
-    while sum(widths) > room:
-        widths[max((k for k in range(len(least)) if widths[k] > least[k]), key=widths.__getitem__)] -= 1
-    title, caption = (Text(words) if words else None for words in (table.title, "\n".join(table.notes)))
-    shown = Table(title=title, caption=caption, padding=(0, beside))
-    for at, (heading, width) in enumerate(zip(table.headings, widths, strict=True)):
-        shown.add_column(Text(heading), justify="right" if at else "left", width=width, overflow="fold")
-    above = ""
-    for first, *others in table.rows:
-        again = folded and first.text == above  # whose many lines are not read twice
-        shown.add_row("" if again else Text(first.text), *(Text(cell.text) for cell in others))
-        above = first.text
-    return shown
+def _build_wrapped_table(table: PageTable, limit: int) -> Table:
+    """Build a table without markup whose widest columns are wrapped until it has at most `limit` characters per line."""
+    columns = [(name, [row[index].text for row in table.rows]) for index, name in enumerate(table.headings)]
+    widths = [_find_longest([name, *cells], "\n") for name, cells in columns]
+    max_word_chars = 10  # longer words of headings may be broken
+    min_widths = [max(min(_find_longest([name]), max_word_chars), _find_longest(cells)) for name, cells in columns]
+    padding = int(sum(min_widths) + 3 * len(min_widths) < limit)
+    available = max(limit - 1 - (1 + 2 * padding) * len(min_widths), sum(min_widths))
+    is_wrapped = sum(widths) > available
+    while sum(widths) > available:
+        shrinkable = [index for index in range(len(widths)) if widths[index] > min_widths[index]]
+        widths[max(shrinkable, key=widths.__getitem__)] -= 1
+    rich_table = Table(
+        title=Text(table.title) if table.title else None,
+        caption=Text("\n".join(table.notes)) if table.notes else None,
+        padding=(0, padding),
+    )
+    for index, (heading, width) in enumerate(zip(table.headings, widths, strict=True)):
+        rich_table.add_column(Text(heading), justify="right" if index else "left", width=width, overflow="fold")
+    previous = ""
+    for first, *cells in table.rows:
+        is_repeated = is_wrapped and first.text == previous  # a long name is printed once
+        rich_table.add_row("" if is_repeated else Text(first.text), *(Text(cell.text) for cell in cells))
+        previous = first.text
+    return rich_table
 
 
-def _longest(texts: Iterable[str], between: str | None = None) -> int:
-    """Of all words, or of what else is between."""
-    return max((cell_len(part) for text in texts for part in text.split(between)), default=0)
+def _find_longest(texts: Iterable[str], separator: str | None = None) -> int:
+    """Return the width of the longest word, or of the longest part between separators."""
+    return max((cell_len(part) for text in texts for part in text.split(separator)), default=0)
 
 
 def compute_min_width(tables: Sequence[Table], folded_headings: Sequence[str] = ()) -> int:
-    """Characters in a line that tables need at least.
+    """Compute the characters per line that tables need at least.
 
-    `tables`: tables for rich, whose numbers stay whole; `folded_headings`: headings that may be folded to the width of the
-    numbers below.
+    Args:
+        tables: Tables of rich, whose numbers are not wrapped.
+        folded_headings: Headings that may be wrapped to the width of the numbers below.
     """
-    console = Console(width=MAX_LINE_CHARS)
-    natural = [Measurement.get(console, console.options, table).maximum for table in tables]
-    spared = [
-        sum(
-            max(0, cell_len(str(of.header)) - (of.min_width or 0))
-            for of in table.columns
-            if str(of.header) in folded_headings
-        )
-        for table in tables
-    ]
-    return max(width - less for width, less in zip(natural, spared, strict=True))
+    console = Console(width=10_000)  # wider than any table
+    min_widths = []
+    for table in tables:
+        width = Measurement.get(console, console.options, table).maximum
+        for column in table.columns:
+            if str(column.header) in folded_headings:
+                width -= max(0, cell_len(str(column.header)) - (column.min_width or 0))
+        min_widths.append(width)
+    return max(min_widths)
 
 
-def _rich_table(part: PageTable) -> Table:
-    """With a line after the rows of each region."""
-    left: dict[str, Any] = {"title_justify": "left", "caption_justify": "left"}
-    table = Table(title=Text(part.title) if part.title else None, title_style="bold", caption_style="", **left)
-    for name in part.headings[:2]:
-        table.add_column(name, no_wrap=True)
-    for at, name in enumerate(part.headings[2:-1], 2):
-        # As Text, for names may hold what rich takes for markup. Names are folded, numbers never.
-        widest = max((cell_len(line) for row in part.rows for line in _text(row[at]).plain.split("\n")), default=0)
-        table.add_column(Text(name), justify="right", overflow="fold", min_width=widest)
-    table.add_column(part.headings[-1], justify="right", no_wrap=True)
-    for _, rows in groupby(part.rows, itemgetter(0)):
+def _build_rich_table(table: PageTable) -> Table:
+    """Build a table with a line below the rows of each region."""
+    alignment: dict[str, Any] = {"title_justify": "left", "caption_justify": "left"}
+    title = Text(table.title) if table.title else None
+    rich_table = Table(title=title, title_style="bold", caption_style="", **alignment)
+    for name in table.headings[:2]:
+        rich_table.add_column(name, no_wrap=True)
+    for index, name in enumerate(table.headings[2:-1], 2):
+        lines: list[str] = []
+        for row in table.rows:
+            lines += _format_cell(row[index]).plain.split("\n")
+        # Names are Text, since they may contain the markup of rich. They are wrapped, numbers are not.
+        min_width = max((cell_len(line) for line in lines), default=0)
+        rich_table.add_column(Text(name), justify="right", overflow="fold", min_width=min_width)
+    rich_table.add_column(table.headings[-1], justify="right", no_wrap=True)
+    for _, rows in groupby(table.rows, itemgetter(0)):
         for row in rows:
-            table.add_row(*map(_text, row))
-        table.add_section()
-    return table
+            rich_table.add_row(*(_format_cell(cell) for cell in row))
+        rich_table.add_section()
+    return rich_table
 
 
-def _below(part: PageTable) -> PageTable:
-    """With intervals below their numbers."""
-    return replace(
-        part, rows=[[cell._replace(text=cell.text.replace("  [", "\n[")) for cell in row] for row in part.rows]
-    )
+def _wrap_intervals(table: PageTable) -> PageTable:
+    """Move intervals below their numbers."""
+    rows = []
+    for row in table.rows:
+        rows.append([cell._replace(text=cell.text.replace("  [", "\n[")) for cell in row])
+    return replace(table, rows=rows)
 
 
-def _text(cell: TextCell) -> Text:
+def _format_cell(cell: TextCell) -> Text:
     return Text(f"{SIGNS[cell.mark]} {cell.text}", style="bold") if cell.mark else Text(cell.text)
 
 
-# What Markdown would take for something else: an underscore does so at the end of a word only.
-SPECIAL = re.compile(r"[\\`*|\[\]]|<(?=[A-Za-z/!?])|&(?=[\w#]+;)|(?<![^\W_])_|_(?![^\W_])")
-
-
 def render_markdown(table: CoverageTable) -> str:
-    """The table as Markdown text; what is marked is bold."""
+    """Render a table as Markdown; marked numbers are bold.
+
+    Args:
+        table: The table.
+    """
+    lines = []
+    if findings := escape_markdown(" ".join(summarize_findings(table))):
+        lines += [findings, ""]
+    for page_table in build_page_tables(table):
+        lines += _render_markdown_table(page_table)
     marks = [f"{BOLD_MARKS[mark]}: {meaning}" for mark, meaning in explain_marks(table).items()]
-    notes = [f"* {escape_markdown(note)}" for note in (*marks, *list_notes(table))]
-    told = escape_markdown(" ".join(summarize_findings(table)))
-    first = [told, ""] if told else []
-    return "\n".join(
-        [*first, *(line for part in build_page_tables(table) for line in _markdown_lines(part)), *notes, ""]
-    )
+    lines += [f"* {escape_markdown(note)}" for note in (*marks, *list_notes(table))]
+    return "\n".join([*lines, ""])
 
 
-def _markdown_lines(part: PageTable) -> Iterator[str]:
-    if part.title:
-        yield f"{escape_markdown(part.title)}\n"
-    yield _markdown_line(map(escape_markdown, part.headings))
-    yield _markdown_line(["---"] * part.num_text_columns + ["---:"] * (len(part.headings) - part.num_text_columns))
-    yield from (_markdown_line(map(_markdown_cell, row)) for row in part.rows)
+def _render_markdown_table(table: PageTable) -> Iterator[str]:
+    if table.title:
+        yield f"{escape_markdown(table.title)}\n"
+    yield _join_cells([escape_markdown(heading) for heading in table.headings])
+    num_number_columns = len(table.headings) - table.num_text_columns
+    yield _join_cells(["---"] * table.num_text_columns + ["---:"] * num_number_columns)
+    for row in table.rows:
+        yield _join_cells([f"**{escape_markdown(text)}**" if mark else escape_markdown(text) for text, mark in row])
     yield ""
 
 
-def _markdown_cell(cell: TextCell) -> str:
-    return f"**{escape_markdown(cell.text)}**" if cell.mark else escape_markdown(cell.text)
-
-
 def escape_markdown(text: str) -> str:
-    """Words that Markdown takes for nothing else."""
-    return SPECIAL.sub(r"\\\g<0>", escape_control_chars(" ".join(text.split())))
+    """Escape characters that have a meaning in Markdown.
+
+    Args:
+        text: The text.
+    """
+    # An underscore has a meaning only at the end of a word.
+    special = r"[\\`*|\[\]]|<(?=[A-Za-z/!?])|&(?=[\w#]+;)|(?<![^\W_])_|_(?![^\W_])"
+    return re.sub(special, r"\\\g<0>", escape_control_chars(" ".join(text.split())))
 
 
-def _markdown_line(cells: Iterable[str]) -> str:
+def _join_cells(cells: Iterable[str]) -> str:
     return f"| {' | '.join(cells)} |"
 
 

@@ -17,7 +17,7 @@ from matplotlib.ticker import LogLocator, NullFormatter
 from numpy.typing import NDArray
 
 from torchcover.coverage import BevGrid
-from torchcover.report.colors import UNKNOWN, ColorScale, plot_cells, plot_color_bar
+from torchcover.report.colors import UNOBSERVED_STYLE, ColorScale, plot_cells, plot_color_bar
 from torchcover.report.number_format import format_percent
 from torchcover.report.overlay import HALO, plot_ego
 from torchcover.report.plot_layout import (
@@ -271,7 +271,9 @@ def _entries(arrays: Mapping[str, NDArray[np.float64]]) -> list[Artist]:
         label = f"nothing within range ({format_percent(infinite)} % of the pixels)"
         entries.append(Patch(facecolor=SKY, edgecolor="#9fb0c0", label=label))
     if none:
-        entries.append(Patch(label=f"no ray: beyond the lens ({format_percent(none)} % of the pixels)", **UNKNOWN))
+        entries.append(
+            Patch(label=f"no ray: beyond the lens ({format_percent(none)} % of the pixels)", **UNOBSERVED_STYLE)
+        )
     return entries
 
 
@@ -350,7 +352,7 @@ def _draw_points(sheet: Sheet, points: Float64) -> list[Artist]:
     if (points == 0).any():
         entries.append(Patch(facecolor=UNSEEN, label="no point at all"))
     if np.isnan(points).any():
-        entries.append(Patch(label="no room for it", **UNKNOWN))
+        entries.append(Patch(label="no room for it", **UNOBSERVED_STYLE))
     return entries
 
 

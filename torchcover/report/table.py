@@ -1,4 +1,4 @@
-"""The table: regions, bands, quantities and rigs as data. How it is written down is the business of the renderers."""
+"""Coverage table: numbers of regions, height bands and rigs as data, independent of its renderers."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -23,14 +23,14 @@ from torchcover.estimation import MIN_BLOCKS, ROUND_OFF, Difference, Quantity
 
 @dataclass(frozen=True)
 class Row:
-    """The numbers of one rig in one region and height band.
+    """Numbers of one rig in one region and height band.
 
     Args:
         rig: Name of the rig.
         region: The region.
-        summary: Its numbers by the key of their quantity, and how many of its cells are known.
-        leading_keys: Keys of the quantities in which it leads here, and its lead over the next rig is more than chance.
-        differences: Key of the quantity -> difference to the first rig; empty if there is no other rig.
+        summary: Numbers by the key of their quantity, and number of observed cells.
+        leading_keys: Keys of the quantities in which the rig leads by a significant difference to the next rig.
+        differences: Key of the quantity -> difference to the first rig; empty without another rig.
     """
 
     rig: str
@@ -41,10 +41,15 @@ class Row:
 
 
 class Conditions(NamedTuple):
-    """What the numbers of one rig hold under: what happened, as in `Coverage.counts`, and how many points there were.
+    """Conditions of the numbers of one rig.
 
-    Errors come from so many blocks of contiguous steps, None without errors; of a mixture with too few, `smallest_scene_kind` is the
-    kind of world that has the fewest. `effective_blocks` are the least and the most of `Estimate.effective` in its regions.
+    Args:
+        counts: Counts of frames and points, as in `Coverage.counts`.
+        blocks: Number of blocks of contiguous frames for standard errors; None without errors.
+        frames_per_block: Maximum number of frames of a block; None without errors.
+        point_count: Number of reference points in the grid.
+        smallest_scene_kind: Scenario of a mixture that has too few blocks; else empty.
+        effective_blocks: Smallest and largest effective number of blocks of the regions.
     """
 
     counts: Mapping[str, int]
@@ -57,20 +62,20 @@ class Conditions(NamedTuple):
 
 @dataclass(frozen=True)
 class CoverageTable:
-    """What a run has found, for one rig or for several over the same frames.
+    """Numbers of one rig, or of several rigs over the same frames.
 
     Args:
-        quantities: What there is a number of: the means, then what other aggregations say.
+        quantities: Quantities of the rows: the means, then those of other aggregations.
         grid: Cells and height bands.
-        thresholds_m: Detection thresholds in metres.
-        max_radius_m: Saturation of the radius in metres.
-        average: What the numbers of the rows are means over: "area", the visible surface, or "cells", the known cells.
-        rows: Name of the rig -> its rows in the order of the regions, then of the bands.
-        conditions: Name of the rig -> what its numbers hold under.
-        notes: What else they hold under, in words of the caller.
-        source: What carried the rigs, `vehicle`, and what sensors make of their hits, `sensor_model` by rig; if known.
-        target_rows: Name of the rig -> its rows of bodies beside the vehicle, if any were put there.
-        block_ends: Frames of the source after which one block after the other is complete, as far as is known.
+        thresholds_m: Detection thresholds in meters.
+        max_radius_m: Maximum radius in meters.
+        average: Average of the numbers: "area" over visible surface, "cells" over observed cells.
+        rows: Name of the rig -> its rows, by region, then by band.
+        conditions: Name of the rig -> conditions of its numbers.
+        notes: Further conditions, in sentences of the caller.
+        source: `vehicle`, and `sensor_model` by rig, as far as known.
+        target_rows: Name of the rig -> its rows of test targets near the vehicle.
+        block_ends: Numbers of frames after which each block of the source is complete, as far as known.
     """
 
     quantities: tuple[Quantity, ...]
@@ -94,33 +99,33 @@ class CoverageTable:
         source: Mapping[str, object] | None = None,
         block_ends: Sequence[int] = (),
     ) -> "CoverageTable":
-        """Make the table of one rig, or of several that were measured together.
+        """Build the table of one rig, or of several rigs that were measured together.
 
         Args:
-            coverages: What `CoverageMetric.compute` returned, or mixtures of that, by the name of the rig.
+            coverages: Name of the rig -> result of `CoverageMetric.compute`, or a mixture of results.
             regions: Regions within the grid.
-            notes: What else the numbers hold under.
-            source: Where they come from; see above.
-            block_ends: See above.
+            notes: Further conditions of the numbers.
+            source: Source of the numbers, see `CoverageTable`.
+            block_ends: Ends of the blocks, see `CoverageTable`.
 
         Raises:
-            ValueError: No rig; several that are not paired, as in `check_paired`; regions that `Coverage.summary`
-                refuses.
+            ValueError: There is no rig, the rigs are not paired (`check_paired`), or `Coverage.summary` rejects a
+                region.
         """
         if not coverages:
-            raise ValueError("a table needs at least one rig; got none")
-        for of_one_world in zip(*(_parts(coverage) for coverage in coverages.values()), strict=True):
+            raise ValueError("coverages: got none; give at least one rig")
+        scenario_coverages = [_split_mixture(coverage) for coverage in coverages.values()]
+        for rigs_in_scenario in zip(*scenario_coverages, strict=True):
             if len(coverages) > 1:
-                check_paired(dict(zip(coverages, of_one_world, strict=True)))
+                check_paired(dict(zip(coverages, rigs_in_scenario, strict=True)))
         first = next(iter(coverages.values()))
         summaries = {rig: coverage.summary(regions) for rig, coverage in coverages.items()}
-        rows = _rows(coverages, list_region_bands(regions, first.grid), summaries)
-        bodies = []
+        rows = _build_rows(coverages, list_region_bands(regions, first.grid), summaries)
+        target_rows: list[dict[str, Row]] = []
         if first.target_sums:
-            each = {
-                rig: coverage.target_sums.summarize() for rig, coverage in coverages.items() if coverage.target_sums
-            }
-            bodies = _rows(coverages, first.target_sums.region_targets, each, OF_BODIES)
+            target_sums = {rig: coverage.target_sums for rig, coverage in coverages.items() if coverage.target_sums}
+            target_summaries = {rig: sums.summarize() for rig, sums in target_sums.items()}
+            target_rows = _build_rows(coverages, first.target_sums.region_targets, target_summaries, OF_BODIES)
         return cls(
             quantities=(*first.quantities, *(first.aggregated_numbers.quantities if first.aggregated_numbers else ())),
             grid=first.grid,
@@ -128,16 +133,16 @@ class CoverageTable:
             max_radius_m=first.max_radius_m,
             average=first.average,
             rows={rig: tuple(row[rig] for row in rows) for rig in coverages},
-            conditions={rig: _conditions(coverage, regions) for rig, coverage in coverages.items()},
+            conditions={rig: _build_conditions(coverage, regions) for rig, coverage in coverages.items()},
             notes=tuple(notes),
             source=source or {},
-            target_rows={rig: tuple(row[rig] for row in bodies) for rig in coverages},
+            target_rows={rig: tuple(row[rig] for row in target_rows) for rig in coverages},
             block_ends=block_ends,
         )
 
     @property
     def mean_quantities(self) -> tuple[Quantity, ...]:
-        """The mean radius, then the detection at each threshold."""
+        """Mean radius, then detection rate at each threshold."""
         return self.quantities[: 1 + len(self.thresholds_m)]
 
     @property
@@ -147,67 +152,77 @@ class CoverageTable:
 
     @property
     def first_conditions(self) -> Conditions:
-        """The conditions of the first rig; steps and blocks are those of every rig."""
+        """Conditions of the first rig; all rigs have the same frames and blocks."""
         return self.conditions[self.rigs[0]]
 
     @property
     def has_intervals(self) -> bool:
-        """Whether enough blocks are in effect for intervals in any region."""
+        """Whether some region has enough effective blocks for confidence intervals."""
         return self.first_conditions.effective_blocks[1] > MIN_BLOCKS - ROUND_OFF
 
     @property
     def rows_by_region(self) -> list[tuple[Row, ...]]:
-        """The rows of each region and band: one for each rig."""
+        """Rows of each region and band, one for each rig."""
         return list(zip(*self.rows.values(), strict=True))
 
     @property
     def target_quantities(self) -> tuple[Quantity, ...]:
-        """What there is a number of for each body in each region."""
+        """Quantities of each test target in each region."""
         row = next((row for rows in self.target_rows.values() for row in rows), None)
         return tuple(number.quantity for number in row.summary.numbers.values()) if row else ()
 
 
-def _rows(
+def _build_rows(
     coverages: Mapping[str, Coverage | CoverageMixture],
-    places: Sequence[tuple[Region, str]],
+    region_bands: Sequence[tuple[Region, str]],
     summaries: Mapping[str, Sequence[RegionSummary]],
     parts: EstimatorGetters = PARTS,
 ) -> list[dict[str, Row]]:
-    several = len(coverages) > 1
+    """Build the rows of each region and band (or test target), by rig."""
     rows = []
-    for (region, height), of_rigs in zip(places, zip(*summaries.values(), strict=True), strict=True):
-        compared = compute_differences(coverages, region, height, parts) if several else {}
-        best = find_leaders(coverages, region, height, parts)
+    for (region, band), rig_summaries in zip(region_bands, zip(*summaries.values(), strict=True), strict=True):
+        differences = compute_differences(coverages, region, band, parts) if len(coverages) > 1 else {}
+        leaders = find_leaders(coverages, region, band, parts)
         row = {}
-        for rig, summary in zip(coverages, of_rigs, strict=True):
-            marked = frozenset(key for key, leader in best.items() if leader == rig)
-            row[rig] = Row(rig, region, summary, marked, compared.get(rig, {}))
+        for rig, summary in zip(coverages, rig_summaries, strict=True):
+            leading_keys = frozenset(key for key, leader in leaders.items() if leader == rig)
+            row[rig] = Row(rig, region, summary, leading_keys, differences.get(rig, {}))
         rows.append(row)
     return rows
 
 
-def _parts(coverage: Coverage | CoverageMixture) -> list[Coverage]:
+def _split_mixture(coverage: Coverage | CoverageMixture) -> list[Coverage]:
     return [coverage] if isinstance(coverage, Coverage) else [part for _, part in coverage.weighted_coverages]
 
 
-def _effective(coverage: Coverage | CoverageMixture, regions: Sequence[Region], blocks: int) -> tuple[float, float]:
-    """The least and the most effective blocks of regions that were seen; the blocks themselves if none was."""
-    places = list_region_bands(regions, coverage.grid)
-    each = [float(one) for place in places for one in coverage.estimate(*place).effective_blocks if one > 0]
-    return (min(each), max(each)) if each else (float(blocks), float(blocks))
+def _find_effective_blocks(
+    coverage: Coverage | CoverageMixture, regions: Sequence[Region], num_blocks: int
+) -> tuple[float, float]:
+    """Find the smallest and largest effective number of blocks of observed regions; all blocks if there are none."""
+    counts: list[float] = []
+    for region, band in list_region_bands(regions, coverage.grid):
+        effective_blocks = coverage.estimate(region, band).effective_blocks
+        counts += [float(count) for count in effective_blocks if count > 0]
+    return (min(counts), max(counts)) if counts else (float(num_blocks), float(num_blocks))
 
 
-def _conditions(coverage: Coverage | CoverageMixture, regions: Sequence[Region]) -> Conditions:
-    """Of a mixture those of all kinds of world, but too few blocks of any of them are too few."""
-    each = [
-        part.block_sums and (part.region_sums or part.block_sums) for part in _parts(coverage)
-    ]  # by area they are the fine ones
-    used = [int((blocks.frame_counts > 0).sum()) for blocks in each if blocks]
-    longest = [int(blocks.frame_counts.max()) for blocks in each if blocks]
-    found = Conditions(dict(coverage.counts), sum(used), max(longest, default=None), coverage.counts["inside_points"])
-    if used:
-        found = found._replace(effective_blocks=_effective(coverage, regions, min(used)))
-    if min(used, default=0) >= MIN_BLOCKS:
-        return found
-    fewest = coverage.scenario_names[used.index(min(used))] if used and isinstance(coverage, CoverageMixture) else ""
-    return found._replace(blocks=min(used, default=None), smallest_scene_kind=fewest)
+def _build_conditions(coverage: Coverage | CoverageMixture, regions: Sequence[Region]) -> Conditions:
+    """Build the conditions of a rig; a mixture has too few blocks if any of its scenarios has too few."""
+    used_blocks: list[int] = []
+    longest_blocks: list[int] = []
+    for part in _split_mixture(coverage):
+        sums = part.block_sums and (part.region_sums or part.block_sums)  # by area the blocks of regions are shorter
+        if sums:
+            used_blocks.append(int((sums.frame_counts > 0).sum()))
+            longest_blocks.append(int(sums.frame_counts.max()))
+    counts = dict(coverage.counts)
+    conditions = Conditions(counts, sum(used_blocks), max(longest_blocks, default=None), counts["inside_points"])
+    if used_blocks:
+        effective_blocks = _find_effective_blocks(coverage, regions, min(used_blocks))
+        conditions = conditions._replace(effective_blocks=effective_blocks)
+    if min(used_blocks, default=0) >= MIN_BLOCKS:
+        return conditions
+    smallest = ""
+    if used_blocks and isinstance(coverage, CoverageMixture):
+        smallest = coverage.scenario_names[used_blocks.index(min(used_blocks))]
+    return conditions._replace(blocks=min(used_blocks, default=None), smallest_scene_kind=smallest)

@@ -1,4 +1,4 @@
-"""A table in words, before it is text: the parts of a page, which renderers for readers have in common."""
+"""Coverage table as tables of text, which all renderers for readers share."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,6 +18,7 @@ from torchcover.report.number_format import (
 from torchcover.report.records import COLUMNS
 from torchcover.report.table import CoverageTable, Row
 from torchcover.report.table_notes import (
+    MAX_HEADING_CHARS,
     format_failure_cells,
     format_failure_headings,
     format_failure_title,
@@ -25,17 +26,18 @@ from torchcover.report.table_notes import (
     get_main_quantity,
 )
 
-MAX_HEADING_CHARS = 16
-PLACE_HEADINGS = ("region", "height")
-BODY_HEADINGS = ("region", "body")
-PLACES = len(PLACE_HEADINGS)
-Rows = tuple[Row, ...]
-# What the marks look like, and what the legend calls that, where text may be bold.
+REGION_HEADINGS = ("region", "band")
+# How marks are shown where text may be bold.
 BOLD_MARKS: Mapping[str, str] = MappingProxyType({"best": "In bold", "significant": "In bold among the differences"})
 
 
 class TextCell(NamedTuple):
-    """What a cell of a part says, and whether it is marked: as the best of its row, or as more than chance."""
+    """Cell of a table of text.
+
+    Args:
+        text: Its text.
+        mark: "best" for the best number of a row, "significant" for a significant difference, else empty.
+    """
 
     text: str
     mark: str = ""
@@ -43,14 +45,14 @@ class TextCell(NamedTuple):
 
 @dataclass(frozen=True)
 class PageTable:
-    """A table of words.
+    """Table of text.
 
     Args:
-        title: Above it; empty for none.
-        headings: Of its columns.
-        rows: Its cells; marked ones are bold.
-        num_text_columns: How many columns are words, on the left; numbers follow, on the right.
-        notes: Below it.
+        title: Title above the table; empty for none.
+        headings: Headings of the columns.
+        rows: Cells; marked ones are shown in bold.
+        num_text_columns: Number of left-aligned columns; the others are right-aligned numbers.
+        notes: Notes below the table.
     """
 
     title: str
@@ -61,96 +63,104 @@ class PageTable:
 
 
 def build_page_tables(table: CoverageTable, *, sensors_in_rows: bool = False) -> list[PageTable]:
-    """The parts of a table.
+    """Build the tables of text of a coverage table.
 
     Args:
         table: The table.
-        sensors_in_rows: With redundancy a row for each sensor with which something is lost, instead of columns.
+        sensors_in_rows: Whether sensor failures have a row for each sensor with an effect, instead of columns.
 
     Returns:
-        For one rig one part, a column for each quantity. For several the paper's layout: a part for each quantity, a
-        column for each rig; and, if there are errors, as many parts with the differences to the first rig. Then the
-        same of bodies beside the vehicle. With redundancy a part for each rig more, a column for each of its sensors.
+        For one rig, a table with a column for each quantity. For several, the layout of the paper: a table for each
+        quantity with a column for each rig, and with standard errors also a table of differences to the first rig.
+        Then the same for test targets. With redundancy, a table of sensor failures for each rig.
     """
-    of_failures = _of_each_failure if sensors_in_rows else _of_failures
-    failures = [of_failures(table, rig) for rig in table.rigs if get_failure_sensors(table.rows[rig])]
-    of_bodies = list(zip(*table.target_rows.values(), strict=True))
-    parts = _of_rows(table, table.rows_by_region, table.quantities)
-    return [*parts, *(_of_rows(table, of_bodies, table.target_quantities) if of_bodies else ()), *failures]
+    build_failures = _build_failure_rows if sensors_in_rows else _build_failure_columns
+    failures = [build_failures(table, rig) for rig in table.rigs if get_failure_sensors(table.rows[rig])]
+    tables = _build_number_tables(table, table.rows_by_region, table.quantities)
+    target_rows = list(zip(*table.target_rows.values(), strict=True))
+    if target_rows:
+        tables += _build_number_tables(table, target_rows, table.target_quantities)
+    return [*tables, *failures]
 
 
-def _of_rows(table: CoverageTable, places: Sequence[Rows], quantities: Sequence[Quantity]) -> list[PageTable]:
+def _build_number_tables(
+    table: CoverageTable, rows_by_region: Sequence[tuple[Row, ...]], quantities: Sequence[Quantity]
+) -> list[PageTable]:
     if len(table.rigs) == 1:
         headings = [fill(format_heading(quantity), MAX_HEADING_CHARS) for quantity in quantities]
-        cells = [[_number(row, quantity) for quantity in quantities] for (row,) in places]
-        return [_part(table, places, "", headings, cells)]
-    (first, *others), parts = table.rigs, []
-    for one in quantities:
-        cells = [[_number(row, one) for row in rows] for rows in places]
-        parts.append(_part(table, places, capitalize(format_heading(one)), table.rigs, cells))
-    for one in quantities if table.first_conditions.blocks is not None else ():
-        cells = [[_difference(row, one) for row in rows[1:]] for rows in places]
-        title = f"Difference to {first}: {format_difference_heading(one)}"
-        parts.append(_part(table, places, title, others, cells))
-    return parts
+        cells = [[_format_number_cell(row, quantity) for quantity in quantities] for (row,) in rows_by_region]
+        return [_add_common_columns(table, rows_by_region, "", headings, cells)]
+    tables = []
+    for quantity in quantities:
+        cells = [[_format_number_cell(row, quantity) for row in rows] for rows in rows_by_region]
+        title = capitalize(format_heading(quantity))
+        tables.append(_add_common_columns(table, rows_by_region, title, table.rigs, cells))
+    for quantity in quantities if table.first_conditions.blocks is not None else ():
+        cells = [[_format_difference_cell(row, quantity) for row in rows[1:]] for rows in rows_by_region]
+        title = f"Difference to {table.rigs[0]}: {format_difference_heading(quantity)}"
+        tables.append(_add_common_columns(table, rows_by_region, title, table.rigs[1:], cells))
+    return tables
 
 
-def _of_failures(table: CoverageTable, rig: str) -> PageTable:
+def _build_failure_columns(table: CoverageTable, rig: str) -> PageTable:
+    """Build the table of sensor failures with a column for each sensor."""
     rows = []
     for row in table.rows[rig]:
-        cells = [TextCell(text, "significant" if marked else "") for text, marked in format_failure_cells(table, row)]
-        rows.append((TextCell(row.summary.region), TextCell(row.summary.band), *cells))
-    return PageTable(
-        format_failure_title(table, rig), [*PLACE_HEADINGS, *format_failure_headings(table, rig)], rows, PLACES
-    )
+        cells = [TextCell(row.summary.region), TextCell(row.summary.band)]
+        for text, is_significant in format_failure_cells(table, row):
+            cells.append(TextCell(text, "significant" if is_significant else ""))
+        rows.append(cells)
+    headings = [*REGION_HEADINGS, *format_failure_headings(table, rig)]
+    return PageTable(format_failure_title(table, rig), headings, rows, len(REGION_HEADINGS))
 
 
-def _of_each_failure(table: CoverageTable, rig: str) -> PageTable:
-    """As narrow as it can be: by how many sensors a place is seen, and what it loses with each, most first."""
-    names, rows = get_failure_sensors(table.rows[rig]), []
-    headings = format_failure_headings(table, rig)
-    seen = len(headings) - len(names) - 1
+def _build_failure_rows(table: CoverageTable, rig: str) -> PageTable:
+    """Build the narrow table of sensor failures: a row for each sensor with an effect, the largest loss first."""
+    sensors, key = get_failure_sensors(table.rows[rig]), get_main_quantity(table).key
+    num_redundancy_columns = len(format_failure_headings(table, rig)) - len(sensors) - 1
+    rows = []
     for row in table.rows[rig]:
-        words = format_failure_cells(table, row)
-        lost = sorted(
-            (row.summary.redundancy.failure_effects[name][get_main_quantity(table).key].improvement, name, *said)
-            for name, said in zip(names, words[seen:-1], strict=True)
-            if row.summary.redundancy and said[0] not in ("0", UNKNOWN)
-        )
-        for at, (_, name, text, marked) in enumerate(lost or [(0.0, words[-1][0], "", False)]):
-            of_place = [said[0] if at == 0 else "" for said in words[: min(seen, 1)]]
-            last = TextCell(text, "significant" if marked else "")
-            rows.append(
-                (TextCell(row.summary.region), TextCell(row.summary.band), *map(TextCell, (*of_place, name)), last)
-            )
-    headings = [*PLACE_HEADINGS, *["sensors\nthat see it"][:seen], "without", "change"]
-    return PageTable(format_failure_title(table, rig), headings, rows, PLACES)
+        cells = format_failure_cells(table, row)
+        effects: list[tuple[float, str, str, bool]] = []
+        for sensor, (text, is_significant) in zip(sensors, cells[num_redundancy_columns:-1], strict=True):
+            if row.summary.redundancy and text not in ("0", UNKNOWN):
+                improvement = row.summary.redundancy.failure_effects[sensor][key].improvement
+                effects.append((improvement, sensor, text, is_significant))
+        effects.sort()
+        for index, (_, sensor, text, is_significant) in enumerate(effects or [(0.0, cells[-1][0], "", False)]):
+            texts = [row.summary.region, row.summary.band]
+            texts += [cell[0] if index == 0 else "" for cell in cells[: min(num_redundancy_columns, 1)]]
+            change = TextCell(text, "significant" if is_significant else "")
+            rows.append([*(TextCell(text) for text in (*texts, sensor)), change])
+    redundancy_headings = ["detecting\nsensors"][:num_redundancy_columns]
+    headings = [*REGION_HEADINGS, *redundancy_headings, "without", "change"]
+    return PageTable(format_failure_title(table, rig), headings, rows, len(REGION_HEADINGS))
 
 
-def _part(
+def _add_common_columns(
     table: CoverageTable,
-    places: Sequence[Rows],
+    rows_by_region: Sequence[tuple[Row, ...]],
     title: str,
     headings: Sequence[str],
     numbers: Sequence[Sequence[TextCell]],
 ) -> PageTable:
-    """A part with the columns that every part has: the place first, those of `COLUMNS` that are shown last."""
-    measure = places[0][0].summary.average if places else table.average
-    shown = [column for column in COLUMNS if column.heading and column.average in (None, measure)]
+    """Build a table with region and band in front of the numbers, and the shown ones of `COLUMNS` behind them."""
+    average = rows_by_region[0][0].summary.average if rows_by_region else table.average
+    columns = [column for column in COLUMNS if column.heading and column.average in (None, average)]
     rows = []
-    for (row, *_), cells in zip(places, numbers, strict=True):
-        last = [TextCell(column.format_value(column.get_value(table, row))) for column in shown]
-        rows.append((TextCell(row.summary.region), TextCell(row.summary.band), *cells, *last))
-    first = BODY_HEADINGS if measure == "target_positions" else PLACE_HEADINGS
-    every = [*first, *headings, *(column.heading for column in shown)]
-    return PageTable(title, every, rows, PLACES)
+    for (row, *_), cells in zip(rows_by_region, numbers, strict=True):
+        common = [TextCell(column.format_value(column.get_value(table, row))) for column in columns]
+        rows.append((TextCell(row.summary.region), TextCell(row.summary.band), *cells, *common))
+    region_headings = ("region", "target") if average == "target_positions" else REGION_HEADINGS
+    all_headings = [*region_headings, *headings, *(column.heading for column in columns)]
+    return PageTable(title, all_headings, rows, len(REGION_HEADINGS))
 
 
-def _number(row: Row, quantity: Quantity) -> TextCell:
-    words = format_number(row.summary.numbers[quantity.key])
-    return TextCell(words, "best" if quantity.key in row.leading_keys else "")
+def _format_number_cell(row: Row, quantity: Quantity) -> TextCell:
+    text = format_number(row.summary.numbers[quantity.key])
+    return TextCell(text, "best" if quantity.key in row.leading_keys else "")
 
 
-def _difference(row: Row, quantity: Quantity) -> TextCell:
+def _format_difference_cell(row: Row, quantity: Quantity) -> TextCell:
     difference = row.differences[quantity.key]
     return TextCell(format_difference(difference), "significant" if difference.is_significant else "")

@@ -1,7 +1,7 @@
-"""A table in sentences: what is lost when a sensor fails, what a reader has to know, and the answer in plain words."""
+"""Coverage table in sentences: findings, notes on its numbers, and the effects of sensor failures."""
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from textwrap import fill
 
@@ -20,133 +20,170 @@ from torchcover.report.number_format import (
 )
 from torchcover.report.table import CoverageTable, Row
 
-MAX_HEADING_CHARS = 16
-NONE = "none"
+MAX_HEADING_CHARS = 16  # headings of columns are wrapped at this width
 
 
 def get_main_quantity(table: CoverageTable) -> Quantity:
-    """What sensors are judged by: the detection at the first threshold, or the radius where there is none."""
+    """Return the quantity by which sensors are compared: detection at the first threshold, or the radius without one.
+
+    Args:
+        table: The table.
+    """
     return table.mean_quantities[min(1, len(table.thresholds_m))]
 
 
 def get_failure_sensors(rows: Sequence[Row]) -> tuple[str, ...]:
-    """The sensors that the rows of a rig have numbers without; none if that was not asked for."""
-    known = (row.summary.redundancy for row in rows)
-    return next((tuple(redundancy.failure_numbers) for redundancy in known if redundancy), ())
+    """Return the sensors whose failure was evaluated.
+
+    Args:
+        rows: Rows of one rig.
+
+    Returns:
+        Names of the sensors; empty without redundancy.
+    """
+    for row in rows:
+        if row.summary.redundancy:
+            return tuple(row.summary.redundancy.failure_numbers)
+    return ()
 
 
 def format_failure_title(table: CoverageTable, rig: str) -> str:
-    """What stands above the part of the table that is about one rig."""
-    beginning = f"{rig}: change" if len(table.rigs) > 1 else "Change"
-    return f"{beginning} of {format_difference_heading(get_main_quantity(table))} when one sensor fails"
+    """Format the title of the table of sensor failures.
+
+    Args:
+        table: The table.
+        rig: Name of the rig.
+    """
+    prefix = f"{rig}: change" if len(table.rigs) > 1 else "Change"
+    return f"{prefix} of {format_difference_heading(get_main_quantity(table))} when one sensor fails"
 
 
 def format_failure_headings(table: CoverageTable, rig: str) -> list[str]:
-    """Of its columns, but for the place."""
-    several = [fill(heading, MAX_HEADING_CHARS) for heading in ("sensors that see it", "by two or more (%)")]
-    return [*(several if table.thresholds_m else ()), *get_failure_sensors(table.rows[rig]), "most lost with"]
+    """Format the headings of the table of sensor failures, without those of region and band.
+
+    Args:
+        table: The table.
+        rig: Name of the rig.
+    """
+    redundancy = [fill(heading, MAX_HEADING_CHARS) for heading in ("detecting sensors", "by two or more (%)")]
+    return [
+        *(redundancy if table.thresholds_m else ()),
+        *get_failure_sensors(table.rows[rig]),
+        fill("largest effect", MAX_HEADING_CHARS),
+    ]
 
 
 def format_failure_cells(table: CoverageTable, row: Row) -> list[tuple[str, bool]]:
-    """The cells of one row but for the place, each with whether it is marked as more than chance."""
+    """Format a row of the table of sensor failures.
+
+    Args:
+        table: The table.
+        row: One row of a rig.
+
+    Returns:
+        Text of each cell, and whether it is a significant change.
+    """
     redundancy, key = row.summary.redundancy, get_main_quantity(table).key
     sensors = get_failure_sensors(table.rows[row.rig])
     if redundancy is None:
         return [(UNKNOWN, False)] * len(format_failure_headings(table, row.rig))
-    words = []
-    for threshold in table.thresholds_m[:1]:
-        words.append((format_number(redundancy.detecting_sensors[make_sensor_count_quantity(threshold).key]), False))
-        words.append((format_number(redundancy.detecting_sensors[make_redundancy_quantity(threshold).key]), False))
+    cells = []
+    for threshold_m in table.thresholds_m[:1]:
+        for quantity in (make_sensor_count_quantity(threshold_m), make_redundancy_quantity(threshold_m)):
+            cells.append((format_number(redundancy.detecting_sensors[quantity.key]), False))
     for sensor in sensors:
         change = redundancy.failure_effects[sensor][key]
-        words.append((format_difference(change), bool(change.is_significant)))
-    known = not math.isnan(row.summary.numbers[key].value)
-    return [*words, (redundancy.most_critical_sensor or (NONE if known else UNKNOWN), False)]
+        cells.append((format_difference(change), bool(change.is_significant)))
+    no_sensor = UNKNOWN if math.isnan(row.summary.numbers[key].value) else "none"
+    return [*cells, (redundancy.most_critical_sensor or no_sensor, False)]
 
 
 @dataclass(frozen=True)
 class FailureParams:
-    """When the loss of a sensor is called a single point of failure.
+    """Parameters of the test for a single point of failure.
 
     Args:
-        min_share: Least loss that is more than chance: the share of the detection that is lost, or by which the
-            radius grows. A tenth is more than settings move a number, see docs/accuracy.md.
+        min_share: Minimum share of the detection rate that is lost, or by which the radius grows. The default of a tenth
+            exceeds the influence of settings on a number, see docs/accuracy.md.
     """
 
     min_share: float = 0.1
 
 
 def describe_single_point_of_failure(table: CoverageTable, rig: str, params: FailureParams = FailureParams()) -> str:
-    """Name the sensor of a rig with which most is lost, and where, if the loss is large and more than chance.
+    """Describe the failure of a sensor with the largest loss, if the loss is large and significant.
 
     Args:
-        table: Of one rig or several.
-        rig: Its name.
-        params: What counts as a single point of failure.
+        table: The table.
+        rig: Name of the rig.
+        params: Criterion of a single point of failure.
 
     Returns:
-        A sentence; empty if redundancy was not asked for.
+        A sentence; empty without redundancy.
     """
     quantity, rows = get_main_quantity(table), table.rows[rig]
-    if not get_failure_sensors(rows):
+    sensors = get_failure_sensors(rows)
+    if not sensors:
         return ""
-    if all(math.isnan(row.summary.numbers[quantity.key].value) for row in rows):
-        return "Whether one sensor is indispensable is unknown: nothing that was asked about was seen."
-    if quantity.key != RADIUS.key and not any(row.summary.numbers[quantity.key].value > 0.0 for row in rows):
-        return "Nothing of what was asked about is detected: no failure could take anything away."
-    if len(get_failure_sensors(rows)) == 1:
-        return f"Its only sensor is {get_failure_sensors(rows)[0]}: without it nothing is seen."
-    large = [row for row in rows if _lost_share(row, quantity) >= params.min_share]
-    large = [row for row in large if _is_significant(row, quantity) is not False]
-    real = [row for row in large if _is_significant(row, quantity)]
-    worst = max(real or large, key=lambda row: _loss(row.summary.redundancy, quantity), default=None)
+    values = [row.summary.numbers[quantity.key].value for row in rows]
+    if all(math.isnan(value) for value in values):
+        return "Single point of failure unknown: no surface in the regions was observed."
+    if quantity.key != RADIUS.key and not any(value > 0.0 for value in values):
+        return "No single point of failure: nothing in the regions is detected with all sensors."
+    if len(sensors) == 1:
+        return f"Single point of failure: {sensors[0]} is the only sensor."
+    candidates = []
+    for row in rows:
+        if _compute_lost_share(row, quantity) >= params.min_share and _is_significant(row, quantity) is not False:
+            candidates.append(row)
+    significant = [row for row in candidates if _is_significant(row, quantity)]
+    losses = [(_get_loss(row.summary.redundancy, quantity), row) for row in significant or candidates]
+    _, worst = max(losses, key=lambda pair: pair[0], default=(0.0, None))
     if worst is None or (redundancy := worst.summary.redundancy) is None or redundancy.most_critical_sensor is None:
-        least = f"{100 * params.min_share:g} %"
-        return f"No single point of failure: no sensor's failure costs {least} or more of any number beyond chance."
+        min_share = f"{100 * params.min_share:g} %"
+        return (
+            f"No single point of failure: no failure of a sensor changes a number significantly by {min_share} or more."
+        )
     sensor = redundancy.most_critical_sensor
-    before, after = worst.summary.numbers[quantity.key].value, redundancy.failure_numbers[sensor][quantity.key].value
-    whole, rest = (format_value(value, quantity.unit) for value in (before, after))
+    before = format_value(worst.summary.numbers[quantity.key].value, quantity.unit)
+    after = format_value(redundancy.failure_numbers[sensor][quantity.key].value, quantity.unit)
     unit = "m" if quantity.unit == "m" else "%"
-    where = f"{worst.summary.region} {worst.summary.band}"
-    change = f"{quantity.title} is {rest} {unit} in {where}, not {whole} {unit}"
-    if real:
-        return f"Single point of failure: {sensor}; without it {change}."
-    return f"Most is lost without {sensor}: {change}; whether that is more than chance is unknown."
+    region = f"{worst.summary.region} {worst.summary.band}"
+    change = f"{quantity.title} in {region} changes from {before} to {after} {unit}"
+    if significant:
+        return f"Single point of failure: {sensor}; without it, {change}."
+    return f"Largest effect of a failure: without {sensor}, {change}; its significance is unknown."
 
 
-def _lost_share(row: Row, quantity: Quantity) -> float:
-    """The loss with the sensor with which most is lost, as a share of the number with all sensors."""
-    loss, whole = _loss(row.summary.redundancy, quantity), row.summary.numbers[quantity.key].value
-    return loss / whole if loss > 0 and whole > 0 else 0.0
+def _compute_lost_share(row: Row, quantity: Quantity) -> float:
+    """Compute the loss without the most critical sensor, as a share of the number with all sensors."""
+    loss, value = _get_loss(row.summary.redundancy, quantity), row.summary.numbers[quantity.key].value
+    return loss / value if loss > 0 and value > 0 else 0.0
 
 
 def _is_significant(row: Row, quantity: Quantity) -> bool | None:
-    """Whether the loss with the sensor with which most is lost is more than chance; None if that is unknown."""
+    """Return whether the loss without the most critical sensor is significant; None if unknown."""
     redundancy = row.summary.redundancy
     if redundancy is None or redundancy.most_critical_sensor is None:
         return None
     return redundancy.failure_effects[redundancy.most_critical_sensor][quantity.key].is_significant
 
 
-def _loss(redundancy: RegionRedundancy | None, quantity: Quantity) -> float:
+def _get_loss(redundancy: RegionRedundancy | None, quantity: Quantity) -> float:
     if redundancy is None or redundancy.most_critical_sensor is None:
         return 0.0
     return -redundancy.failure_effects[redundancy.most_critical_sensor][quantity.key].improvement
 
 
-# Buildings and trees are above every band; where more than such a share is outside, the clouds may be elsewhere.
-MOSTLY = 0.8
-
-
 @dataclass(frozen=True)
 class TableNote:
-    """One thing to know.
+    """Note on the numbers of a rig.
 
     Args:
-        name: Which.
-        count: How many there are.
-        total: Of how many.
-        sentence: In words.
+        name: Key of the note.
+        count: Number of cases, such as frames without sensor points.
+        total: Number of all frames, points, cells or rows.
+        sentence: The note in words.
     """
 
     name: str
@@ -156,184 +193,272 @@ class TableNote:
 
 
 def collect_table_notes(table: CoverageTable, rig: str) -> tuple[TableNote, ...]:
-    """What is to be known about the numbers of a rig, of that which did happen."""
-    return tuple(remark for remark in _looked_at(table, rig) if remark.count)
+    """Collect the notes on the numbers of a rig whose count is not 0.
+
+    Args:
+        table: The table.
+        rig: Name of the rig.
+    """
+    return tuple(note for note in _build_notes(table, rig) if note.count)
 
 
-def _looked_at(table: CoverageTable, rig: str) -> Iterator[TableNote]:
+def _build_notes(table: CoverageTable, rig: str) -> Iterator[TableNote]:
+    """Yield all notes on the numbers of a rig, also those whose count is 0."""
     summaries = [row.summary for row in table.rows[rig]]
-    yield TableNote("no_region", int(not summaries), 1, "No region, so no number: the maps cover the whole grid.")
+    yield TableNote("no_region", int(not summaries), 1, "No regions, so no numbers; the maps cover the whole grid.")
     if table.average == "area":
-        seen = "Means over the square metres that the reference sees."
-        yield TableNote("visible_surface", len(summaries), len(summaries), seen)
+        sentence = "Numbers are means over the surface area that the reference observes."
+        yield TableNote("visible_surface", len(summaries), len(summaries), sentence)
     else:
-        cells, known = sum(one.num_cells for one in summaries), sum(one.observed_cells for one in summaries)
-        flattered = "Means over the known cells only; the fewer are known, the more the numbers may flatter the rig."
-        yield TableNote("unknown_cells", cells - known, cells, flattered)
-    yield from _on_errors(table, rig)
-    counts, inside, limit_m = table.conditions[rig].counts, table.conditions[rig].point_count, table.max_radius_m
-    every, outside = inside + counts["outside_points"], counts["outside_points"] - counts["no_ground_points"]
-    far = "infinitely far" if math.isinf(limit_m) else f"{limit_m:.4g} m far, the limit"
-    doubt = " Is the ground at z = 0, and x ahead?" if outside > MOSTLY * every else ""
-    some = {**counts, "outside_points": outside}
-    for name, of, words in (
+        cell_count = sum(summary.num_cells for summary in summaries)
+        observed_count = sum(summary.observed_cells for summary in summaries)
+        sentence = "Numbers are means over observed cells only; a small observed share biases them in favor of the rig."
+        yield TableNote("unobserved_cells", cell_count - observed_count, cell_count, sentence)
+    yield from _build_interval_notes(table, rig)
+    counts, point_count = table.conditions[rig].counts, table.conditions[rig].point_count
+    all_points = point_count + counts["outside_points"]
+    outside_points = counts["outside_points"] - counts["no_ground_points"]
+    limit = "infinity" if math.isinf(table.max_radius_m) else f"the maximum of {table.max_radius_m:.4g} m"
+    # Buildings and trees lie above all bands; a share above 80 % suggests another coordinate frame.
+    hint = " Check that z = 0 is the ground and x points forward." if outside_points > 0.8 * all_points else ""
+    num_frames = counts["num_frames"]
+    for name, count, total, predicate in (
         (
             "empty_sensor_frames",
-            counts["num_frames"],
-            "steps had no sensor point: they count as blind, not as missing.",
+            counts["empty_sensor_frames"],
+            num_frames,
+            "frames had no sensor points; they count as not covered.",
         ),
-        ("empty_reference_frames", counts["num_frames"], "steps had no reference point: they say nothing."),
-        ("saturated_points", inside, f"reference points count as {far}: no sensor point was nearer."),
-        ("outside_points", every, f"reference points lie outside the grid: left out.{doubt}"),
-        ("no_ground_points", every, "reference points have no known ground at or below them: in no band."),
+        (
+            "empty_reference_frames",
+            counts["empty_reference_frames"],
+            num_frames,
+            "frames had no reference points; they do not contribute.",
+        ),
+        (
+            "saturated_points",
+            counts["saturated_points"],
+            point_count,
+            f"reference points have no sensor point nearby; their radius is set to {limit}.",
+        ),
+        ("outside_points", outside_points, all_points, f"reference points outside the grid are excluded.{hint}"),
+        (
+            "no_ground_points",
+            counts["no_ground_points"],
+            all_points,
+            "reference points have no ground below them; they are in no band.",
+        ),
     ):
-        yield TableNote(name, some[name], of, f"{some[name]:,} of {of:,} {words}")
+        yield TableNote(name, count, total, f"{count:,} of {total:,} {predicate}")
 
 
-def _on_errors(table: CoverageTable, rig: str) -> Iterator[TableNote]:
-    blocks, steps = table.conditions[rig].blocks, table.conditions[rig].frames_per_block or 0
+def _build_interval_notes(table: CoverageTable, rig: str) -> Iterator[TableNote]:
+    """Yield the notes on confidence intervals."""
+    conditions = table.conditions[rig]
+    blocks, frames_per_block = conditions.blocks, conditions.frames_per_block or 0
     if blocks is None:
         return
     if not table.has_intervals:
-        where = f" in {table.conditions[rig].smallest_scene_kind}" * bool(table.conditions[rig].smallest_scene_kind)
+        scenario = f" in {conditions.smallest_scene_kind}" * bool(conditions.smallest_scene_kind)
         needed = estimate_blocks_needed(blocks, table.first_conditions.effective_blocks[0])
-        few = f"Not enough steps for intervals{where}: {blocks} block{'s' * (blocks != 1)}, about {needed} are needed."
-        yield TableNote("too_few_blocks", blocks, needed, few)
+        got = f"{blocks} block{'s' * (blocks != 1)}"
+        sentence = f"Not enough frames for confidence intervals{scenario}: got {got}, about {needed} are needed."
+        yield TableNote("too_few_blocks", blocks, needed, sentence)
         return
-    means = [quantity.key for quantity in table.mean_quantities]  # of a largest radius no error is ever known
-    numbers = [[row.summary.numbers[key] for key in means] for row in table.rows[rig]]
-    without = sum(any(math.isfinite(number.value) and math.isnan(number.low) for number in row) for row in numbers)
-    some = any(math.isfinite(number.low) for row in numbers for number in row)
-    length = f"up to {steps:,} steps in a row" if steps > 1 else "a step"
-    brackets = f"In brackets: 95 % intervals, from {blocks} blocks of {length}."
-    yield TableNote("intervals", blocks * some, blocks, brackets)
-    unknown = "No interval where too few blocks have probed the region, or all say the same."
-    yield TableNote("no_intervals", without, len(numbers), unknown)
+    keys = [quantity.key for quantity in table.mean_quantities]  # a maximum never has a standard error
+    rows_without_interval = 0
+    has_interval = False
+    for row in table.rows[rig]:
+        numbers = [row.summary.numbers[key] for key in keys]
+        has_interval |= any(math.isfinite(number.low) for number in numbers)
+        rows_without_interval += any(math.isfinite(number.value) and math.isnan(number.low) for number in numbers)
+    length = f"up to {frames_per_block:,} consecutive frames" if frames_per_block > 1 else "one frame"
+    sentence = f"Brackets: 95 % confidence intervals from {blocks} blocks of {length}."
+    yield TableNote("intervals", blocks * has_interval, blocks, sentence)
+    sentence = "Numbers without interval: too few blocks observe the region, or all blocks agree."
+    yield TableNote("no_intervals", rows_without_interval, len(table.rows[rig]), sentence)
 
 
 def list_notes(table: CoverageTable) -> list[str]:
-    """What the numbers hold under and what went wrong, a sentence each; what is about one rig only begins with it."""
-    of_rigs = merge_notes({rig: _of_rig(table, rig) for rig in table.rigs})
-    shared = {"cells": "they know the same cells", "area": "they are asked about the same square metres"}[table.average]
-    paired = [f"All rigs were measured against the same reference points, so {shared}."]
-    return [*(paired if len(table.rigs) > 1 else []), *of_rigs, *table.notes]
+    """List the notes on all numbers as sentences; a note on one rig begins with its name.
+
+    Args:
+        table: The table.
+    """
+    notes = merge_notes({rig: _format_rig_notes(table, rig) for rig in table.rigs})
+    shared = {"cells": "the same cells are observed", "area": "the visible surface is the same"}[table.average]
+    paired = [f"All rigs were measured against the same reference points, so that {shared}."]
+    return [*(paired if len(table.rigs) > 1 else []), *notes, *table.notes]
 
 
 def merge_notes(notes: Mapping[str, Sequence[str]]) -> list[str]:
-    """What is said of all, then what is said of some, which begins with their names.
+    """Merge notes of several rigs: common notes first, then the others with the name of their rig.
+
+    Args:
+        notes: Name of the rig -> its notes.
 
     Example:
-        >>> merge_notes({"roof": ["8 steps.", "Blind."], "grille": ["8 steps."]})
-        ['8 steps.', 'roof: Blind.']
+        >>> merge_notes({"roof": ["8 frames.", "Blind."], "grille": ["8 frames."]})
+        ['8 frames.', 'roof: Blind.']
     """
-    common = [note for note in next(iter(notes.values())) if all(note in each for each in notes.values())]
-    return [*common, *(f"{name}: {note}" for name, each in notes.items() for note in each if note not in common)]
+    first_notes = next(iter(notes.values()))
+    common = [note for note in first_notes if all(note in rig_notes for rig_notes in notes.values())]
+    merged = list(common)
+    for name, rig_notes in notes.items():
+        merged += [f"{name}: {note}" for note in rig_notes if note not in common]
+    return merged
 
 
 def explain_marks(table: CoverageTable) -> dict[str, str]:
-    """What the marks of differences mean, by their names; empty where there are none."""
-    several, by_sensor = len(table.rigs) > 1, any(get_failure_sensors(rows) for rows in table.rows.values())
-    if not (several or by_sensor) or not table.has_intervals:
+    """Explain the marks "best" and "significant" of numbers.
+
+    Args:
+        table: The table.
+
+    Returns:
+        Mark -> meaning; empty if nothing is marked.
+    """
+    has_rigs = len(table.rigs) > 1
+    has_failures = any(get_failure_sensors(rows) for rows in table.rows.values())
+    if not (has_rigs or has_failures) or not table.has_intervals:
         return {}
-    best = {"best": "the best of its row, where its lead over the next is more than chance."} if several else {}
-    chance = "more than chance, by Student's t at 95 %: of 20 rows without a difference, one is marked."
-    return {**best, "significant": chance}
+    best = {"best": "best of its row, with a significant lead over the next."} if has_rigs else {}
+    significant = "significant by Student's t at 95 %; of 20 rows without a difference, one is marked on average."
+    return {**best, "significant": significant}
 
 
-def _of_rig(table: CoverageTable, rig: str) -> list[str]:
+def _format_rig_notes(table: CoverageTable, rig: str) -> list[str]:
     bands = ", ".join(f"{name} {format_height_band(table.grid, name)}" for name in table.grid.heights)
-    first = f"{format_resolution(table.conditions[rig].counts['num_frames'], table.grid)}; {bands}."
-    sentences = (remark.sentence for remark in collect_table_notes(table, rig))
+    resolution = f"{format_resolution(table.conditions[rig].counts['num_frames'], table.grid)}; {bands}."
+    sentences = [note.sentence for note in collect_table_notes(table, rig)]
     failure = describe_single_point_of_failure(table, rig)
-    return [first, *sentences, *([failure] if failure else [])]
+    return [resolution, *sentences, *([failure] if failure else [])]
 
 
-# The range that is told is that of the region ahead that reaches farthest, but no farther than this.
-RANGE_M = 80.0
-BANDS = {"ground": "ground", "obstacle": "obstacles"}
-# Of so many places that all say the same, at least nine in ten say it anywhere, with 95 % confidence: 0.9**30 < 0.05.
-LEAST_AGREED = 30
-SIDES = {"front_3m": "in front", "rear_3m": "behind", "left_3m": "on the left", "right_3m": "on the right"}
+@dataclass(frozen=True)
+class FindingsParams:
+    """Parameters of the sentences that summarize a table.
+
+    Args:
+        max_range_m: Regions ahead that reach farther are not summarized.
+        min_agreeing_positions: Number of positions that must agree for a share of 0 or 100 % without interval: if 30
+            agree, at least nine in ten agree anywhere with 95 % confidence, since 0.9 ** 30 < 0.05.
+    """
+
+    max_range_m: float = 80.0
+    min_agreeing_positions: int = 30
 
 
 def summarize_findings(table: CoverageTable) -> tuple[str, ...]:
-    """What a meeting is told of a table; the first sentence says most.
+    """Summarize a table in sentences, the most important first.
 
     Args:
-        table: Of one rig, or of several that are compared.
+        table: The table.
 
     Returns:
-        Sentences: on bodies beside the vehicle, on the range, on the failure of a sensor; those that there are numbers
-        for, or that steps are too few.
+        Sentences about test targets, detection ahead, sensor failures, and missing confidence intervals, as far as the
+        table has the numbers.
     """
-    told = tuple(filter(None, (rule(table) for rule in RULES)))
-    return tuple(filter(None, (*told, explain_missing_intervals(table, "ranges" if told else "an answer"))))
+    findings = [describe_near_field(table), describe_range(table), describe_failures(table)]
+    findings = [finding for finding in findings if finding]
+    missing = explain_missing_intervals(table, "confidence intervals" if findings else "an answer")
+    return tuple([*findings, missing] if missing else findings)
 
 
 def explain_missing_intervals(table: CoverageTable, subject: str) -> str:
-    """Say that frames are too few for intervals, where these were asked for, and how many would give them.
+    """Explain that there are too few frames for confidence intervals, and how many are needed.
 
     Args:
-        table: Of one rig or several.
-        subject: What intervals are needed for: "an answer".
+        table: The table.
+        subject: Purpose of the intervals, such as "an answer".
 
     Returns:
-        A sentence; empty where some number has an interval, or where none was asked for.
+        A sentence; empty if some number has an interval, or if no intervals were requested.
     """
-    steps, blocks = table.first_conditions.counts["num_frames"], table.first_conditions.blocks
+    num_frames, blocks = table.first_conditions.counts["num_frames"], table.first_conditions.blocks
     if blocks is None or table.has_intervals:
         return ""
-    needed, ends = estimate_blocks_needed(blocks, table.first_conditions.effective_blocks[0]), table.block_ends
-    begin = f"Not enough frames for {subject}: {steps:,} form {blocks} block{'s' * (blocks != 1)} of time, "
-    if ends and len(ends) < needed:
-        return f"{begin}intervals need about {needed}, and this source has {len(ends)} in all."
-    frames = ends[needed - 1] if ends else needed * (table.first_conditions.frames_per_block or 1)
-    return f"{begin}intervals need about {needed}, which are {frames:,} frames (`--num-frames`)."
+    needed = estimate_blocks_needed(blocks, table.first_conditions.effective_blocks[0])
+    got = f"{num_frames:,} frames form {blocks} block{'s' * (blocks != 1)}"
+    if table.block_ends and len(table.block_ends) < needed:
+        return (
+            f"Not enough frames for {subject}: {got}, {needed} are needed, and the source has {len(table.block_ends)}."
+        )
+    frames_per_block = table.first_conditions.frames_per_block or 1
+    needed_frames = table.block_ends[needed - 1] if table.block_ends else needed * frames_per_block
+    return (
+        f"Not enough frames for {subject}: {got}, {needed} are needed (about {needed_frames:,} frames; `--num-frames`)."
+    )
 
 
-def describe_near_field(table: CoverageTable) -> str:
-    """At what share of the free places beside the vehicle the first body is seen, side by side."""
-    rows = list(zip(*table.target_rows.values(), strict=True))
-    if not rows:
+def describe_near_field(table: CoverageTable, params: FindingsParams = FindingsParams()) -> str:
+    """Describe the share of free positions near the vehicle at which the first test target is detected, by side.
+
+    Args:
+        table: The table.
+        params: Parameters of the sentence.
+
+    Returns:
+        A sentence; empty without test targets.
+    """
+    target_rows = list(zip(*table.target_rows.values(), strict=True))
+    if not target_rows:
         return ""
-    body, key = rows[0][0].summary.band, table.target_quantities[0].key
-    near = [of for of in rows if of[0].summary.band == body and of[0].region.name in SIDES]
-    of_sides = {SIDES[of[0].region.name]: of for of in near}
-    enough = (table.first_conditions.blocks or 0) >= MIN_BLOCKS
-    told = {
-        side: _told(of, key, enough=enough and of[0].summary.numbers[key].count >= LEAST_AGREED)
-        for side, of in of_sides.items()
-    }
-    known = [f"{side} {words}" for side, words in told.items() if words]
-    criterion = table.target_quantities[0].title.removeprefix("free places with ")
-    seen = f"{format_target_name(body)} is seen ({criterion})"
-    if known:
-        return f"Free places within 3 m where {seen}: {'; '.join(known)}."
-    unknown = all(math.isnan(row.summary.numbers[key].error) for of in of_sides.values() for row in of)
-    several = len(table.rigs) > 1 and not unknown
-    return f"Of the places within 3 m where {seen}, no rig has more than the others beyond chance." * several
+    target, quantity = target_rows[0][0].summary.band, table.target_quantities[0]
+    sides = {"front_3m": "in front", "rear_3m": "behind", "left_3m": "on the left", "right_3m": "on the right"}
+    has_enough_blocks = (table.first_conditions.blocks or 0) >= MIN_BLOCKS
+    texts: list[str] = []
+    errors: list[float] = []
+    for rows in target_rows:
+        if rows[0].summary.band != target or rows[0].region.name not in sides:
+            continue
+        errors += [row.summary.numbers[quantity.key].error for row in rows]
+        has_enough_positions = rows[0].summary.numbers[quantity.key].count >= params.min_agreeing_positions
+        text = _describe_share(rows, quantity.key, is_sufficient=has_enough_blocks and has_enough_positions)
+        if text:
+            texts.append(f"{sides[rows[0].region.name]} {text}")
+    criterion = quantity.title.removeprefix("free places with ").removeprefix("free positions with ")
+    detected = f"{format_target_name(target)} is detected ({criterion})"
+    if texts:
+        return f"Free positions within 3 m where {detected}: {'; '.join(texts)}."
+    if len(table.rigs) > 1 and not all(math.isnan(error) for error in errors):
+        return f"Free positions within 3 m where {detected}: no rig has significantly more than the others."
+    return ""
 
 
 def describe_range(table: CoverageTable) -> str:
-    """What is detected ahead: of one rig with intervals, of several who leads by more than chance."""
+    """Describe detection ahead: of one rig with its interval, of several the one that leads significantly.
+
+    Args:
+        table: The table.
+
+    Returns:
+        A sentence; empty without a region ahead, thresholds or intervals.
+    """
     region = find_forward_region(table)
     if region is None or not table.thresholds_m or not table.has_intervals:
         return ""
-    key, where = get_main_quantity(table).key, f"to {region.x_m[1]:g} m ahead ({detected_words(table)})"
-    bands = [of for of in table.rows_by_region if of[0].region is region]
-    told = {surface_words(table, of[0]): _told(of, key, enough=True) for of in bands}
-    known = [f"of {band} {words}" for band, words in told.items() if words]
-    if known:
-        return f"Detected {where}: {'; '.join(known)}."
-    return f"No rig detects more than the others {where} beyond chance." * (len(table.rigs) > 1)
+    key = get_main_quantity(table).key
+    distance = f"to {region.x_m[1]:g} m ahead ({describe_criterion(table)})"
+    texts = []
+    for rows in table.rows_by_region:
+        if rows[0].region is region and (text := _describe_share(rows, key, is_sufficient=True)):
+            texts.append(f"of {describe_surface(table, rows[0])} {text}")
+    if texts:
+        return f"Detected {distance}: {'; '.join(texts)}."
+    return f"No rig detects significantly more than the others {distance}." * (len(table.rigs) > 1)
 
 
-def detected_words(table: CoverageTable) -> str:
-    """Describe the criterion of detection: how near a point of the rig must be."""
+def describe_criterion(table: CoverageTable) -> str:
+    """Describe the criterion of detection: the maximum distance to a sensor point.
+
+    Args:
+        table: The table.
+    """
     return f"a point within {table.thresholds_m[0]:g} m"
 
 
-def surface_words(table: CoverageTable, row: Row) -> str:
+def describe_surface(table: CoverageTable, row: Row) -> str:
     """Describe the surface to which the numbers of a row refer: visible square meters, or observed cells.
 
     Args:
@@ -343,57 +468,85 @@ def surface_words(table: CoverageTable, row: Row) -> str:
     Returns:
         Words such as "512.3 m² of visible ground".
     """
-    surface = BANDS.get(row.summary.band, row.summary.band)
+    surface = {"obstacle": "obstacles"}.get(row.summary.band, row.summary.band)
     if table.average == "area":
         return f"{format_square_meters(row.summary.visible_m2)} m² of visible {surface}"
     return f"{row.summary.observed_cells:,} observed cells of {surface}"
 
 
-def find_forward_region(table: CoverageTable) -> Region | None:
-    """The region that the range is told of: of those that begin at the vehicle the farthest to `RANGE_M`; else none."""
-    regions = dict.fromkeys(of[0].region for of in table.rows_by_region)
-    reached = [one for one in regions if one.x_m[0] == 0.0 and one.x_m[1] <= RANGE_M and not one.corners_m]
-    return max(reached, key=lambda one: one.x_m[1], default=None)
+def find_forward_region(table: CoverageTable, params: FindingsParams = FindingsParams()) -> Region | None:
+    """Find the rectangle that begins at the vehicle and reaches farthest ahead within the maximum range.
+
+    Args:
+        table: The table.
+        params: Maximum range.
+
+    Returns:
+        The region; None if there is none.
+    """
+    farthest: Region | None = None
+    for rows in table.rows_by_region:
+        region = rows[0].region
+        if region.x_m[0] != 0.0 or region.x_m[1] > params.max_range_m or region.corners_m:
+            continue
+        if farthest is None or region.x_m[1] > farthest.x_m[1]:
+            farthest = region
+    return farthest
 
 
 def describe_failures(table: CoverageTable) -> str:
-    """The sensor that most hangs on, of each rig."""
-    asked = [rig for rig in table.rigs if get_failure_sensors(table.rows[rig])]
-    several = len(table.rigs) > 1
-    return " ".join(f"{rig}: " * several + describe_single_point_of_failure(table, rig) for rig in asked)
+    """Describe the single point of failure of each rig.
+
+    Args:
+        table: The table.
+
+    Returns:
+        Sentences; empty without redundancy.
+    """
+    sentences = []
+    for rig in table.rigs:
+        if get_failure_sensors(table.rows[rig]):
+            prefix = f"{rig}: " * (len(table.rigs) > 1)
+            sentences.append(prefix + describe_single_point_of_failure(table, rig))
+    return " ".join(sentences)
 
 
-RULES: tuple[Callable[[CoverageTable], str], ...] = (describe_near_field, describe_range, describe_failures)
-
-
-def _told(rows: Sequence[Row], key: str, *, enough: bool) -> str:
-    """A share of one rig with its interval; of several who leads by more than chance; no words if nobody knows."""
+def _describe_share(rows: Sequence[Row], key: str, *, is_sufficient: bool) -> str:
+    """Describe a share of one rig with its interval, or of several the leader; empty if it is not significant."""
     if len(rows) == 1:
         number = rows[0].summary.numbers[key]
-        # Where all blocks say the same there is no interval, and nothing is left to chance.
-        agreed = math.isnan(number.low) and number.value in (0.0, 1.0) and enough
-        interval = "" if agreed else f" [{format_whole_percent(number.low)}, {format_whole_percent(number.high)}]"
-        return f"{format_whole_percent(number.value)} %{interval}" if agreed or not math.isnan(number.low) else ""
+        value = f"{format_whole_percent(number.value)} %"
+        if not math.isnan(number.low):
+            return f"{value} [{format_whole_percent(number.low)}, {format_whole_percent(number.high)}]"
+        # If all blocks agree, there is no interval, and enough of them need none.
+        return value if number.value in (0.0, 1.0) and is_sufficient else ""
     leader = next((row for row in rows if key in row.leading_keys), None)
     if leader is None:
         return ""
-    second = max((row for row in rows if row is not leader), key=lambda row: row.summary.numbers[key].value)
+    followers = [row for row in rows if row is not leader]
+    second = max(followers, key=lambda row: row.summary.numbers[key].value)
     return ", ".join(f"{row.rig} {format_whole_percent(row.summary.numbers[key].value)} %" for row in (leader, second))
 
 
 def format_target_name(name: str) -> str:
-    """What a body is called in a sentence.
+    """Format the name of a test target with its article.
+
+    Args:
+        name: Name of the target.
 
     Example:
         >>> format_target_name("child_110cm"), format_target_name("adult")
         ('a child', 'an adult')
     """
-    plain = name.partition("_")[0]
-    return f"{'an' if plain[:1] in 'aeiou' else 'a'} {plain}"
+    noun = name.partition("_")[0]
+    return f"{'an' if noun[:1] in 'aeiou' else 'a'} {noun}"
 
 
 def format_whole_percent(share: float) -> str:
-    """Without decimals, but some is not none, and nearly all is not all.
+    """Format a share in percent without decimals, never rounded to 0 or 100.
+
+    Args:
+        share: Share in [0, 1].
 
     Example:
         >>> [format_whole_percent(share) for share in (0.0, 0.001, 0.126, 0.999, 1.0)]

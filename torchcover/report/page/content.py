@@ -11,9 +11,9 @@ from torch import Tensor
 
 from torchcover.coverage import Coverage, Layer
 from torchcover.estimation import Number
-from torchcover.report.colors import NEVER_PROBED, ColorScale, build_color_scale, build_difference_scale, to_array
+from torchcover.report.colors import UNOBSERVED, ColorScale, build_color_scale, build_difference_scale, to_array
 from torchcover.report.map_layers import (
-    NOTHING_FOUND,
+    NO_SURFACE,
     compute_difference,
     compute_square_sides,
     downsample_coverage,
@@ -73,7 +73,7 @@ class PageMap:
     cell_m: float
     values: Array
     scale: ColorScale
-    unobserved_label: str = NEVER_PROBED
+    unobserved_label: str = UNOBSERVED
     errors: Array | None = None
     weights: Array | None = None
     weight_name: str = ""
@@ -263,7 +263,7 @@ def _of_quantity(
                 cell_m=grid.cell_m,
                 values=spread[rig][band],
                 scale=scale,
-                unobserved_label=NEVER_PROBED if weights.sides is None else NOTHING_FOUND,
+                unobserved_label=UNOBSERVED if weights.sides is None else NO_SURFACE,
                 errors=None if error is None else error[band],
                 weights=weights.values[band],
                 weight_name=weights.name,

@@ -12,7 +12,7 @@ from torchcover.report.overlay import SensorView, get_sensor_color
 from torchcover.report.page.content import Array, DetectionShares, TargetVisibilityMap
 from torchcover.report.table import CoverageTable
 from torchcover.report.table_layout import PageTable, TextCell
-from torchcover.report.table_notes import detected_words, get_main_quantity, surface_words
+from torchcover.report.table_notes import describe_criterion, describe_surface, get_main_quantity
 
 # Of the plan, beyond which nothing is drawn; lines are so far from the vehicle.
 REACH_M = 3.4
@@ -31,7 +31,7 @@ def build_detection_shares(table: CoverageTable) -> list[DetectionShares]:
     key = get_main_quantity(table).key
     return [
         DetectionShares(
-            f"{surface_words(table, rows[0])} to {rows[0].region.x_m[1]:g} m: {detected_words(table)}",
+            f"{describe_surface(table, rows[0])} to {rows[0].region.x_m[1]:g} m: {describe_criterion(table)}",
             {row.rig: row.summary.numbers[key] for row in rows},
         )
         for rows in table.rows_by_region
