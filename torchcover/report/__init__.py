@@ -1,4 +1,4 @@
-"""What a run shows: a table and its renderers, maps, drawings, a page."""
+"""Presentation of results: tables and their renderers, maps, plots, and the HTML page."""
 
 import lazy_loader
 

@@ -120,7 +120,7 @@ def print_page_tables(tables: Sequence[PageTable]) -> None:
 
 
 def _build_wrapped_table(table: PageTable, limit: int) -> Table:
-    """Build a table without markup whose widest columns are wrapped until it has at most `limit` characters per line."""
+    """Build a table without markup whose widest columns are wrapped to at most `limit` characters per line."""
     columns = [(name, [row[index].text for row in table.rows]) for index, name in enumerate(table.headings)]
     widths = [_find_longest([name, *cells], "\n") for name, cells in columns]
     max_word_chars = 10  # longer words of headings may be broken

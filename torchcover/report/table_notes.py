@@ -103,8 +103,8 @@ class FailureParams:
     """Parameters of the test for a single point of failure.
 
     Args:
-        min_share: Minimum share of the detection rate that is lost, or by which the radius grows. The default of a tenth
-            exceeds the influence of settings on a number, see docs/accuracy.md.
+        min_share: Minimum share of the detection rate that is lost, or by which the radius grows. The default of a
+            tenth exceeds the influence of settings on a number, see docs/accuracy.md.
     """
 
     min_share: float = 0.1
