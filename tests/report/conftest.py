@@ -25,7 +25,7 @@ def measured(sensor: torch.Tensor, *, grid: BevGrid = GRID, seed: int = 0, **opt
 
 def over_steps(size: int, seed: int, steps: int, **options) -> Coverage:
     """One cloud of the rig a step, against reference points of that step."""
-    metric = CoverageMetric(GRID, blocks=16, **options)
+    metric = CoverageMetric(GRID, num_blocks=16, **options)
     for index in range(steps):
         metric.update(cloud(size, seed * 100 + index), cloud(100, 1000 + index), block_index=index)
     return metric.compute()
@@ -33,7 +33,7 @@ def over_steps(size: int, seed: int, steps: int, **options) -> Coverage:
 
 def over_surface(size: int, seed: int, steps: int) -> Coverage:
     """As `over_steps`, but every reference point stands for 0.1 to 0.9 square metres."""
-    metric = CoverageMetric(GRID, blocks=16, square_metres=True)
+    metric = CoverageMetric(GRID, num_blocks=16, has_area_weights=True)
     for index in range(steps):
         m2 = 0.1 + 0.8 * torch.rand(100, generator=torch.Generator().manual_seed(index))
         metric.update(cloud(size, seed * 100 + index), cloud(100, 1000 + index), weights=m2, block_index=index)

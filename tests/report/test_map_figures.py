@@ -30,7 +30,7 @@ def coverage_of(grid: BevGrid, **options) -> Coverage:
 
 
 def blocked(steps: int) -> Coverage:
-    metric = CoverageMetric(SQUARE, blocks=16)
+    metric = CoverageMetric(SQUARE, num_blocks=16)
     for index in range(steps):
         points = [[0.5, 0.5, 0.0]] if index % 8 else [[0.5, 0.5, 0.0], [9.5, 0.5, 0.0]]
         metric.update(torch.tensor([[0.5, 0.5, -0.3 - 0.02 * (index % 16)]]), torch.tensor(points), block_index=index)
@@ -107,7 +107,7 @@ def test_every_aggregation_is_drawn_under_its_key():
     aggregations = [kind.parse(kind.example) for kind in AGGREGATIONS]
     points = torch.tensor([[0.5, 0.5, 0.5], [1.5, 0.5, 0.5]])
     for over_surface, others in ((False, ()), (True, ("radius_m", "detection_0.4m"))):
-        metric = CoverageMetric(SMALL, aggregations=aggregations, square_metres=over_surface)
+        metric = CoverageMetric(SMALL, aggregations=aggregations, has_area_weights=over_surface)
         metric.update(torch.zeros(1, 3), points, weights=torch.ones(2))
         coverage = metric.compute()
         shown = names({"a": coverage})

@@ -34,7 +34,7 @@ def table(surface_pair, regions):
 def two_cells() -> Coverage:
     """3 m2 at a radius of 0 and 1 m2 at one of 1 m, in cells of their own; then a step of nothing."""
     grid = BevGrid(x_m=(0.0, 3.0), y_m=(0.0, 1.0), cell_m=1.0, heights={"all": (-1.0, 1.0)})
-    metric = CoverageMetric(grid, square_metres=True)
+    metric = CoverageMetric(grid, has_area_weights=True)
     reference = torch.tensor([[0.5, 0.5, 0.0], [1.5, 0.5, 0.0]])
     metric.update(reference[:1], reference, weights=torch.tensor([3.0, 1.0]))
     metric.update(reference[:1], torch.zeros(0, 3), weights=torch.zeros(0))

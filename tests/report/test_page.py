@@ -150,7 +150,7 @@ def page_of(coverages, **more) -> Page:
 
 def over_surface(size: int, points) -> Coverage:
     """So many points of a rig in each of 16 steps, against the same surface points: many cells have errors."""
-    metric = CoverageMetric(GRID, blocks=16, square_metres=True)
+    metric = CoverageMetric(GRID, num_blocks=16, has_area_weights=True)
     for index in range(16):
         m2 = 0.1 + 0.8 * torch.rand(400, generator=torch.Generator().manual_seed(index))
         metric.update(points(size, 100 + index), points(400, 1000 + index), weights=m2, block_index=index)

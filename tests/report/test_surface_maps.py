@@ -9,8 +9,7 @@ import torch
 from torchcover.coverage import BevGrid, CoverageMetric, Region
 from torchcover.coverage.blocks import BlockSums
 from torchcover.report.map_layers import (
-    FAINTEST,
-    MIN_POINTS,
+    MapParams,
     compute_opacity,
     compute_ratios,
     compute_square_sides,
@@ -26,7 +25,7 @@ ALL = Region("all", GRID.x_m, GRID.y_m)
 
 def measured(steps: int = 16, points: int = 400):
     """Points that crowd in a corner and leave another empty, and weigh from 0.001 to 1 m2."""
-    metric = CoverageMetric(GRID, (0.1, 0.2), blocks=16, square_metres=True)
+    metric = CoverageMetric(GRID, (0.1, 0.2), num_blocks=16, has_area_weights=True)
     for index in range(steps):
         random = torch.Generator().manual_seed(index)
         size = torch.tensor([5.75, 3.25, 2.0])
@@ -53,7 +52,7 @@ def cut(points: np.ndarray, sides: np.ndarray, y: int, x: int, side: int) -> Non
     """A slow twin: cut one square, then its quarters."""
     quarters = [(y + dy, x + dx, side // 2) for dy in (0, side // 2) for dx in (0, side // 2)]
     inside = [points[qy : qy + half, qx : qx + half].sum() for qy, qx, half in quarters]
-    if side > 1 and all(found == 0 or found >= MIN_POINTS for found in inside):
+    if side > 1 and all(found == 0 or found >= MapParams.min_points for found in inside):
         for quarter in quarters:
             cut(points, sides, *quarter)
     else:
@@ -83,14 +82,14 @@ def test_no_square_is_larger_than_two_metres_unless_the_cell_is(cell_m, largest)
 def test_where_points_are_many_a_cell_has_its_own_ratio(coverage, sides):
     alone = (sides == 1) & (coverage.points > 0)
     assert int(alone.sum()) > 40
-    for found, key in zip(compute_ratios(coverage.area, sides), list(coverage.layers)[3:], strict=True):
+    for found, key in zip(compute_ratios(coverage.area_sums, sides), list(coverage.layers)[3:], strict=True):
         assert torch.equal(found[alone], coverage.layers[key].values[alone])
 
 
 def test_a_square_has_the_ratio_of_the_sums_of_its_cells(coverage, sides):
-    m2, *sums = coverage.area.totals().numpy()
+    m2, *sums = coverage.area_sums.totals().numpy()
     sums = np.stack(sums)
-    found = compute_ratios(coverage.area, sides).numpy()
+    found = compute_ratios(coverage.area_sums, sides).numpy()
     for band, y, x in zip(*(sides == 4).numpy().nonzero(), strict=True):
         rows, columns = (slice(at // 4 * 4, at // 4 * 4 + 4) for at in (y, x))
         expected = sums[:, band, rows, columns].sum(axis=(1, 2)) / m2[band, rows, columns].sum()
@@ -98,20 +97,20 @@ def test_a_square_has_the_ratio_of_the_sums_of_its_cells(coverage, sides):
 
 
 def test_what_is_drawn_weighs_as_much_as_the_region_has(coverage, sides):
-    m2 = sum_over_squares(coverage.area.totals()[0], sides)
+    m2 = sum_over_squares(coverage.area_sums.totals()[0], sides)
     each = m2 / sum_over_squares(torch.ones_like(m2), sides)
     for band, height in enumerate(GRID.heights):
-        weighted = (compute_ratios(coverage.area, sides)[:, band] * each[band]).nansum(dim=(1, 2)) / each[band].sum()
+        weighted = (compute_ratios(coverage.area_sums, sides)[:, band] * each[band]).nansum(dim=(1, 2)) / each[band].sum()
         torch.testing.assert_close(weighted, coverage.estimate(ALL, height).value, rtol=1e-12, atol=0)
 
 
 def test_a_place_without_a_square_metre_is_unknown_and_has_no_opacity(coverage, sides):
-    seen = sum_over_squares(coverage.area.totals()[0], sides) > 0
+    seen = sum_over_squares(coverage.area_sums.totals()[0], sides) > 0
     assert 0 < int(seen.sum()) < seen.numel()
-    assert torch.equal(compute_ratios(coverage.area, sides).isfinite(), seen.expand(3, -1, -1, -1))
-    opacity = compute_opacity(coverage.area, 16, sides, CELL_M)
+    assert torch.equal(compute_ratios(coverage.area_sums, sides).isfinite(), seen.expand(3, -1, -1, -1))
+    opacity = compute_opacity(coverage.area_sums, 16, sides, CELL_M)
     assert torch.equal(opacity == 0, ~seen)
-    assert opacity[seen].min() > FAINTEST
+    assert opacity[seen].min() > MapParams.min_opacity
     assert opacity.max() <= 1
 
 
@@ -129,7 +128,7 @@ def test_opacity_grows_with_the_surface_up_to_that_of_open_ground():
     m2 = torch.tensor([0.0, 1e-9, 0.01, 0.1, 10 * CELL_M**2, 50.0]).double()[None, None]
     one = torch.ones(m2.shape, dtype=torch.int64)
     nothing, *rising, full, more = compute_opacity(sums_of(m2), 10, one, CELL_M).flatten().tolist()
-    assert nothing == 0 < FAINTEST < rising[0] < rising[1] < rising[2] < full == more == 1
+    assert nothing == 0 < MapParams.min_opacity < rising[0] < rising[1] < rising[2] < full == more == 1
 
 
 def test_open_ground_is_opaque_in_squares_that_the_grid_cuts_off_too():
@@ -138,7 +137,7 @@ def test_open_ground_is_opaque_in_squares_that_the_grid_cuts_off_too():
         opacity = compute_opacity(sums_of(ground), 10, torch.full((1, 5, 5), side), CELL_M)
         torch.testing.assert_close(opacity, torch.ones_like(opacity), rtol=1e-12, atol=0)
         quarter = compute_opacity(sums_of(ground / 4), 10, torch.full((1, 5, 5), side), CELL_M)
-        torch.testing.assert_close(quarter, torch.full_like(quarter, (1 + FAINTEST) / 2), rtol=1e-12, atol=0)
+        torch.testing.assert_close(quarter, torch.full_like(quarter, (1 + MapParams.min_opacity) / 2), rtol=1e-12, atol=0)
 
 
 def test_infinity_stays_in_its_square():
@@ -149,13 +148,13 @@ def test_infinity_stays_in_its_square():
     assert torch.equal(found.isinf()[0], torch.tensor([[True, True, False, False]] * 2 + [[False] * 4] * 2))
 
 
-@pytest.mark.parametrize(("cell", "trailing_distance_m"), [(0.25, 0.25), (0.15, 0.15), (0.125, 0.25), (0.05, 0.2)])
+@pytest.mark.parametrize(("cell", "drawn_m"), [(0.25, 0.25), (0.15, 0.15), (0.125, 0.25), (0.05, 0.2)])
 def test_small_cells_are_drawn_in_squares_with_the_same_numbers(cell, drawn_m):
     """Neither side of the grid is a whole number of squares; a region's ratio is that of its squares."""
     grid = BevGrid(
         x_m=(0.0, 46 * cell), y_m=(0.0, 25 * cell), cell_m=cell, heights={"low": (0.0, 1.0), "high": (1.0, 2.0)}
     )
-    metric = CoverageMetric(grid, (0.1,), blocks=8, square_metres=True, regions=[])
+    metric = CoverageMetric(grid, (0.1,), num_blocks=8, has_area_weights=True, regions=[])
     for seed in range(16):
         random = torch.Generator().manual_seed(seed)
         rig, reference = (torch.rand(99, 3, generator=random) * torch.tensor([7.0, 4.0, 2.0]) for _ in range(2))
