@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from benchmarks import compare, table
 from torchcover import nearest
 from torchcover.data import SimulatedFrames
-from torchcover.neighbors.choice import choose_search
+from torchcover.neighbors.backend_choice import choose_search
 from torchcover.simulation import PaperReference
 
 RIGS = ("front_roof_128", "nuscenes", "edgar", "kitti_cameras")

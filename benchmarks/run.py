@@ -29,7 +29,7 @@ WATCHED = {
     "torchcover.simulation.simulator:Simulator._scans": RIG,
     "torchcover.simulation.surface_reference:SurfaceReference.scan": REFERENCE,
     "torchcover.simulation.scene:Scene.at": MOVING,
-    "torchcover.neighbors.query:_nearest": SEARCH,
+    "torchcover.neighbors.query:_search_nearest": SEARCH,
     "torchcover.coverage.sums:CoverageSums.sums_of": SUMS,
     "torchcover.coverage.sums:CoverageSums.add": SUMS,
     "torchcover.targets.probing:Probes.sums_of": BODIES,
@@ -164,14 +164,15 @@ def parts(folder):
     observe = owner_of("torchcover.evaluation.measurement:observe")
     setattr(*observe, first(getattr(*observe)))
     watches.watch_all()
-    raycaster, choice = (import_module(f"torchcover.{name}") for name in ("simulation.raycaster", "neighbors.choice"))
+    raycaster = import_module("torchcover.simulation.raycaster")
+    choice = import_module("torchcover.neighbors.backend_choice")
 
     class Scene(raycaster.EmbreeScene):
         run = timed(raycaster.EmbreeScene.run, EMBREE)
 
     raycaster.EmbreeScene = Scene
-    search_of = choice._search_of
-    choice._search_of = lambda backend: timed(search_of(backend), BARE_SEARCH)
+    load_search = choice._load_search
+    choice._load_search = lambda backend: timed(load_search(backend), BARE_SEARCH)
     sys.argv = ["torchcover", *COMMAND, "--num-workers", "0", "--out", folder]
     try:
         command_line()

@@ -41,7 +41,7 @@ def draw(reference, before, after, path):
     """The reference coloured by its radius, under the points, before and after."""
     figure, axes = plt.subplots(2, 1, figsize=(9.0, 11.0), layout="constrained")
     for ax, points, title in zip(axes, (before, after), ("before", "after"), strict=True):
-        radius = blind_spot_radius(reference, points)
+        radius = blind_spot_radius(points, reference)
         dots = ax.scatter(*reference[:, :2].T, c=radius, s=3, cmap="viridis_r", vmin=0.0, vmax=3.0, linewidths=0)
         ax.plot(*points[:, :2].T, "r.", markersize=3)
         ax.set(title=f"{title}: mean radius {radius.mean():.2f} m", xlabel="x in m", ylabel="y in m", aspect="equal")
@@ -55,7 +55,7 @@ def main():
     """Optimise; print the numbers, draw the picture."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--points", type=int, default=400, help="free points")
-    parser.add_argument("--num-frames", type=int, default=200, help="steps of gradient descent")
+    parser.add_argument("--num-steps", type=int, default=200, help="steps of gradient descent")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("out/optimise_points.png"))
     options = parser.parse_args()
@@ -68,14 +68,14 @@ def main():
 
     points = before.clone().requires_grad_()
     descent = torch.optim.Adam([points], lr=0.1)
-    for _ in track(range(options.steps), description="gradient steps", console=console):
+    for _ in track(range(options.num_steps), description="gradient steps", console=console):
         descent.zero_grad()
-        blind_spot_radius(reference, points).mean().backward()
+        blind_spot_radius(points, reference).mean().backward()
         descent.step()
 
     after = points.detach()
     for name, cloud in (("before", before), ("after", after)):
-        radius = blind_spot_radius(reference, cloud)
+        radius = blind_spot_radius(cloud, reference)
         seen = (radius <= THRESHOLD_M).float().mean()
         console.print(f"{name}: mean radius {radius.mean():.3f} m, {seen:.1%} of the reference within {THRESHOLD_M} m")
     draw(reference, before, after, options.out)

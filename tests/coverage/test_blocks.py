@@ -213,7 +213,7 @@ def test_the_error_of_a_difference_is_that_of_the_paired_values():
 
 @pytest.mark.parametrize("blocks", [0, 2, 6, 9, -8])
 def test_a_number_of_blocks_that_gives_no_error_to_believe_is_refused(blocks):
-    with pytest.raises(ValueError, match=f"blocks: 1, or an even number from 8 on, is needed; got {blocks}"):
+    with pytest.raises(ValueError, match=f"num_blocks: 1, or an even number from 8 on, is needed; got {blocks}"):
         CoverageMetric(GRID, num_blocks=blocks)
 
 

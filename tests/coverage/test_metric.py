@@ -214,7 +214,7 @@ def test_without_radii_only_points_near_the_reference_matter_to_the_last_bit():
     assert less.counts["saturated_points"] == 0
     with pytest.raises(ValueError, match="radii: aggregations and sensors need them"):
         CoverageMetric(GRID, (0.25,), needs_radii=False, aggregations=[Maximum()])
-    with pytest.raises(ValueError, match="by another metric"):
+    with pytest.raises(ValueError, match="belongs to another metric"):
         CoverageMetric(GRID, (0.25,)).merge_state(CoverageMetric(GRID, (0.25,), needs_radii=False))
 
 

@@ -166,7 +166,7 @@ def test_devices_without_float64_get_what_the_cpu_computes():
         turned = rotate(frame, 0.3)
         region = Region.from_corners("corner", [(0.0, 0.0), (20.0, 0.0), (20.0, 20.0)])
         return [
-            *nearest(reference, sensor), blind_spot_radius(reference, sensor, max_radius=2.0), grid.find_cells(reference),
+            *nearest(reference, sensor), blind_spot_radius(sensor, reference, max_radius=2.0), grid.find_cells(reference),
             *grid.assign_cells(reference), grid.count_points_by_column(reference), region.mask_points(*reference[:, :2].T),
             *find_points_in_boxes(reference, boxes), seen.share, seen.reference_points, compute_bev_iou(boxes.rows, boxes.rows),
             turned.reference, turned.boxes.rows, *camera.project(reference), camera.unproject(depth),

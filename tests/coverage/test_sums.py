@@ -8,7 +8,7 @@ import torch
 from torchcover import BevGrid, CoverageMetric
 from torchcover.coverage import Maximum, PooledMean
 from torchcover.metrics import sum_rows
-from torchcover.metrics.blocks import merge_tables
+from torchcover.metrics.blocked_sums import merge_tables
 
 ONE_CELL = BevGrid(x_m=(0.0, 1.0), y_m=(0.0, 1.0), cell_m=1.0, heights={"all": (-1.0, 1.0)})
 STEP = (torch.tensor([[1.0, 0.0, 0.0]]), torch.zeros(1, 3))

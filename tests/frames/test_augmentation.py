@@ -34,8 +34,8 @@ def test_radii_stay_and_scale_with_a_scaling(move, factor):
     frame = make_frame()
     moved = move(frame)
     for rig in ("a", "b"):
-        before = blind_spot_radius(frame.reference, frame.clouds[rig])
-        after = blind_spot_radius(moved.reference, moved.clouds[rig])
+        before = blind_spot_radius(frame.clouds[rig], frame.reference)
+        after = blind_spot_radius(moved.clouds[rig], moved.reference)
         torch.testing.assert_close(after, factor * before, atol=1e-5, rtol=1e-5)
 
 

@@ -344,7 +344,7 @@ def test_the_state_is_part_of_the_state_dict_only_if_asked_for(case):
     before = states(other)
     assert len(model.load_state_dict(saved, strict=False).unexpected_keys) == len(saved)
     assert_states(other, before)
-    with pytest.raises(RuntimeError, match="the state was made by another metric"):
+    with pytest.raises(RuntimeError, match="the state was belongs to another metric"):
         model.load_state_dict(saved)
 
 
@@ -428,7 +428,7 @@ def test_other_metrics_and_things_that_are_none_are_not_merged(case, of_every_ca
     for other in (SumMetric(), *(other for other in of_every_case if type(other) is not type(metric))):
         with pytest.raises(ValueError, match=f"cannot merge a {type(other).__name__} into a {type(metric).__name__}"):
             metric.merge_state(other)
-        with pytest.raises(ValueError, match="made by another metric"):
+        with pytest.raises(ValueError, match="belongs to another metric"):
             metric.merge_state(other.metric_state)
     for other in (3, None, [metric]):
         with pytest.raises(
@@ -446,9 +446,9 @@ def test_a_state_that_lacks_something_or_has_another_shape_is_refused(case):
         lacks = {key: state for key, state in states(other).items() if key != name}
         wrong = {**states(other), name: value[None]}
         for broken in (lacks, wrong):
-            with pytest.raises(ValueError, match=f"'{name}'|made by another metric"):
+            with pytest.raises(ValueError, match=f"'{name}'|belongs to another metric"):
                 metric.merge_state(broken)
-            with pytest.raises(RuntimeError, match=f"'{name}'|made by another metric"):
+            with pytest.raises(RuntimeError, match=f"'{name}'|belongs to another metric"):
                 metric.load_state_dict(broken)
     assert_states(metric, before)
 

@@ -3,14 +3,21 @@
 import pytest
 import torch
 
-from torchcover.neighbors.box_tree import AXIS_CELLS, LEAF, NONE, SPREAD, build_box_tree, compute_morton_order
+from torchcover.neighbors.box_tree import (
+    AXIS_CELLS,
+    LEAF_SIZE,
+    NO_INDEX,
+    SPREAD_STEPS,
+    build_box_tree,
+    compute_morton_order,
+)
 
 
 def random_cloud(count, seed, dtype=torch.float32):
     return torch.rand(count, 3, generator=torch.Generator().manual_seed(seed), dtype=dtype) * 100 - 50
 
 
-@pytest.mark.parametrize("count", [1, LEAF, LEAF + 1, 3 * LEAF, 1000])
+@pytest.mark.parametrize("count", [1, LEAF_SIZE, LEAF_SIZE + 1, 3 * LEAF_SIZE, 1000])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_boxes_and_smallest_numbers_are_of_all_beneath(count, dtype):
     points = random_cloud(count, count, dtype)
@@ -19,14 +26,14 @@ def test_boxes_and_smallest_numbers_are_of_all_beneath(count, dtype):
     assert torch.equal(tree.points, points[tree.point_indices])
     first = len(tree.boxes) // 2
     assert first.bit_count() == 1
-    leaves = list(zip(tree.points.split(LEAF), tree.point_indices.split(LEAF), strict=True))
-    assert len(leaves) == -(-count // LEAF) <= first
+    leaves = list(zip(tree.points.split(LEAF_SIZE), tree.point_indices.split(LEAF_SIZE), strict=True))
+    assert len(leaves) == -(-count // LEAF_SIZE) <= first
     for node in range(1, 2 * first):
         depth = first.bit_length() - node.bit_length()
         beneath = leaves[(node << depth) - first : ((node + 1) << depth) - first]
         if not beneath:
             assert tree.boxes[node].tolist() == [torch.inf] * 3 + [-torch.inf] * 3
-            assert tree.min_point_indices[node] == NONE
+            assert tree.min_point_indices[node] == NO_INDEX
             continue
         cloud, numbers = (torch.cat(parts) for parts in zip(*beneath, strict=True))
         assert torch.equal(tree.boxes[node], torch.cat([cloud.amin(dim=0), cloud.amax(dim=0)]))
@@ -34,8 +41,8 @@ def test_boxes_and_smallest_numbers_are_of_all_beneath(count, dtype):
 
 
 def leaf_sizes(cloud):
-    """The diagonals of the boxes around every `LEAF` points in order."""
-    leaves = cloud[compute_morton_order(cloud)][: len(cloud) // LEAF * LEAF].view(-1, LEAF, 3)
+    """The diagonals of the boxes around every `LEAF_SIZE` points in order."""
+    leaves = cloud[compute_morton_order(cloud)][: len(cloud) // LEAF_SIZE * LEAF_SIZE].view(-1, LEAF_SIZE, 3)
     return (leaves.amax(dim=1) - leaves.amin(dim=1)).double().norm(dim=1)
 
 
@@ -44,13 +51,13 @@ def test_points_far_away_do_not_coarsen_the_order(far_m):
     cloud = random_cloud(20_000, 1)
     alone = leaf_sizes(cloud).median()
     assert leaf_sizes(torch.cat([cloud, far_m * random_cloud(100, 2)])).median() < 1.2 * alone
-    assert alone < 1.5 * (LEAF / len(cloud)) ** (1 / 3) * 3**0.5 * 100
+    assert alone < 1.5 * (LEAF_SIZE / len(cloud)) ** (1 / 3) * 3**0.5 * 100
 
 
 def test_cells_are_spread_to_every_third_bit():
     cell = torch.randint(AXIS_CELLS, (500,), generator=torch.Generator().manual_seed(6))
     spread = cell
-    for bits, mask in SPREAD:
+    for bits, mask in SPREAD_STEPS:
         spread = (spread | (spread << bits)) & mask
     assert torch.equal(spread, sum(((cell >> bit) & 1) << (3 * bit) for bit in range(21)))
 

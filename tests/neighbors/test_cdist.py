@@ -80,9 +80,11 @@ class PeakMemory(TorchDispatchMode):
 
 @clouds
 @pytest.mark.parametrize("memory_mb", MEGABYTES)
-@pytest.mark.parametrize("between", [cdist._distances, cdist._squared_distances])  # of the CPU, and of other devices
+@pytest.mark.parametrize(
+    "between", [cdist._compute_distances, cdist._compute_squared_distances]
+)  # of the CPU, and of other devices
 def test_memory_stays_inside_the_budget(clouds, memory_mb, between, monkeypatch):
-    monkeypatch.setattr(cdist, "_distances", between)
+    monkeypatch.setattr(cdist, "_compute_distances", between)
     query, points = clouds
     with PeakMemory(query, points) as memory:
         nearest(query, points, backend="cdist", memory_mb=memory_mb)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from pykdtree.kdtree import KDTree
 
 from torchcover import blind_spot_radius, nearest
-from torchcover.neighbors import BACKENDS, cdist, check_cloud, choice, kdtree
+from torchcover.neighbors import BACKENDS, backend_choice, cdist, check_cloud, kdtree
 from torchcover.neighbors.query import _rescale
 
 DTYPES = [torch.float16, torch.bfloat16, torch.float32, torch.float64]
@@ -301,7 +301,7 @@ def test_the_inputs_are_bit_equal_afterwards(backend):
     before = query.clone(), points.clone()
     nearest(query, points, backend=backend)
     nearest(query * 1e30, points, backend=backend)
-    blind_spot_radius(query, points, max_radius=1.0, backend=backend)
+    blind_spot_radius(points, query, max_radius=1.0, backend=backend)
     assert torch.equal(query, before[0])
     assert torch.equal(points, before[1])
 
@@ -328,48 +328,48 @@ def test_backends_agree_under_autocast():
 )
 def test_auto_takes_packets_in_float32_where_a_call_gains_its_share_of_loading_them(counts, dtype, chosen, monkeypatch):
     """Stood in for by what any machine has: which is chosen, not what it finds."""
-    monkeypatch.setattr(choice, "_works", lambda *_: True)
+    monkeypatch.setattr(backend_choice, "_can_search", lambda *_: True)
     for name in BACKENDS.keys() - {chosen}:
         monkeypatch.setitem(BACKENDS, name, f"not.chosen.{name}")
     monkeypatch.setitem(BACKENDS, chosen, "torchcover.neighbors.cdist")
     clouds = (random_cloud(count, 21, dtype=dtype) for count in counts)
-    assert choice.choose_search(*clouds, "auto") is cdist.search
+    assert backend_choice.choose_search(*clouds, "auto") is cdist.search
 
 
 @pytest.mark.parametrize(("scale", "chosen"), [((1, 0, 0), False), ((1, 1, 0), False), ((1, 1, 1), True)])
 def test_packets_do_not_pay_around_points_on_a_line_or_in_a_plane(scale, chosen, monkeypatch):
     """All of a packet's queries are compared with what is near any of them; flat boxes of the tree are soon passed."""
-    monkeypatch.setattr(choice, "_works", lambda *_: True)
+    monkeypatch.setattr(backend_choice, "_can_search", lambda *_: True)
     query, points = random_cloud(100_000, 22), random_cloud(300_000, 23) * torch.tensor(scale, dtype=torch.float32)
-    assert (choice.choose_shared_backend(query, [points]) == "packets") is chosen
-    assert choice.choose_shared_backend(points, [points]) == "packets"  # queries among them are near few
+    assert (backend_choice.choose_shared_backend(query, [points]) == "packets") is chosen
+    assert backend_choice.choose_shared_backend(points, [points]) == "packets"  # queries among them are near few
 
 
 def test_packets_that_do_not_pay_in_one_cloud_do_in_many(monkeypatch):
-    monkeypatch.setattr(choice, "_works", lambda *_: True)
+    monkeypatch.setattr(backend_choice, "_can_search", lambda *_: True)
     query, points = random_cloud(2_000, 24), random_cloud(100, 25)
-    assert choice.choose_shared_backend(query, [points]) != "packets"
-    assert choice.choose_shared_backend(query, [points] * 20) == "packets"
+    assert backend_choice.choose_shared_backend(query, [points]) != "packets"
+    assert backend_choice.choose_shared_backend(query, [points] * 20) == "packets"
 
 
 def test_packets_lose_nothing_to_the_tree_where_queries_and_points_are_in_one_plane():
     query, points = (random_cloud(10_000, seed) * torch.tensor([1.0, 1.0, 0.0]) for seed in (28, 29))
-    assert choice._lost_s(query, points) == 0.0
+    assert backend_choice._estimate_packet_loss_s(query, points) == 0.0
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
 def test_what_packets_lose_around_points_in_a_plane_does_not_hang_on_the_unit_of_length(scale):
     query, points = random_cloud(10_000, 26), random_cloud(10_000, 27) * torch.tensor([1.0, 1.0, 0.0])
-    lost_s = choice._lost_s(query, points)
+    lost_s = backend_choice._estimate_packet_loss_s(query, points)
     assert lost_s > 0.0
-    assert choice._lost_s(query * scale, points * scale) == pytest.approx(lost_s, rel=1e-5)
+    assert backend_choice._estimate_packet_loss_s(query * scale, points * scale) == pytest.approx(lost_s, rel=1e-5)
 
 
 @pytest.mark.parametrize("counts", [(0, 700_000), (17_000, 0)])
 def test_without_a_query_or_a_point_nothing_is_lost_whatever_is_chosen(counts, monkeypatch):
-    monkeypatch.setattr(choice, "_works", lambda *_: True)
+    monkeypatch.setattr(backend_choice, "_can_search", lambda *_: True)
     query, points = (torch.zeros(count, 3) for count in counts)
-    assert choice.choose_shared_backend(query, [points]) == "packets"
+    assert backend_choice.choose_shared_backend(query, [points]) == "packets"
 
 
 def box_of(extent, count, low=(5.0, -20.0, 300.0)):
@@ -393,22 +393,24 @@ def test_what_packets_lose_around_points_in_a_plane_or_on_a_line_by_hand(asked, 
     """64 of 64,000 queries are 10 m wide, the farthest points 90 m away: the next 10 + sqrt(2 * 45 * 10) m are near."""
     query = box_of(asked, 64_000)
     points = box_of(extent, 2, tuple(float(c) for c in query[0] + torch.tensor(at)))
-    assert choice._lost_s(query, points) == pytest.approx(choice.NEAR_S * 64_000 * 2 * share, rel=1e-5)
+    assert backend_choice._estimate_packet_loss_s(query, points) == pytest.approx(
+        backend_choice.BackendParams().time_per_pair_s * 64_000 * 2 * share, rel=1e-5
+    )
 
 
 @pytest.mark.parametrize(("count", "chosen"), [(28_000, "packets"), (30_000, "auto")])
 def test_packets_are_taken_until_they_lose_more_than_they_gain(count, chosen, monkeypatch):
-    monkeypatch.setattr(choice, "_works", lambda *_: True)
+    monkeypatch.setattr(backend_choice, "_can_search", lambda *_: True)
     query, points = box_of((160.0, 62.5, 100.0), 64_000), box_of((80.0, 160.0, 0.0), count, (5.0, -20.0, 310.0))
-    assert choice.choose_shared_backend(query, [points]) == chosen
+    assert backend_choice.choose_shared_backend(query, [points]) == chosen
 
 
 @pytest.fixture
 def untried():
     """Whether numba and Warp work is asked anew, and afterwards again."""
-    choice._works.cache_clear()
+    backend_choice._can_search.cache_clear()
     yield
-    choice._works.cache_clear()
+    backend_choice._can_search.cache_clear()
 
 
 LARGE = (random_cloud(17_000, 50), random_cloud(200, 51))
@@ -443,7 +445,7 @@ def test_gradients_agree_with_finite_differences(backend):
     query, points = random_cloud(6, 23, dtype=torch.float64), random_cloud(15, 24, dtype=torch.float64)
     inputs = query.requires_grad_(), points.requires_grad_()
     assert torch.autograd.gradcheck(lambda q, p: nearest(q, p, backend=backend).distance, inputs)
-    assert torch.autograd.gradcheck(lambda q, p: blind_spot_radius(q, p, max_radius=8.0, backend=backend), inputs)
+    assert torch.autograd.gradcheck(lambda q, p: blind_spot_radius(p, q, max_radius=8.0, backend=backend), inputs)
 
 
 @pytest.mark.parametrize("dtype", DTYPES)
@@ -472,7 +474,7 @@ def test_the_gradient_at_distance_zero_is_zero(backend):
 def test_what_is_out_of_reach_has_no_gradient(backend):
     query = cloud([0, 0, 0], [5, 0, 0]).requires_grad_()
     points = cloud([1, 0, 0]).requires_grad_()
-    radius = blind_spot_radius(query, points, max_radius=2.0, backend=backend)
+    radius = blind_spot_radius(points, query, max_radius=2.0, backend=backend)
     radius.sum().backward()
     assert radius.tolist() == [1.0, 2.0]
     assert query.grad.tolist() == [[-1, 0, 0], [0, 0, 0]]
@@ -492,17 +494,17 @@ def test_no_points_and_a_gradient(backend):
 def test_one_sensor_point_gives_the_distance_to_it(backend):
     x, y = torch.meshgrid(torch.arange(-20.0, 20.0), torch.arange(-20.0, 20.0), indexing="ij")
     plane = torch.stack([x.flatten(), y.flatten(), torch.zeros(1600)], dim=1)
-    radius = blind_spot_radius(plane, cloud([3, -4, 2]), backend=backend)
+    radius = blind_spot_radius(cloud([3, -4, 2]), plane, backend=backend)
     torch.testing.assert_close(radius, ((plane[:, 0] - 3) ** 2 + (plane[:, 1] + 4) ** 2 + 4).sqrt())
 
 
 @backends
 def test_an_empty_sensor_cloud_is_blind(backend):
     reference = random_cloud(3, 27)
-    assert blind_spot_radius(reference, torch.zeros(0, 3), backend=backend).tolist() == [math.inf] * 3
-    saturated = blind_spot_radius(reference, torch.zeros(0, 3), max_radius=7.0, backend=backend)
+    assert blind_spot_radius(torch.zeros(0, 3), reference, backend=backend).tolist() == [math.inf] * 3
+    saturated = blind_spot_radius(torch.zeros(0, 3), reference, max_radius=7.0, backend=backend)
     assert saturated.tolist() == [7.0] * 3
-    assert blind_spot_radius(torch.zeros(0, 3), reference, backend=backend).shape == (0,)
+    assert blind_spot_radius(reference, torch.zeros(0, 3), backend=backend).shape == (0,)
 
 
 @backends
@@ -510,7 +512,7 @@ def test_an_empty_sensor_cloud_is_blind(backend):
 def test_max_radius_saturates(backend, max_radius):
     query, points = random_cloud(100, 28), random_cloud(200, 29)
     expected = torch.minimum(nearest(query, points, backend=backend).distance, torch.tensor(max_radius))
-    assert torch.equal(blind_spot_radius(query, points, max_radius=max_radius, backend=backend), expected)
+    assert torch.equal(blind_spot_radius(points, query, max_radius=max_radius, backend=backend), expected)
 
 
 # Trap 5
@@ -536,7 +538,7 @@ def test_small_distances_survive_where_a_matrix_product_loses_them(offset):
 @backends
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize(
-    ("function", "names"), [(nearest, ("query", "points")), (blind_spot_radius, ("reference", "sensor"))]
+    ("function", "names"), [(nearest, ("query", "points")), (blind_spot_radius, ("sensor", "reference"))]
 )
 def test_coordinates_that_are_not_finite_are_refused(backend, value, function, names):
     good, bad = random_cloud(5, 30), random_cloud(4, 31)
@@ -575,7 +577,7 @@ def test_a_max_distance_that_is_no_distance_is_refused(limit):
     with pytest.raises(ValueError, match=f"max_distance .*>= 0 is needed; got {limit}"):
         nearest(random_cloud(2, 34), random_cloud(2, 35), max_distance=limit)
     with pytest.raises(ValueError, match=r"max_radius.* >= 0 is needed"):
-        blind_spot_radius(random_cloud(2, 34), random_cloud(2, 35), max_radius=limit)
+        blind_spot_radius(random_cloud(2, 35), random_cloud(2, 34), max_radius=limit)
 
 
 @pytest.mark.parametrize("budget", [0.0, -1.0, math.nan])
@@ -614,20 +616,22 @@ def test_the_trees_are_not_for_any_device(backend, kinds):
 
 @pytest.fixture
 def unsaid():
-    choice._say_that_the_cpu_searches.cache_clear()
+    backend_choice._warn_about_cpu_search.cache_clear()
     yield
-    choice._say_that_the_cpu_searches.cache_clear()
+    backend_choice._warn_about_cpu_search.cache_clear()
 
 
-@pytest.mark.parametrize(("device", "faster"), [("meta", "all"), ("cuda", "all; faster still: .*torchcover.warp.*")])
+@pytest.mark.parametrize(
+    ("device", "faster"), [("meta", "all pairs"), ("cuda", "all pairs; faster still: .*torchcover.warp.*")]
+)
 def test_many_pairs_on_a_device_are_searched_on_the_cpu_and_it_says_so_once(monkeypatch, unsaid, device, faster):
-    monkeypatch.setattr(choice, "MAX_PAIRS_ON_THE_DEVICE", 5)
-    monkeypatch.setattr(choice, "_works", lambda backend, *_: backend != "warp")
+    params = backend_choice.BackendParams(max_device_pairs=5)
+    monkeypatch.setattr(backend_choice, "_can_search", lambda backend, *_: backend != "warp")
     few, many = ([on_another_device(count, device) for count in counts] for counts in ((1, 5), (2, 3)))
-    assert choice.choose_search(*few, "auto") is cdist.search
-    said = f"clouds on {device} with more than 5 pairs are searched on the CPU, .* to compare them {faster}$"
+    assert backend_choice.choose_search(*few, "auto", params) is cdist.search
+    said = f"clouds on {device} with more than 5 pairs are searched on the CPU, .* than comparing {faster}$"
     with pytest.warns(UserWarning, match=said) as warned:
-        searches = [choice.choose_search(*many, "auto") for _ in range(2)]
+        searches = [backend_choice.choose_search(*many, "auto", params) for _ in range(2)]
     assert len(warned) == 1
     query, points = random_cloud(20, 60), random_cloud(300, 61)
     expected = nearest(query, points, backend="kdtree").index
@@ -638,10 +642,10 @@ def test_many_pairs_on_a_device_are_searched_on_the_cpu_and_it_says_so_once(monk
 def test_auto_takes_warp_on_cuda_alone(monkeypatch, device, chosen):
     """Stood in for by what any machine has."""
     asked = []
-    monkeypatch.setattr(choice, "_works", lambda *what: asked.append(what[:2]) or True)
+    monkeypatch.setattr(backend_choice, "_can_search", lambda *what: asked.append(what[:2]) or True)
     monkeypatch.setitem(BACKENDS, "warp", "not.chosen.warp")
     monkeypatch.setitem(BACKENDS, chosen, "torchcover.neighbors.kdtree")
-    search = choice.choose_search(on_another_device(9, device), on_another_device(9, device), "auto")
+    search = backend_choice.choose_search(on_another_device(9, device), on_another_device(9, device), "auto")
     assert search is kdtree.search
     assert asked == [("warp", torch.device("cuda"))] * (device == "cuda")
 
@@ -649,7 +653,7 @@ def test_auto_takes_warp_on_cuda_alone(monkeypatch, device, chosen):
 def test_without_warp_the_log_says_how_to_get_it(monkeypatch, caplog, untried):
     monkeypatch.setitem(BACKENDS, "warp", "no.such.module")
     with caplog.at_level("INFO", logger="torchcover"):
-        works = [choice._works("warp", torch.device("cpu"), "others search") for _ in range(2)]
+        works = [backend_choice._can_search("warp", torch.device("cpu"), "others search") for _ in range(2)]
     assert works == [False, False]
     (line,) = caplog.messages
     assert line.startswith("nearest: others search; warp is faster: pip install 'torchcover[warp]'")
@@ -659,7 +663,7 @@ def test_warp_that_cannot_use_the_device_is_not_used_and_that_is_said_once(monke
     """As on a GPU of another make, which torch calls cuda too. On `meta`, where there are no numbers to search."""
     monkeypatch.setitem(BACKENDS, "warp", "torchcover.neighbors.kdtree")
     with pytest.warns(UserWarning, match="^nearest: others search, as backend 'warp' does not work here: ") as said:
-        works = [choice._works("warp", torch.device("meta"), "others search") for _ in range(2)]
+        works = [backend_choice._can_search("warp", torch.device("meta"), "others search") for _ in range(2)]
     assert works == [False, False]
     assert len(said) == 1
 
@@ -672,8 +676,8 @@ def test_a_broken_backend_that_was_named_is_an_error_of_one_line(monkeypatch, tm
     with pytest.raises(ImportError) as raised:
         nearest(*LARGE, backend=backend)
     assert str(raised.value) == (
-        f"backend '{backend}' does not work here (libllvm: no such file); try 'auto', or "
-        f"pip install 'torchcover[{extra}]' anew"
+        f"backend '{backend}' does not work here (libllvm: no such file); try 'auto', or reinstall it: "
+        f"pip install 'torchcover[{extra}]'"
     )
 
 
@@ -683,7 +687,7 @@ def test_a_broken_backend_that_was_named_is_an_error_of_one_line(monkeypatch, tm
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("scale", [1e-9, 1.0, 1e9])
 def test_by_squared_differences_the_same_are_nearest(monkeypatch, dtype, scale):
-    monkeypatch.setattr(cdist, "_distances", cdist._squared_distances)
+    monkeypatch.setattr(cdist, "_compute_distances", cdist._compute_squared_distances)
     assert_exact(random_cloud(300, 70, scale, dtype), random_cloud(500, 71, scale, dtype), "cdist")
 
 
@@ -721,7 +725,9 @@ def test_out_of_memory_the_queries_are_asked_in_parts(monkeypatch, dtype):
 
 def test_out_of_memory_for_a_few_queries_is_an_error_with_the_size(monkeypatch):
     monkeypatch.setattr("torchcover.neighbors.query.choose_search", lambda *_: SmallMemory(0, kdtree.search))
-    said = "^cpu: the search among 400 points for 3,000 queries, 750 at a time: CUDA out of memory.*7.00 GiB.$"
+    said = (
+        "^cpu: not enough memory to search 400 points for 3,000 queries, 750 at a time: CUDA out of memory.*7.00 GiB.$"
+    )
     with pytest.raises(MemoryError, match=said):
         nearest(random_cloud(3000, 64), random_cloud(400, 65))
 
@@ -733,18 +739,18 @@ def test_out_of_memory_for_a_few_queries_is_an_error_with_the_size(monkeypatch):
 def test_transforms_of_torch_give_what_eager_code_gives():
     query, points = random_cloud(50, 66), random_cloud(40, 67)
     wanted = points.clone().requires_grad_()
-    (gradient,) = torch.autograd.grad(blind_spot_radius(query, wanted).sum(), wanted)
+    (gradient,) = torch.autograd.grad(blind_spot_radius(wanted, query).sum(), wanted)
 
     def total(points, **options):
-        return blind_spot_radius(query, points, **options).sum()
+        return blind_spot_radius(points, query, **options).sum()
 
     for backend in ("auto", "cdist", "kdtree", "packets"):
         torch.testing.assert_close(torch.func.grad(partial(total, backend=backend))(points), gradient)
         _, along = torch.func.jvp(partial(total, backend=backend), (points,), (torch.ones_like(points),))
         torch.testing.assert_close(along, gradient.sum())
         both = torch.stack([points, points + 0.5])
-        each = torch.vmap(partial(blind_spot_radius, query, backend=backend))(both)
-        assert torch.equal(each, torch.stack([blind_spot_radius(query, cloud, backend=backend) for cloud in both]))
+        each = torch.vmap(partial(blind_spot_radius, reference=query, backend=backend))(both)
+        assert torch.equal(each, torch.stack([blind_spot_radius(cloud, query, backend=backend) for cloud in both]))
     assert torch.equal(
         torch.vmap(nearest, in_dims=(1, None))(query[:, None], points).index, nearest(query, points).index[None]
     )

@@ -142,7 +142,7 @@ def test_gaps_between_boxes_are_those_along_each_axis_in_closed_form(installed):
     (low, high), (least, most) = ((boxes[:, :3], boxes[:, 3:]) for boxes in (one, other))
     apart = np.maximum(np.maximum(low - most, least - high), 0)
     between_centres = np.abs((low + high) - (least + most)).sum(axis=1)
-    for name, expected in (("_gap", (apart**2).sum(axis=1)), ("_centre_gap", between_centres)):
+    for name, expected in (("_compute_gap", (apart**2).sum(axis=1)), ("_compute_center_gap", between_centres)):
         gap = getattr(packets, name).py_func
         found = [gap(one, node, around) for node, around in enumerate(other)]
         np.testing.assert_allclose(found, expected, rtol=1e-4, err_msg=name)
@@ -152,7 +152,7 @@ def test_gaps_between_boxes_are_those_along_each_axis_in_closed_form(installed):
 def test_the_gap_to_a_box_is_that_to_the_nearest_place_in_it(backend):
     """As Python runs it: a smaller one would be found out by nothing but the time that a search takes."""
     boxes, points = boxes_around(60, 37), uniform(60, 39)
-    gap = import_module("torchcover.neighbors.warp")._gap.func
+    gap = import_module("torchcover.neighbors.warp")._compute_gap.func
     found = [gap(boxes, node, *point) for node, point in enumerate(points)]
     expected = ((np.clip(points, boxes[:, :3], boxes[:, 3:]) - points) ** 2).sum(axis=1)
     np.testing.assert_allclose(found, expected, rtol=1e-4)
@@ -167,17 +167,17 @@ def test_a_walk_looks_into_at_most_twice_the_boxes_that_any_search_has_to(backen
     tree = [part.numpy() for part in warp.build_box_tree(torch.from_numpy(points))]
     looked = []
 
-    def noted(*given, gap=warp._gap.func):
+    def noted(*given, gap=warp._compute_gap.func):
         looked.append(given[1])
         return gap(*given)
 
-    monkeypatch.setattr(warp, "_gap", noted)
-    monkeypatch.setattr(warp, "_better", warp._better.func)
+    monkeypatch.setattr(warp, "_compute_gap", noted)
+    monkeypatch.setattr(warp, "_is_better", warp._is_better.func)
     stand_in = {"max": max, "int32": int, "where": lambda truth, one, other: one if truth else other}
-    found = np.full(len(query), warp.NONE)
+    found = np.full(len(query), warp.NO_INDEX)
     for number in range(len(query)):
         monkeypatch.setattr(warp, "wp", SimpleNamespace(tid=lambda number=number: number, **stand_in))
-        warp._walk.func(query, *tree, np.float32(np.inf), found)
+        warp._walk_tree.func(query, *tree, np.float32(np.inf), found)
     nearest_of_all = slow_twin(query, points)
     np.testing.assert_array_equal(found, nearest_of_all)
     inner = tree[2][1 : len(tree[2]) // 2, None]
@@ -192,7 +192,7 @@ def test_a_packet_looks_into_fewer_leaves_if_it_begins_with_those_around_its_mid
     query = points + np.float32(0.1)
     looked = []
 
-    def noted(*given, visit=packets._visit):
+    def noted(*given, visit=packets._visit_leaf):
         looked.append(given[-1])
         return visit(*given)
 
@@ -202,9 +202,9 @@ def test_a_packet_looks_into_fewer_leaves_if_it_begins_with_those_around_its_mid
             np.testing.assert_array_equal(search(query, points, "packets"), slow_twin(query, points))
         return len(looked)
 
-    monkeypatch.setattr(packets, "_visit", noted)
+    monkeypatch.setattr(packets, "_visit_leaf", noted)
     from_the_middle = leaves_looked_into()
-    monkeypatch.setattr(packets, "_centre_gap", lambda *_: 0.0)
+    monkeypatch.setattr(packets, "_compute_center_gap", lambda *_: 0.0)
     assert from_the_middle < 0.8 * leaves_looked_into()
 
 
@@ -234,7 +234,7 @@ def test_the_order_of_the_queries_their_parts_and_the_threads_change_nothing(nam
     order = generator(30).permutation(len(query))
     threads(3)
     if backend == "packets":
-        monkeypatch.setattr(packets, "SHARE", 70)
+        monkeypatch.setattr(packets, "CHUNK_SIZE", 70)
     np.testing.assert_array_equal(search(query[order], points, backend), expected[order])
     parts = [search(part, points, backend) for part in np.array_split(query, 3) if len(part)]
     np.testing.assert_array_equal(np.concatenate(parts), expected)
@@ -291,11 +291,11 @@ def test_a_point_far_away_does_not_coarsen_the_order(installed):
 def test_keys_are_the_bits_of_the_cells_along_the_axes_in_turn_and_then_the_index(installed):
     cells = generator(44).integers(0, packets.AXIS_CELLS, (500, 3))
     cells[:2] = [[0] * 3, [packets.AXIS_CELLS - 1] * 3]
-    keys = packets._morton_keys(cells.astype(np.float32) - 7)
+    keys = packets._compute_morton_keys(cells.astype(np.float32) - 7)
     in_turn = sum(((cells[:, axis] >> bit) & 1) << (3 * bit + axis) for axis in range(3) for bit in range(11))
     np.testing.assert_array_equal(keys, (in_turn.astype(np.uint64) << np.uint64(31)) + np.arange(500, dtype=np.uint64))
     assert keys[1] >> np.uint64(31) == 2**33 - 1
-    np.testing.assert_array_equal(packets._sorted(keys.copy()), np.sort(keys))
+    np.testing.assert_array_equal(packets._sort_keys(keys.copy()), np.sort(keys))
 
 
 @if_installed
@@ -304,14 +304,14 @@ def test_crowds_are_the_runs_of_more_equal_cells_than_are_left_alone(installed):
     cells, ends = np.repeat(np.arange(len(counts), dtype=np.uint64), counts), np.cumsum(counts)
     keys = (cells << np.uint64(31)) + np.arange(len(cells), dtype=np.uint64)[::-1]
     runs = [[end - count, end] for count, end in zip(counts, ends, strict=True) if count > 1024]
-    np.testing.assert_array_equal(packets._crowds(keys), runs)
+    np.testing.assert_array_equal(packets._find_crowds(keys), runs)
 
 
 @if_installed
 @pytest.mark.parametrize("count", [1, 16, 17, 100, 1000])
 def test_boxes_and_smallest_indices_are_of_all_that_is_beneath(installed, count):
     points, order = uniform(count, 46), generator(47).permutation(count)
-    leaves, indices, boxes, smallest = packets._build(points, order)
+    leaves, indices, boxes, smallest = packets._build_tree(points, order)
     filled = np.concatenate([order, np.repeat(order[-1:], -count % 16)]).reshape(-1, 16)
     np.testing.assert_array_equal(indices, filled)
     np.testing.assert_array_equal(leaves.transpose(0, 2, 1), points[filled])
@@ -330,27 +330,27 @@ def test_boxes_and_smallest_indices_are_of_all_that_is_beneath(installed, count)
 def test_a_packet_knows_its_box_and_its_least_distances_and_whether_a_box_may_lessen_them(installed, as_python, count):
     query, part = uniform(100, 48), generator(49).permutation(100)[:count]
     points = np.sort(uniform(64, 50), axis=0) + np.float32([60, 0, 0])  # some boxes beside all queries
-    leaves, indices, boxes, smallest = packets._build(points, np.arange(64))
-    packet, found, around = np.zeros(packets.MOST + 1, np.float32), np.zeros(64, np.int32), np.zeros(6, np.float32)
-    packets._load(query, part, packet, found, np.float32(3e38), around)
+    leaves, indices, boxes, smallest = packets._build_tree(points, np.arange(64))
+    packet, found, around = np.zeros(packets.WORST + 1, np.float32), np.zeros(64, np.int32), np.zeros(6, np.float32)
+    packets._load_packet(query, part, packet, found, np.float32(3e38), around)
     members = query[np.concatenate([part, np.repeat(part[-1:], 64 - count)])]
     np.testing.assert_array_equal(packet[:192].reshape(3, 64), members.T)
     np.testing.assert_array_equal(around, np.concatenate([members.min(axis=0), members.max(axis=0)]))
     squared = ((members[:, None] - points) ** 2).sum(axis=2)
     for leaf in range(4):
-        most = packets._visit(packet, found, leaves, indices, leaf)
+        most = packets._visit_leaf(packet, found, leaves, indices, leaf)
         least = squared[:, : 16 * leaf + 16].min(axis=1)
-        np.testing.assert_allclose(packet[packets.LEAST : packets.TO_BOX], least, rtol=1e-5)
+        np.testing.assert_allclose(packet[packets.BEST : packets.BOX], least, rtol=1e-5)
         np.testing.assert_array_equal(found, squared[:, : 16 * leaf + 16].argmin(axis=1))
-        assert most == packet[packets.LEAST : packets.TO_BOX].max()
+        assert most == packet[packets.BEST : packets.BOX].max()
     for node, (low, high) in enumerate(boxes[1:].reshape(-1, 2, 3), 1):
         x, y, z = (np.clip(members, low, high) - members).T
         to_box = x * x + y * y + z * z
         for bound in (0.0, to_box.min(), to_box.min() * 1.001, to_box.max()):
-            packet[packets.LEAST : packets.TO_BOX], found[:] = bound, smallest[node]
-            assert packets._may_improve(packet, found, boxes, smallest, node) == (to_box < bound).any()
+            packet[packets.BEST : packets.BOX], found[:] = bound, smallest[node]
+            assert packets._can_improve(packet, found, boxes, smallest, node) == (to_box < bound).any()
             found[to_box.argmin()] += 1
-            assert packets._may_improve(packet, found, boxes, smallest, node) == (to_box.min() <= bound)
+            assert packets._can_improve(packet, found, boxes, smallest, node) == (to_box.min() <= bound)
 
 
 @if_installed

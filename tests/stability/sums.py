@@ -8,7 +8,7 @@ import torch
 
 from torchcover.estimation import Estimate, Quantity
 from torchcover.estimation.errors import compute_jackknife_error
-from torchcover.metrics.blocks import sum_rows
+from torchcover.metrics.blocked_sums import sum_rows
 
 from .case import Case, most, relative
 

@@ -14,7 +14,7 @@ EXAMPLE = Path(__file__).parents[2] / "examples" / "optimise_points.py"
 def test_a_point_is_pulled_towards_those_it_is_nearest_to_and_others_feel_nothing():
     reference = torch.tensor([[1.0, 0.0, 0.0], [0.0, 2.0, 0.0], [9.0, 0.0, 0.0]])
     points = torch.tensor([[0.0, 0.0, 0.0], [9.0, 0.0, 1.0], [0.0, -5.0, 0.0]], requires_grad=True)
-    blind_spot_radius(reference, points).sum().backward()
+    blind_spot_radius(points, reference).sum().backward()
     # Downhill is along the unit vectors towards the reference points: (1, 0, 0) + (0, 1, 0), and (0, 0, -1).
     assert torch.equal(-points.grad, torch.tensor([[1.0, 1.0, 0.0], [0.0, 0.0, -1.0], [0.0, 0.0, 0.0]]))
 
@@ -27,7 +27,7 @@ def test_free_points_end_in_the_median_of_what_they_are_nearest_to():
     for step in range(200):
         descent.param_groups[0]["lr"] = 0.5 / (1 + step / 10)
         descent.zero_grad()
-        blind_spot_radius(reference, point).mean().backward()
+        blind_spot_radius(point, reference).mean().backward()
         descent.step()
     assert (point.detach() - torch.tensor([[1.0, 0.0, 0.0]])).norm() < 0.05
 
@@ -35,7 +35,7 @@ def test_free_points_end_in_the_median_of_what_they_are_nearest_to():
 def test_the_example_lowers_the_mean_radius_and_draws_a_picture(tmp_path, monkeypatch, capsys):
     picture = tmp_path / "points.png"
     monkeypatch.setattr(
-        sys, "argv", ["optimise_points.py", "--points", "60", "--num-frames", "15", "--out", str(picture)]
+        sys, "argv", ["optimise_points.py", "--points", "60", "--num-steps", "15", "--out", str(picture)]
     )
     runpy.run_path(str(EXAMPLE), run_name="__main__")
     said = capsys.readouterr().out

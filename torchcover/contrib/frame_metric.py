@@ -19,7 +19,7 @@ from torchcover.estimation import MIN_BLOCKS, Estimate, Number, Quantity
 from torchcover.frames import Frame
 from torchcover.metrics import BlockedSums, MergeableSums, get_figure
 from torchcover.neighbors import check_cloud, check_tensor, nearest
-from torchcover.neighbors.choice import choose_shared_backend
+from torchcover.neighbors.backend_choice import choose_shared_backend
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -334,7 +334,7 @@ class SceneRatios(BlockedSums, FrameMetric):
 
     def _add_frame(self, frame: Frame) -> None:
         base, sums, counts = self._of_frame(frame)  # before anything is added
-        block = self._block_of(frame.block_index)
+        block = self._assign_block(frame.block_index)
         self.denominators[block] += base.to(self.denominators)
         self.numerators[block] += sums.to(self.numerators)
         self.counts += counts.to(self.counts)

@@ -104,7 +104,7 @@ class MSog(BlockedSums, FrameMetric):
         labels = self.query_cache.get_or_compute(
             frame, ("labels", self.category, self.grid), lambda: self._labels(frame)
         )
-        block = self._block_of(frame.block_index)
+        block = self._assign_block(frame.block_index)
         for label, voxels in enumerate(labels):
             self.label_counts[block, label, voxels.to(self.label_counts.device)] += 1
 

@@ -35,7 +35,7 @@ from torchcover.files import (
     read_npz,
     write_npz,
 )
-from torchcover.metrics.blocks import FINER
+from torchcover.metrics.blocked_sums import FINE_BLOCKS_PER_BLOCK
 
 if TYPE_CHECKING:
     from torchcover.coverage.result import Coverage
@@ -215,7 +215,7 @@ def _parse_redundancy(header: dict[str, Any], observed_cells: ObservedCells, arr
 
 def _parse_region_sums(header: dict[str, Any], grid: BevGrid, arrays: Arrays) -> RegionSums:
     region_sums = RegionSums(*(torch.from_numpy(arrays[name]) for name in REGION_ARRAYS))
-    num_blocks = header["num_blocks"] * (FINER if header["num_blocks"] > 1 else 1)
+    num_blocks = header["num_blocks"] * (FINE_BLOCKS_PER_BLOCK if header["num_blocks"] > 1 else 1)
     num_region_bands = len(header["regions"]) * len(grid.heights)
     num_values = 1 + len(header["thresholds_m"]) + len(header["redundancy_layers"])
     expected = [(num_blocks,), (num_blocks, num_region_bands), (num_blocks, num_values, num_region_bands)]

@@ -28,7 +28,7 @@ from torchcover.coverage.steps import (
 from torchcover.devices import ensure_float64, map_tensors
 from torchcover.estimation import Estimate
 from torchcover.metrics import BlockedSums, SparseSums, sum_rows
-from torchcover.metrics.blocks import FINER
+from torchcover.metrics.blocked_sums import FINE_BLOCKS_PER_BLOCK
 from torchcover.neighbors import nearest
 
 
@@ -220,12 +220,12 @@ class CoverageSums(BlockedSums):
 
     def add_sums(self, sums: FrameSums) -> None:
         """Add a step that `sums_of` a metric of the same parameters has measured."""
-        block, fine = self._block_of(sums.block_index), self._fine_block_of(sums.block_index)
+        block, fine = self._assign_block(sums.block_index), self._get_fine_block(sums.block_index)
         self.add_to_sparse_sums("cell_sums", block, sums.cell_columns)
         self.add_to_sparse_sums("region_sums", fine, sums.region_columns)
         for name, count in sums.counts.items():
             getattr(self, name).add_(count)
-        self._follow_steps()
+        self._handle_added_frames()
 
     def _distances(self, reference: Tensor, step: FrameInput) -> list[Tensor]:
         """(S, M) metres to the nearest point of each sensor that counts for the radius, then those for each threshold.
@@ -294,7 +294,7 @@ class CoverageSums(BlockedSums):
 
     def _in_places(self, *, fine: bool) -> CellSums:
         """The sums of (..., B, P) places in blocks, the fine ones or the others."""
-        together = 1 if fine else min(int(self.frames_per_block), FINER)  # so many fine blocks are one
+        together = 1 if fine else min(int(self.frames_per_block), FINE_BLOCKS_PER_BLOCK)  # so many fine blocks are one
         blocks, count = self.num_fine_blocks if fine else self.num_blocks, self._places.num_region_bands
         key, columns = self.region_sums.split_with_sizes([1, self._columns.num_columns], dim=1)
         key = key.div(together * count, rounding_mode="floor") * count + key % count

@@ -148,7 +148,7 @@ def measure_box_visibility(
         asked, box = torch.cat([asked, sides.to(asked)]), torch.cat([box, side_of])
         weights = torch.cat([weights.double(), square_metres])
     # Only the reference may be cropped to the boxes.
-    radius = blind_spot_radius(asked, sensor).double()
+    radius = blind_spot_radius(sensor, asked).double()
     return BoxVisibility(
         # A GPU adds weights up in any order, so that even all of them may come to a trifle over the total.
         share=compute_box_means((radius <= threshold_m).double(), box, len(boxes), weights).clamp(max=1.0),

@@ -63,7 +63,7 @@ class RerunLog:
         self._stream.set_time("step", sequence=frame.index)
         for rig, cloud in frame.clouds.items():
             self._stream.log([rig, "points"], rr.Points3D(_few(frame.get_measured_points(rig)), colors=[70, 120, 190]))
-            radius = blind_spot_radius(frame.reference, cloud, max_radius=FAR_M)
+            radius = blind_spot_radius(cloud, frame.reference, max_radius=FAR_M)
             colours = apply_colormap(_few(radius), ColorScale("radius", "m", "viridis_r", 0.0, FAR_M))
             self._stream.log([rig, "reference by radius"], rr.Points3D(_few(frame.reference), colors=colours))
         if frame.boxes is not None:

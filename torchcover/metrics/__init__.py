@@ -1,4 +1,4 @@
-"""What every metric of torchcover promises, once: sums with a meaning that merge exactly."""
+"""Base classes of all metrics of torchcover: sums with a definition that merge exactly."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""Sums with a meaning: merged and loaded exactly, or refused. Needs nothing of torchmetrics."""
+"""Sums with a definition that are merged and loaded exactly, or refused; independent of torchmetrics."""
 
 import hashlib
 import math
@@ -16,26 +16,27 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# What fills a table up to the length of another one; no row holds it.
-FILLER = math.inf
+# First entry of the rows that pad a table; no other row has it.
+PADDING = math.inf
 
 Reduction = Callable[[Sequence[Tensor]], Tensor]
 
 
 class MergeableSums:
-    """Sums over steps, and the parameters that say what they are sums of.
+    """Sums over frames, and the parameters that define them.
 
-    * Two of them over different steps merge exactly: `merge_state`.
-    * Sums that mean different things are never added: a fingerprint of class and parameters is part of the state.
-    * States are copies: nothing that is loaded or merged is written to later.
-    * On a device without float64 (MPS) the sums stay on the CPU, to which clouds follow.
+    * Two objects over different frames merge exactly: `merge_state`.
+    * Sums with different definitions are never added: a fingerprint of class and parameters is part of the state.
+    * States are copies: nothing that is loaded or merged is modified later.
+    * On a device without float64 (MPS) the sums stay on the CPU, to which clouds are moved.
 
-    A subclass passes its parameters to `__init__`, adds its states with `define_sum`, and counts `num_frames`. Their size is
-    fixed; only a table (`define_table`) grows. `MergeableMetric` before it in the bases makes a torchmetrics metric of it.
+    A subclass passes its parameters to `__init__`, adds its states with `define_sum`, and counts `num_frames`. The size
+    of a state is fixed; only a table (`define_table`) grows. With `MergeableMetric` before it in the bases, it becomes a
+    torchmetrics metric.
 
     Args:
-        definition: What the sums depend on, by the name of the parameter; compared by `==` and `repr`.
-        kwargs: For the next base.
+        definition: Name and value of each parameter that the sums depend on; compared by `==` and `repr`.
+        kwargs: Keyword arguments of the next base class.
 
     Example:
         >>> class Points(MergeableSums):
@@ -60,35 +61,35 @@ class MergeableSums:
     num_frames: Tensor
     _defaults: dict[str, Any]
 
-    def __init__(self, definition: Mapping[str, object], **kwargs: Any) -> None:  # noqa: ANN401  (of the next base)
+    def __init__(self, definition: Mapping[str, object], **kwargs: Any) -> None:  # noqa: ANN401
         self._defaults = {}
         super().__init__(**kwargs)
         self.definition = dict(definition)
         self._tables: dict[str, Reduction] = {}
-        self._largest: set[str] = set()
-        # (32,) int64 numbers in [0, 256), equal for two metrics exactly if their sums mean the same.
-        words = repr((type(self).__name__, sorted(self.definition.items())))
-        fingerprint = torch.tensor(list(hashlib.sha256(words.encode()).digest()), device="cpu")
+        self._maxima: set[str] = set()
+        # (32,) int64 numbers in [0, 256), equal for two metrics exactly if their definitions are equal.
+        description = repr((type(self).__name__, sorted(self.definition.items())))
+        fingerprint = torch.tensor(list(hashlib.sha256(description.encode()).digest()), device="cpu")
         self.define_state("fingerprint", fingerprint, "max")
         self.define_sum("num_frames", (), torch.int64)
 
-    @torch.inference_mode(False)  # here and below: a tensor made under it could not be added to outside of it
+    @torch.inference_mode(False)  # here and below: such a tensor cannot be changed outside of inference mode
     def define_state(self, name: str, default: Tensor, dist_reduce_fx: str | Callable[..., Tensor]) -> None:
         """Add a state.
 
         Args:
-            name: Of the state, an attribute from here on.
-            default: What it starts from. One number that is expanded takes the memory of one number.
-            dist_reduce_fx: "sum", "max", or how torchmetrics makes one table of those of all ranks.
+            name: Name of the state, an attribute from here on.
+            default: Initial value. An expanded number takes the memory of one number.
+            dist_reduce_fx: "sum", "max", or a function that merges the tables of all ranks.
         """
         if dist_reduce_fx == "max":
-            self._largest.add(name)
+            self._maxima.add(name)
         if default.is_contiguous() or any(default.stride()):
             self._register_state(name, default.clone(), dist_reduce_fx)
             return
         number = default[(0,) * default.dim()].clone()
         self._register_state(name, number, dist_reduce_fx)
-        if default.device.type == "cpu" and not number:  # zeros that take memory once they are written to
+        if default.device.type == "cpu" and not number:  # such zeros take memory only once they are written to
             state = torch.from_numpy(np.zeros(default.shape, number.numpy().dtype))
         else:
             state = torch.empty_like(default, memory_format=torch.contiguous_format).fill_(number)
@@ -100,165 +101,196 @@ class MergeableSums:
         setattr(self, name, default.clone())
 
     def define_sum(self, name: str, shape: tuple[int, ...], dtype: torch.dtype = torch.float64) -> None:
-        """Add a state that starts at zero and adds up; float64 or int64, for sums grow."""
+        """Add a state that is zero at first and adds up.
+
+        Args:
+            name: Name of the state, an attribute from here on.
+            shape: Shape of the state.
+            dtype: float64 or int64, since sums grow.
+        """
         self.define_state(name, torch.zeros((), dtype=dtype, device="cpu").expand(shape), "sum")
 
     def define_table(self, name: str, num_columns: int, reduction: Reduction | None = None) -> None:
-        """Add a float64 state of rows that begin with a finite number, none at first.
+        """Add a float64 state of rows that begin with a finite number; it has no rows at first.
 
         Args:
-            name: Of the state.
-            num_columns: Numbers in a row.
-            reduction: How several tables become one. Not given: all rows are kept, in the order of
+            name: Name of the state, an attribute from here on.
+            num_columns: Numbers per row.
+            reduction: Function that merges several tables. By default all rows are kept, in the order of
                 `torchcover.metrics.insert_rows`.
         """
         self._tables[name] = reduction or concat_tables
-        none = torch.empty((0, num_columns), dtype=torch.float64, device="cpu")
-        self.define_state(name, none, partial(_of_filled, reduction=self._tables[name]))
+        empty = torch.empty((0, num_columns), dtype=torch.float64, device="cpu")
+        self.define_state(name, empty, partial(_reduce_padded_tables, reduction=self._tables[name]))
 
     @property
     def device(self) -> torch.device:
-        """Where the sums are."""
+        """Device of the sums."""
         return self.fingerprint.device
 
     @property
     def metric_state(self) -> dict[str, Any]:
-        """The states by their names."""
+        """States by name."""
         return {name: getattr(self, name) for name in self._defaults}
 
     @torch.inference_mode(False)
     def reset(self) -> None:
-        """Forget every step."""
+        """Remove all frames."""
         for name, default in self._defaults.items():
             setattr(self, name, default.clone().to(getattr(self, name).device))
 
     def to(self, device: torch.device | str) -> Self:
-        """Move the sums to another device, if that has float64."""
+        """Move the sums to another device; they stay where they are if it has no float64.
+
+        Args:
+            device: Target device.
+        """
         if has_float64(torch.device(device)):
             for name, state in self.metric_state.items():
                 setattr(self, name, state.to(device))
         return self
 
     def state_dict(self) -> dict[str, Any]:
-        """What `load_state_dict` takes: the states by their names."""
+        """Return the states by name, for `load_state_dict`."""
         return self.metric_state
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Take the sums of another one with the same parameters.
-
-        Raises:
-            ValueError: Other parameters, or a state that lacks something.
-        """
-        copies = self._copied(state_dict)
-        for name, state in copies.items():
-            setattr(self, name, state)
-        self._follow_steps()
-
-    @torch.inference_mode(False)
-    def merge_state(self, incoming_state: Any) -> None:  # noqa: ANN401  (so that another kind is refused by name)
-        """Add the steps of another metric with the same parameters, which is left as it was.
+        """Replace the sums by those of another object with the same parameters.
 
         Args:
-            incoming_state: Such a metric, or its `metric_state`.
+            state_dict: States by name.
 
         Raises:
-            ValueError: Another kind of metric, other parameters, or a state that lacks something.
+            ValueError: The states have other parameters, or are incomplete.
+        """
+        copies = self._copy_states(state_dict)
+        for name, state in copies.items():
+            setattr(self, name, state)
+        self._handle_added_frames()
+
+    @torch.inference_mode(False)
+    def merge_state(self, incoming_state: Any) -> None:  # noqa: ANN401  (anything else is refused by name)
+        """Add the frames of another metric with the same parameters; that metric does not change.
+
+        Args:
+            incoming_state: The other metric, or its `metric_state`.
+
+        Raises:
+            ValueError: Another class, other parameters, or an incomplete state.
         """
         if hasattr(incoming_state, "metric_state"):
-            self._check_meaning(incoming_state)
+            self._check_definition(incoming_state)
             incoming_state = incoming_state.metric_state
         if not isinstance(incoming_state, Mapping):
             raise ValueError(
                 f"a {type(self).__name__} or its metric_state is needed; got {type(incoming_state).__name__}"
             )
-        self._reduce_states(self._copied(incoming_state))
-        self._follow_steps()
+        self._reduce_states(self._copy_states(incoming_state))
+        self._handle_added_frames()
 
     def _reduce_states(self, incoming_state: dict[str, Any]) -> None:
-        # A copy already, here and in torchmetrics' `forward`.
+        # `incoming_state` is a copy, here and in the `forward` of torchmetrics.
         self._align_with(incoming_state)
         for name in self._defaults:
-            pair = incoming_state[name], getattr(self, name)
+            incoming, state = incoming_state[name], getattr(self, name)
             if name in self._tables:
-                both = self._tables[name](pair[::-1])
+                merged = self._tables[name]((state, incoming))
             else:
-                both = torch.maximum(*pair) if name in self._largest else torch.add(*pair)
-            setattr(self, name, both)
+                merged = torch.maximum(incoming, state) if name in self._maxima else torch.add(incoming, state)
+            setattr(self, name, merged)
 
     def _align_with(self, incoming: dict[str, Any]) -> None:
-        """Bring this state and another one, a copy, into a form in which they can be added up."""
+        """Convert this state and a copy of another one so that they can be added up."""
 
     def _align_ranks(self, gather: Callable[[Tensor], Sequence[Tensor]]) -> None:
-        """Bring the states of all ranks, of which `gather` gives one, into a form in which they can be added up."""
+        """Convert this state so that those of all ranks, which `gather` returns, can be added up."""
 
-    def _check_meaning(self, other: object) -> None:
-        if not isinstance(other, MergeableSums) or type(other) is not type(self):
-            raise ValueError(f"cannot merge a {type(other).__name__} into a {type(self).__name__}")
-        for name, mine in self.definition.items():
-            if mine != other.definition.get(name):
-                raise ValueError(f"cannot merge metrics with different {name}: {mine} and {other.definition.get(name)}")
+    def _check_definition(self, metric: object) -> None:
+        if not isinstance(metric, MergeableSums) or type(metric) is not type(self):
+            raise ValueError(f"cannot merge a {type(metric).__name__} into a {type(self).__name__}")
+        for name, value in self.definition.items():
+            if value != metric.definition.get(name):
+                raise ValueError(
+                    f"cannot merge metrics with different {name}: {value} and {metric.definition.get(name)}"
+                )
 
-    def _copied(self, states: Mapping[str, Tensor]) -> dict[str, Any]:
-        """The states of a metric, once they are known to mean the same, on this device and in these types."""
+    def _copy_states(self, states: Mapping[str, Tensor]) -> dict[str, Any]:
+        """Copy the states of a metric with the same definition to this device and these types."""
         fingerprint = states.get("fingerprint")
         if fingerprint is None or not torch.equal(fingerprint.to(self.fingerprint), self.fingerprint):
             raise ValueError(
-                f"the state was made by another metric than this {type(self).__name__}, or with other "
+                f"the state belongs to another metric than this {type(self).__name__}, or to one with other "
                 f"{', '.join(self.definition)}"
             )
         copies = {}
         for name in self._defaults:
-            mine, other = getattr(self, name), states.get(name)
-            needed = tuple(mine.shape)
-            if name in self._tables and other is not None:
-                needed = (*other.shape[:1], *needed[1:])
-            if other is None or tuple(other.shape) != needed:
-                arrived = "none" if other is None else tuple(other.shape)
+            state, incoming = getattr(self, name), states.get(name)
+            needed = tuple(state.shape)
+            if name in self._tables and incoming is not None:
+                needed = (*incoming.shape[:1], *needed[1:])
+            if incoming is None or tuple(incoming.shape) != needed:
+                arrived = "none" if incoming is None else tuple(incoming.shape)
                 raise ValueError(f"state {name!r} of shape {needed} is needed; got {arrived}")
-            copies[name] = other.to(device=mine.device, dtype=mine.dtype, copy=True)
+            copies[name] = incoming.to(device=state.device, dtype=state.dtype, copy=True)
         return copies
 
-    def _follow_steps(self) -> None:
-        """Take notice of steps that were added otherwise than by `update`."""
+    def _handle_added_frames(self) -> None:
+        """React to frames that were not added by `update`."""
 
 
 def insert_rows(table: Tensor, new_rows: Tensor) -> Tensor:
-    """A table with some more rows, in ascending order: by the first column, then by the second, and so on.
+    """Insert rows into a table that is sorted by the first column, then by the second, and so on.
 
     Args:
         table: (K, C) float64 finite rows in that order.
-        new_rows: (N, C) more of them, in any order.
+        new_rows: (N, C) rows to be inserted, in any order.
+
+    Returns:
+        (K + N, C) sorted rows.
 
     Example:
         >>> insert_rows(torch.tensor([[1.0, 5.0]]), torch.tensor([[1.0, 3.0], [0.0, 9.0]])).tolist()
         [[0.0, 9.0], [1.0, 3.0], [1.0, 5.0]]
     """
-    both = torch.cat([table, new_rows.to(table)])
-    order = np.lexsort(both.cpu().numpy().T[::-1])
-    return both[torch.from_numpy(order).to(both.device)]
+    rows = torch.cat([table, new_rows.to(table)])
+    order = np.lexsort(rows.cpu().numpy().T[::-1])
+    return rows[torch.from_numpy(order).to(rows.device)]
 
 
 def pad_table(table: Tensor, length: int) -> Tensor:
-    """The table, filled up to a length."""
-    return torch.nn.functional.pad(table, (0, 0, 0, length - len(table)), value=FILLER)
+    """Pad a table.
+
+    Args:
+        table: (K, C) rows.
+        length: Number of rows of the result, K at least.
+    """
+    return torch.nn.functional.pad(table, (0, 0, 0, length - len(table)), value=PADDING)
 
 
 def concat_tables(tables: Sequence[Tensor]) -> Tensor:
-    """One table with the rows of several."""
+    """Join the rows of several tables in sorted order.
+
+    Args:
+        tables: (K, C) each.
+    """
     return insert_rows(tables[0][:0], torch.cat(list(tables)))
 
 
-def _of_filled(tables: Tensor, reduction: Reduction) -> Tensor:
-    """One table of several, (parts, N, C), that were filled up to the same length."""
-    return reduction([rows[rows[:, 0] != FILLER] for rows in tables])
+def _reduce_padded_tables(tables: Tensor, reduction: Reduction) -> Tensor:
+    """Merge (parts, N, C) tables that were padded to the same length."""
+    return reduction([rows[rows[:, 0] != PADDING] for rows in tables])
 
 
 def get_figure(ax: "Axes | None") -> "tuple[Figure, Axes]":
-    """The axes that a metric was given and their figure, or new ones of pyplot's, as torchmetrics has it."""
+    """Return a figure and its axes.
+
+    Args:
+        ax: Existing axes; without them pyplot creates a figure, as in torchmetrics.
+    """
     if ax is None:
         import matplotlib.pyplot as plt
 
         return plt.subplots(layout="constrained")
     figure = ax.get_figure(root=True)
-    assert figure is not None, "axes that were removed from their figure"
+    assert figure is not None, "the axes were removed from their figure"
     return figure, ax

@@ -1,10 +1,10 @@
-"""Exact nearest neighbours. Knows no other part of the house.
+"""Exact nearest-neighbor search on CPUs and GPUs, independent of the rest of the package.
 
-One entry, `nearest`; a backend is a file with one function `search(query, points, max_distance, memory_mb)`
-that returns the index of a nearest point. What a distance is, and its gradient, is decided once, in `nearest`.
+`nearest` is the entry point. A backend is a module with one function `search(query, points, max_distance, memory_mb)`
+that returns the index of a nearest point; `nearest` itself computes distances and gradients, for all backends alike.
 """
 
-from torchcover.neighbors.choice import BACKENDS
+from torchcover.neighbors.backend_choice import BACKENDS
 from torchcover.neighbors.query import (
     NearestPoints,
     blind_spot_radius,

@@ -1,4 +1,4 @@
-"""How loops over arrays are compiled: by numba, the extra `fast`. Where that is missing, importing this fails."""
+"""Compilation of loops over arrays by numba (extra `fast`); importing this module fails without numba."""
 
 from collections.abc import Callable
 from typing import Any, TypeAlias, TypeVar
@@ -10,25 +10,35 @@ except ModuleNotFoundError as error:
 if numba.config.DISABLE_JIT:
     raise ImportError("NUMBA_DISABLE_JIT is set")
 
-# An array or a number of the type that the signature says.
+# An array or a number of a type that the signature declares.
 Array: TypeAlias = Any
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def compile_function(signature: str) -> Callable[[Function], Function]:
-    """Compile at once, and keep it on disk where a folder can be written (beside this file, or NUMBA_CACHE_DIR)."""
+    """Return a decorator that compiles a function at import.
 
-    def made(function: Function) -> Function:
-        # Neither contraction nor another order of sums: a distance is the same whichever loop computes it.
+    The result is cached on disk if the folder of this file or NUMBA_CACHE_DIR can be written.
+
+    Args:
+        signature: Types of the arguments and the result, in numba's notation.
+    """
+
+    def compile_with_signature(function: Function) -> Function:
+        # Sums are neither contracted nor reordered: a distance is the same in every loop.
         options: dict[str, Any] = {"nogil": True, "error_model": "numpy", "fastmath": {"nnan", "nsz"}}
         try:
             return numba.njit(signature, cache=True, **options)(function)  # type: ignore[no-any-return]
         except (RuntimeError, OSError):
             return numba.njit(signature, **options)(function)  # type: ignore[no-any-return]
 
-    return made
+    return compile_with_signature
 
 
 def inline_function(function: Function) -> Function:
-    """Copy it into the functions that call it; a call in the inner loop costs a third of the search."""
+    """Copy a function into its callers; a call in the inner loop would take a third of the search time.
+
+    Args:
+        function: Function of arrays and numbers that numba can compile.
+    """
     return numba.njit(inline="always")(function)  # type: ignore[no-any-return]

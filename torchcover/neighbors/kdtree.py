@@ -1,4 +1,4 @@
-"""KD-tree search on the CPU with pykdtree, on as many threads as OpenMP is given (`OMP_NUM_THREADS`)."""
+"""KD-tree search on the CPU with pykdtree, on the threads that OpenMP has (`OMP_NUM_THREADS`)."""
 
 import math
 from typing import Any
@@ -9,42 +9,46 @@ from numpy.typing import NDArray
 from pykdtree.kdtree import KDTree
 from torch import Tensor
 
-# About how many points are looked at for equal ones.
-SAMPLE = 1024
-# Points in a leaf of the tree. Large leaves are built in less than half the time, small ones sooner asked.
-LARGE_LEAF, SMALL_LEAF = 64, 16
-# Few queries: at least as many points for each.
-POINTS_PER_QUERY = 12
-
 
 def search(query: Tensor, points: Tensor, max_distance: float, memory_mb: float) -> Tensor:
-    """As `cdist.search`, on the CPU; -1 for queries without a point in reach. It takes as much memory as the points."""
-    bound = None if math.isinf(max_distance) else max_distance
-    coordinates, number = _distinct(np.ascontiguousarray(points.numpy()))
-    leaf = LARGE_LEAF if len(points) >= POINTS_PER_QUERY * len(query) else SMALL_LEAF
-    _, index = KDTree(coordinates, leafsize=leaf).query(np.ascontiguousarray(query.numpy()), distance_upper_bound=bound)
-    found = torch.from_numpy(index.astype(np.int64))
-    # pykdtree answers "none" with the number of points.
-    none = found >= len(coordinates)
-    if number is not None:
-        found = torch.from_numpy(number)[found.clamp(max=len(number) - 1)]
-    return found.masked_fill(none, -1)
+    """Find the index of a nearest point for each query on the CPU.
 
+    Args:
+        query: (N, 3) finite coordinates.
+        points: (M, 3) finite coordinates of the same type, M > 0.
+        max_distance: Largest distance in meters that counts.
+        memory_mb: Not used; the tree takes as much memory as the points.
 
-def _distinct(points: NDArray[Any]) -> tuple[NDArray[Any], NDArray[np.int64] | None]:
-    """One of each of the points, and their numbers; all of them and None, unless a sample holds equal ones.
-
-    The tree cannot split what is equal: the returns at (0, 0, 0) of a spinning LiDAR would be one leaf of thousands of
-    points, which most queries would look through.
+    Returns:
+        (N,) int64 indices; -1 for queries without a point in reach.
     """
-    sample = _as_keys(points[:: max(1, len(points) // SAMPLE)])
+    bound = None if math.isinf(max_distance) else max_distance
+    coordinates, original_indices = _drop_duplicates(np.ascontiguousarray(points.numpy()))
+    # Trees with large leaves are built in less than half the time, those with small leaves are faster to query.
+    leaf_size = 64 if len(points) >= 12 * len(query) else 16
+    tree = KDTree(coordinates, leafsize=leaf_size)
+    _, found = tree.query(np.ascontiguousarray(query.numpy()), distance_upper_bound=bound)
+    index = torch.from_numpy(found.astype(np.int64))
+    is_missing = index >= len(coordinates)  # pykdtree returns the number of points if none is in reach
+    if original_indices is not None:
+        index = torch.from_numpy(original_indices)[index.clamp(max=len(original_indices) - 1)]
+    return index.masked_fill(is_missing, -1)
+
+
+def _drop_duplicates(points: NDArray[Any]) -> tuple[NDArray[Any], NDArray[np.int64] | None]:
+    """Return distinct points and their indices; all points and None unless a sample of 1024 contains equal ones.
+
+    The tree cannot split equal points: the missing returns of a spinning LiDAR, all at (0, 0, 0), would form one leaf
+    of thousands of points that most queries search.
+    """
+    sample = _convert_rows_to_keys(points[:: max(1, len(points) // 1024)])
     if len(np.unique(sample)) == len(sample):
         return points, None
-    _, number = np.unique(_as_keys(points), return_index=True)
-    return points[number], number
+    _, indices = np.unique(_convert_rows_to_keys(points), return_index=True)
+    return points[indices], indices
 
 
-def _as_keys(points: NDArray[Any]) -> NDArray[np.void]:
-    """(N,) rows as one value each, equal exactly if their bytes are; -0 is 0."""
+def _convert_rows_to_keys(points: NDArray[Any]) -> NDArray[np.void]:
+    """Convert rows to (N,) single values that are equal exactly if the bytes of the rows are; -0 becomes 0."""
     rows = np.ascontiguousarray(points + points.dtype.type(0))
     return rows.view(np.dtype((np.void, rows.dtype.itemsize * rows.shape[1]))).ravel()

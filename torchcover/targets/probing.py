@@ -175,11 +175,11 @@ class NearFieldObserver(BlockedSums):
     def add_sums(self, frame_sums: NearFieldFrameSums | None) -> None:
         """Add what `sums_of` gives."""
         if frame_sums is not None:
-            self._block_of(frame_sums.block_index)
-            self.sums[self._fine_block_of(frame_sums.block_index)] += frame_sums.sums
+            self._assign_block(frame_sums.block_index)
+            self.sums[self._get_fine_block(frame_sums.block_index)] += frame_sums.sums
             self.position_counts += frame_sums.position_counts
             self.num_frames += 1
-            self._follow_steps()
+            self._handle_added_frames()
 
     def compute(self) -> Tensor:
         """(rigs, bodies, regions, 5) the sums so far, as those of a block of `TargetSums`."""
