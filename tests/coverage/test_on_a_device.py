@@ -16,7 +16,7 @@ from torchcover.detection import (
     measure_box_visibility,
 )
 from torchcover.frames import Frame, rotate
-from torchcover.neighbors import choice
+from torchcover.neighbors import backend_choice
 
 GPU, MPS = torch.device("cuda", 0), torch.device("mps", 0)
 # What takes tensors of two devices.
@@ -138,7 +138,7 @@ def test_a_gpu_adds_up_what_the_cpu_does():
 
 
 def test_what_was_seen_of_boxes_stays_on_the_device(monkeypatch):
-    monkeypatch.setattr(choice, "_works", lambda *_: False)
+    monkeypatch.setattr(backend_choice, "_can_search", lambda *_: False)
     boxes = Boxes.from_rows(
         torch.tensor([[5.0, 5, 5, 8, 8, 8, 0.3], [15.0, 15, 15, 8, 8, 8, 0], [99.0, 0, 0, 1, 1, 1, 0]])
     )

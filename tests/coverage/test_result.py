@@ -405,4 +405,4 @@ def test_torch_loads_plain_objects_without_running_what_a_file_says():
     assert loaded[:2] == [grid, region]
     assert loaded[2].scalars() == metric.compute().scalars()
     assert torch.equal(loaded[3].boxes.rows, boxes.rows)
-    assert loaded[4].block_index == [3]
+    assert loaded[4].block_indices == [3]

@@ -36,13 +36,13 @@ class Case:
 
     Args:
         make: Makes it, with some of its parameters changed.
-        steps: Arguments of `update`, by name, 8 steps or more.
+        frames: Arguments of `update`, by name, 8 steps or more.
         bland: A step after which metrics of other parameters have the same sums.
         changes: Other parameters, each under a text that starts with the name of the one that differs.
     """
 
     make: Callable[..., Metric]
-    steps: Sequence[Step]
+    frames: Sequence[Step]
     bland: Step
     changes: Mapping[str, Step]
 
@@ -56,7 +56,7 @@ class Case:
     @cached_property
     def whole(self) -> tuple[dict[str, torch.Tensor], Any]:
         """The states and the result over all steps, which many laws compare with: not to be changed."""
-        metric = self.over(self.steps)
+        metric = self.over(self.frames)
         return {name: value.clone() for name, value in metric.metric_state.items()}, metric.compute()
 
     @cached_property
@@ -66,7 +66,7 @@ class Case:
     def after(self, *indices: int) -> Any:
         """The result over some steps, kept as `whole` is."""
         if indices not in self._results:
-            self._results[indices] = self.over([self.steps[index] for index in indices]).compute()
+            self._results[indices] = self.over([self.frames[index] for index in indices]).compute()
         return self._results[indices]
 
 
@@ -142,7 +142,7 @@ def by_sensor(steps: int) -> Case:
     whole = coverage(
         steps,
         {
-            "sensors in another order": {"sensor_names": ("rear", "roof")},
+            "sensor_names in another order": {"sensor_names": ("rear", "roof")},
             "regions": {"regions": regions[:1]},
             "has_area_weights": {"has_area_weights": False},
         },
@@ -153,7 +153,7 @@ def by_sensor(steps: int) -> Case:
     )
     # Regions are within the other cases' grid only.
     changes = {name: change for name, change in whole.changes.items() if name != "grid"}
-    return replace(whole, steps=[apart(step) for step in whole.steps], bland=apart(whole.bland), changes=changes)
+    return replace(whole, frames=[apart(step) for step in whole.frames], bland=apart(whole.bland), changes=changes)
 
 
 # Detection.
@@ -247,7 +247,7 @@ def of_frames(kind: type[FrameMetric], usual: Step, changes: Mapping[str, Step])
         lambda **changed: as_metric(kind)(**{**usual, **changed}),
         [frame_step(index) for index in range(0, 24, 3)],  # blocks are paired up
         {"frame": nothing},
-        {**changes, "rig": {"rig": "rig"}},
+        {**changes, "rig_name": {"rig_name": "rig"}},
     )
 
 
@@ -280,7 +280,7 @@ CASES = {
             "detection_visibility": torch.empty(0),
         },
         {
-            "by": {"by": "iou", "threshold": 0.9},
+            "match_by": {"match_by": "iou", "threshold": 0.9},
             "threshold": {"threshold": 0.5},
             "visibility_borders": {"visibility_borders": (0.1, 0.4, 0.6, 0.8)},
             "distance_borders": {"distance_borders": (10.0, 20.0)},
@@ -292,7 +292,7 @@ CASES = {
         {"categories": ("car", "pedestrian"), "range_borders_m": (20.0,)},
         {
             "threshold_m": {"threshold_m": 0.2},
-            "hits": {"hits": (2,)},
+            "min_point_counts": {"min_point_counts": (2,)},
             "categories": {"categories": ("pedestrian", "car")},
             "range_borders_m": {"range_borders_m": (30.0,)},
         },
@@ -307,7 +307,7 @@ CASES = {
             "grid": OTHER_GRID,
             "regions": {"regions": ()},
             "threshold_m": {"threshold_m": 0.2},
-            "at_least": {"at_least": (1, 2)},
+            "min_sensor_counts": {"min_sensor_counts": (1, 2)},
             "has_area_weights": {"has_area_weights": False},
         },
     ),
@@ -330,8 +330,8 @@ CASES = {
         },
     ),
     "s-mig": of_frames(
-        SMig, VOXELS, {**OF_VOXELS, "categories": {"categories": ("car",)}, "occlusion": {"ends_at_hits": True}}
+        SMig, VOXELS, {**OF_VOXELS, "categories": {"categories": ("car",)}, "ends_at_hits": {"ends_at_hits": True}}
     ),
-    "s-mig, occluded": of_frames(SMig, {**VOXELS, "occlusion": True}, OF_VOXELS),
+    "s-mig, occluded": of_frames(SMig, {**VOXELS, "ends_at_hits": True}, OF_VOXELS),
     "m-sog": of_frames(MSog, VOXELS, {**OF_VOXELS, "category": {"category": "pedestrian"}}),
 }

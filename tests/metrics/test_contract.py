@@ -85,31 +85,31 @@ def test_before_any_step_it_answers_and_says_that_it_knows_nothing(case):
     metric = case.make()
     with pytest.warns(UserWarning, match="was called before the ``update`` method"):
         metric.compute()
-    assert metric.steps == 0
+    assert metric.num_frames == 0
     assert not metric.update_called
 
 
 @EVERY
 def test_lists_are_the_same_as_one_by_one(case):
     at_once = case.make()
-    at_once.update(**in_lists(case.steps))
+    at_once.update(**in_lists(case.frames))
     assert_states(at_once, case.whole[0])
-    assert at_once.steps == len(case.steps)
+    assert at_once.num_frames == len(case.frames)
 
 
 @EVERY
 def test_the_inputs_are_as_they_were(case):
-    given = copy.deepcopy(case.steps[:2])
+    given = copy.deepcopy(case.frames[:2])
     case.over(given).compute()
-    for step, before in zip(given, case.steps, strict=False):
+    for step, before in zip(given, case.frames, strict=False):
         assert_same(step, before)
 
 
 @EVERY
 @pytest.mark.parametrize("in_a_list", [False, True])
 def test_an_array_of_numpy_is_refused_by_its_name_and_nothing_is_added(case, in_a_list):
-    metric = case.over(case.steps[:1])
-    before, step = states(metric), case.steps[1]
+    metric = case.over(case.frames[:1])
+    before, step = states(metric), case.frames[1]
     given_as_arrays = with_arrays(step)
     assert given_as_arrays
     for name, given in given_as_arrays.items():
@@ -121,41 +121,41 @@ def test_an_array_of_numpy_is_refused_by_its_name_and_nothing_is_added(case, in_
 @EVERY
 def test_forward_gives_the_step_and_adds_it(case):
     metric = case.make()
-    for step in case.steps[:3]:
+    for step in case.frames[:3]:
         assert_same(metric(**step), case.over([step]).compute())
-    for step in case.steps[3:]:
+    for step in case.frames[3:]:
         metric(**step)
     assert_same(metric.compute(), case.whole[1])
-    assert metric.steps == len(case.steps)
+    assert metric.num_frames == len(case.frames)
 
 
 @EVERY
 def test_compute_changes_nothing_and_sees_later_steps(case):
-    metric = case.over(case.steps[:4])
+    metric = case.over(case.frames[:4])
     before = states(metric)
     first = metric.compute()
     kept = copy.deepcopy(first)
     assert_states(metric, before)
-    metric.update(**case.steps[4])
+    metric.update(**case.frames[4])
     assert_same(metric.compute(), case.after(*range(5)))
     assert_same(first, kept)
 
 
 @EVERY
 def test_reset_forgets_every_step(case):
-    metric = case.over(case.steps[:4])
+    metric = case.over(case.frames[:4])
     metric.compute()
     metric.reset()
     assert_states(metric, states(case.make()))
-    metric.update(**case.steps[5])
-    assert_same(metric.compute(), case.over(case.steps[5:6]).compute())
+    metric.update(**case.frames[5])
+    assert_same(metric.compute(), case.over(case.frames[5:6]).compute())
     assert_states(case.make(), states(case.over([])))
 
 
 @EVERY
 def test_plot_gives_figure_and_axes_and_changes_nothing(case):
-    metric = case.over(case.steps[:3])
-    before, other = states(metric), case.over(case.steps[3:6]).compute()
+    metric = case.over(case.frames[:3])
+    before, other = states(metric), case.over(case.frames[3:6]).compute()
     try:
         figure, axes = metric.plot()
         assert (axes.figure, axes) == metric.plot(metric.compute(), axes) == (figure, axes)
@@ -176,11 +176,11 @@ def test_plot_gives_figure_and_axes_and_changes_nothing(case):
 BEFORE = {
     "nothing": lambda case, metric: None,
     "reset": lambda case, metric: metric.reset(),
-    "forward": lambda case, metric: (metric(**case.steps[0]), metric.reset()),
+    "forward": lambda case, metric: (metric(**case.frames[0]), metric.reset()),
     "move": lambda case, metric: metric.to("cpu"),
     "load": lambda case, metric: metric.load_state_dict(case.make().state_dict()),
     "merge": lambda case, metric: metric.merge_state(case.make()),
-    "compute": lambda case, metric: (metric.update(**case.steps[0]), metric.compute(), metric.reset()),
+    "compute": lambda case, metric: (metric.update(**case.frames[0]), metric.compute(), metric.reset()),
 }
 
 
@@ -190,25 +190,25 @@ def test_steps_are_added_under_inference_mode_and_after_it(case, before):
     metric = case.make()
     with torch.inference_mode():
         before(case, metric)
-        metric.update(**case.steps[0])
-        metric(**case.steps[1])
-    metric.update(**case.steps[-1])
+        metric.update(**case.frames[0])
+        metric(**case.frames[1])
+    metric.update(**case.frames[-1])
     assert_same(metric.compute(), case.after(0, 1, -1))
 
 
 @EVERY
 def test_a_metric_that_was_made_under_inference_mode_takes_steps_after_it(case):
     with torch.inference_mode():
-        metric = case.over(case.steps[:1])
-    metric.update(**case.steps[1])
-    metric.merge_state(case.over(case.steps[-1:]))
+        metric = case.over(case.frames[:1])
+    metric.update(**case.frames[1])
+    metric.merge_state(case.over(case.frames[-1:]))
     assert_same(metric.compute(), case.after(0, 1, -1))
 
 
 @EVERY
 def test_what_the_sums_start_from_takes_no_memory(case):
     """It is one number; torchmetrics would keep as many as there are sums."""
-    metric = case.over(case.steps[:2])
+    metric = case.over(case.frames[:2])
     for name in metric._defaults.keys() - {"fingerprint"}:
         start = metric._defaults[name]
         assert start.untyped_storage().nbytes() <= start.element_size(), name
@@ -224,13 +224,13 @@ def test_the_state_has_a_fixed_size_but_for_its_tables(case):
         return {name: state[name].untyped_storage().nbytes() for name in state.keys() - set(metric._tables)}
 
     before = sizes()
-    metric.update(**in_lists(case.steps))
+    metric.update(**in_lists(case.frames))
     assert sizes() == before
 
 
 @EVERY
 def test_sums_are_float64_and_counts_are_int64(case):
-    assert {value.dtype for value in case.over(case.steps[:1]).metric_state.values()} <= {torch.float64, torch.int64}
+    assert {value.dtype for value in case.over(case.frames[:1]).metric_state.values()} <= {torch.float64, torch.int64}
 
 
 CASTS = {
@@ -248,19 +248,19 @@ CASTS = {
 
 @EVERY
 def test_a_cast_leaves_the_sums_alone(case):
-    metric = case.over(case.steps[:1])
+    metric = case.over(case.frames[:1])
     before = states(metric)
     for cast in CASTS.values():
         assert cast(metric) is metric
         assert_states(metric, before)
-    metric.update(**case.steps[1])
+    metric.update(**case.frames[1])
     metric.reset()
     assert_states(metric, states(case.make()))
 
 
 @EVERY
 def test_a_move_takes_every_state_along(case):
-    metric = case.over(case.steps[:1])
+    metric = case.over(case.frames[:1])
     metric.compute()
     types = {name: value.dtype for name, value in metric.metric_state.items()}
     assert metric.to("cpu").to("meta") is metric
@@ -280,10 +280,10 @@ def test_a_move_takes_every_state_along(case):
 )
 @EVERY
 def test_a_copy_goes_its_own_way(case, copied):
-    metric = case.over(case.steps[:1])
+    metric = case.over(case.frames[:1])
     other = copied(metric)
     before = states(metric)
-    other.update(**case.steps[1])
+    other.update(**case.frames[1])
     assert_states(metric, before)
     assert_same(other.compute(), case.after(0, 1))
     assert_same(metric.compute(), case.after(0))
@@ -296,7 +296,7 @@ def test_a_state_dict_goes_round_without_aliases(case, inside):
     def wrap(metric):
         return torch.nn.ModuleDict({"metric": metric}) if inside else metric
 
-    metric, other = case.over(case.steps[:1]), case.over(case.steps[5:7])
+    metric, other = case.over(case.frames[:1]), case.over(case.frames[5:7])
     metric.persistent(True)
     other.compute()
     saved = wrap(metric).state_dict()
@@ -304,7 +304,7 @@ def test_a_state_dict_goes_round_without_aliases(case, inside):
     wrap(other).load_state_dict(saved)
     assert_same(other.compute(), metric.compute())
     before = states(metric)
-    other.update(**case.steps[1])
+    other.update(**case.frames[1])
     assert_states(metric, before)
     assert all(torch.equal(saved[name], kept[name]) for name in kept)
     assert_same(other.compute(), case.after(0, 1))
@@ -312,7 +312,7 @@ def test_a_state_dict_goes_round_without_aliases(case, inside):
 
 @EVERY
 def test_a_fresh_metric_that_loads_steps_computes_without_a_warning(case):
-    fresh, saved = case.make(), case.over(case.steps[:3])
+    fresh, saved = case.make(), case.over(case.frames[:3])
     saved.persistent(True)
     fresh.load_state_dict(saved.state_dict())
     assert fresh.update_called
@@ -332,7 +332,7 @@ def test_a_state_rounded_on_the_way_does_not_make_the_sums_short(case):
 @EVERY
 def test_the_state_is_part_of_the_state_dict_only_if_asked_for(case):
     """As in torchmetrics: a checkpoint of a model loads into one with another metric, or with none."""
-    metric = case.over(case.steps[:1])
+    metric = case.over(case.frames[:1])
     assert not metric.state_dict()
     before = states(metric)
     metric.load_state_dict({})
@@ -344,7 +344,7 @@ def test_the_state_is_part_of_the_state_dict_only_if_asked_for(case):
     before = states(other)
     assert len(model.load_state_dict(saved, strict=False).unexpected_keys) == len(saved)
     assert_states(other, before)
-    with pytest.raises(RuntimeError, match="the state was belongs to another metric"):
+    with pytest.raises(RuntimeError, match="the state belongs to another metric"):
         model.load_state_dict(saved)
 
 
@@ -354,7 +354,7 @@ def test_the_state_is_part_of_the_state_dict_only_if_asked_for(case):
 @pytest.mark.parametrize("cut", [0, 1])
 @EVERY
 def test_merged_parts_are_the_whole_in_any_order_and_leave_the_other_alone(case, cut):
-    parts = case.over(case.steps[:cut]), case.over(case.steps[cut:])
+    parts = case.over(case.frames[:cut]), case.over(case.frames[cut:])
     whole, result = case.whole
     for last_first, as_dict in itertools.product([False, True], repeat=2):
         first, second = copy.deepcopy(parts[::-1] if last_first else parts)
@@ -362,10 +362,10 @@ def test_merged_parts_are_the_whole_in_any_order_and_leave_the_other_alone(case,
             first.compute()  # outdated by the merge
         before = states(second)
         first.merge_state(second.metric_state if as_dict else second)
-        assert first.steps == len(case.steps)
+        assert first.num_frames == len(case.frames)
         assert_same(states(first), whole)
         assert_same(first.compute(), result)
-        first.update(**case.steps[-1])
+        first.update(**case.frames[-1])
         assert_states(second, before)
 
 
@@ -380,7 +380,7 @@ def test_nothing_and_nothing_is_nothing(case):
 @EVERY
 def test_merging_is_associative(case):
     def parts():
-        return [case.over(case.steps[k::3]) for k in range(3)]
+        return [case.over(case.frames[k::3]) for k in range(3)]
 
     a, b, c = parts()
     a.merge_state(b)
@@ -393,9 +393,9 @@ def test_merging_is_associative(case):
 
 @EVERY
 def test_a_metric_merged_into_itself_has_every_step_twice(case):
-    metric = case.over(case.steps[:5])
+    metric = case.over(case.frames[:5])
     metric.merge_state(metric)
-    assert_same(states(metric), states(case.over([*case.steps[:5], *case.steps[:5]])))
+    assert_same(states(metric), states(case.over([*case.frames[:5], *case.frames[:5]])))
 
 
 # What is refused.
@@ -403,27 +403,27 @@ def test_a_metric_merged_into_itself_has_every_step_twice(case):
 
 @EVERY_CHANGE
 def test_sums_that_mean_something_else_are_not_merged_or_loaded(case, change):
-    metric, other = case.over(case.steps[:1]), case.over(case.steps[:1], **case.changes[change])
+    metric, other = case.over(case.frames[:1]), case.over(case.frames[:1], **case.changes[change])
     parameter = change.replace(",", " ").split()[0]
     before = states(metric)
     with pytest.raises(ValueError, match=f"cannot merge metrics with different {parameter}: "):
         metric.merge_state(other)
-    with pytest.raises(ValueError, match=rf"the state was made by another .* or with other .*\b{parameter}\b"):
+    with pytest.raises(ValueError, match=rf"the state belongs to another .* with other .*\b{parameter}\b"):
         metric.merge_state(other.metric_state)
     other.persistent(True)
-    with pytest.raises(RuntimeError, match=rf"the state was made by another .* or with other .*\b{parameter}\b"):
+    with pytest.raises(RuntimeError, match=rf"the state belongs to another .* with other .*\b{parameter}\b"):
         metric.load_state_dict(other.state_dict())
     assert_states(metric, before)
 
 
 @pytest.fixture(scope="module")
 def of_every_case():
-    return [case.over(case.steps[:1]) for case in CASES.values()]
+    return [case.over(case.frames[:1]) for case in CASES.values()]
 
 
 @EVERY
 def test_other_metrics_and_things_that_are_none_are_not_merged(case, of_every_case):
-    metric = case.over(case.steps[:1])
+    metric = case.over(case.frames[:1])
     before = states(metric)
     for other in (SumMetric(), *(other for other in of_every_case if type(other) is not type(metric))):
         with pytest.raises(ValueError, match=f"cannot merge a {type(other).__name__} into a {type(metric).__name__}"):
@@ -440,7 +440,7 @@ def test_other_metrics_and_things_that_are_none_are_not_merged(case, of_every_ca
 
 @EVERY
 def test_a_state_that_lacks_something_or_has_another_shape_is_refused(case):
-    metric, other = case.over(case.steps[:2]), case.over(case.steps[2:4])
+    metric, other = case.over(case.frames[:2]), case.over(case.frames[2:4])
     before = states(metric)
     for name, value in other.metric_state.items():
         lacks = {key: state for key, state in states(other).items() if key != name}
@@ -469,7 +469,7 @@ def test_a_collection_keeps_metrics_apart_that_agree_at_first(case):
     """torchmetrics lets metrics share one state if theirs are equal after the first step (its issue 2596)."""
     wanted = {"one": {}, "the same": {}, **case.changes}
     collection = MetricCollection({name: case.make(**changes) for name, changes in wanted.items()})
-    steps = [case.bland, case.steps[0]]
+    steps = [case.bland, case.frames[0]]
     for step in steps:
         collection.update(**step)
     results = collection.compute()
@@ -480,10 +480,10 @@ def test_a_collection_keeps_metrics_apart_that_agree_at_first(case):
 @EVERY
 def test_a_collection_resets_and_runs_forward(case):
     collection = MetricCollection({"this": case.make()}, prefix="val/")
-    assert_same(collection(**case.steps[0])["val/this"], case.after(0))
+    assert_same(collection(**case.frames[0])["val/this"], case.after(0))
     collection.reset()
-    collection.update(**case.steps[1])
-    assert_same(collection.compute()["val/this"], case.over(case.steps[1:2]).compute())
+    collection.update(**case.frames[1])
+    assert_same(collection.compute()["val/this"], case.over(case.frames[1:2]).compute())
 
 
 # Two processes.
@@ -498,7 +498,7 @@ def answers(tmp_path_factory):
 @pytest.mark.parametrize("name", CASES)
 def test_two_processes_equal_one_and_each_keeps_its_own_sums(answers, name):
     case = CASES[name]
-    more = flat(case.over([*case.steps, case.steps[0], case.steps[0]]).compute())
+    more = flat(case.over([*case.frames, case.frames[0], case.frames[0]]).compute())
     for answer in (of_rank[name] for of_rank in answers):
         assert_same(answer["whole"], flat(case.whole[1]))
         assert answer["unchanged"], "the sums of all ranks stayed in the state of one"

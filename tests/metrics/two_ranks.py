@@ -45,16 +45,16 @@ def answers_of(rank, folder):
     warnings.filterwarnings("ignore", ".* was called before the ``update`` method")
     answers = {}
     for name, case in CASES.items():
-        metric = case.over(shares(case.steps)[rank])
+        metric = case.over(shares(case.frames)[rank])
         before = {state: value.clone() for state, value in metric.metric_state.items()}
         answer = answers[name] = {"whole": flat(metric.compute()), "unchanged": True}
         answer["unchanged"] = all(torch.equal(value, before[state]) for state, value in metric.metric_state.items())
-        metric.update(**case.steps[0])
+        metric.update(**case.frames[0])
         answer["more"] = flat(metric.compute())
         # One rank has seen nothing, not even an empty list.
-        answer["alone"] = flat(case.over(case.steps[:5] if rank == 0 else []).compute())
+        answer["alone"] = flat(case.over(case.frames[:5] if rank == 0 else []).compute())
         answer["complaints"] = {
-            change: complaint_about(case.over(case.steps[:1], **(changes if rank else {})))
+            change: complaint_about(case.over(case.frames[:1], **(changes if rank else {})))
             for change, changes in case.changes.items()
         }
     dist.destroy_process_group()

@@ -220,7 +220,7 @@ class FrameMetric(MergeableSums):
         query_cache: FrameQueryCache | None = None,
         **kwargs: Any,  # noqa: ANN401  (of `FrameMetric`)
     ) -> None:
-        super().__init__({**definition, "rig": rig_name}, **kwargs)
+        super().__init__({**definition, "rig_name": rig_name}, **kwargs)
         self.rig_name = rig_name
         self.query_cache = FrameQueryCache() if query_cache is None else query_cache
 

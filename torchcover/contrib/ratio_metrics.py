@@ -83,7 +83,7 @@ class ObjectCoverage(SceneRatios):
             for stratum in strata.name_suffixes
         ]
         super().__init__(
-            ratios, {"threshold_m": float(threshold_m), "hits": tuple(min_point_counts), **strata.definition}, **kwargs
+            ratios, {"threshold_m": float(threshold_m), "min_point_counts": tuple(min_point_counts), **strata.definition}, **kwargs
         )
         self.strata = strata
         self.threshold_m = float(threshold_m)
@@ -260,8 +260,8 @@ class KCover(SceneRatios):
         ]
         meaning = {
             "threshold_m": float(threshold_m),
-            "at_least": tuple(min_sensor_counts),
-            "square_metres": has_area_weights,
+            "min_sensor_counts": tuple(min_sensor_counts),
+            "has_area_weights": has_area_weights,
             "grid": grid,
             "regions": places.regions,
         }

@@ -276,7 +276,7 @@ class SMig(FrameMetric):
             "voxel_m": float(voxel_m),
             "region": region,
             "categories": tuple(categories),
-            "occlusion": ends_at_hits,
+            "ends_at_hits": ends_at_hits,
         }
         super().__init__(meaning, **kwargs)
         self.sensors = tuple(sensors)
