@@ -252,10 +252,10 @@ def test_a_number_that_few_worlds_know_has_no_error_and_none_to_race_with_unless
 
 def test_what_a_draw_of_worlds_gives_is_what_the_metric_gives_over_them():
     case = CASES["object coverage"]
-    estimate = case.over(case.steps).estimate()
-    assert len(estimate.frame_counts) == len(case.steps)  # a world each
-    drawn = case.over([case.steps[0], case.steps[0], case.steps[3]]).compute()
-    weights = torch.zeros(1, len(case.steps))
+    estimate = case.over(case.frames).estimate()
+    assert len(estimate.frame_counts) == len(case.frames)  # a world each
+    drawn = case.over([case.frames[0], case.frames[0], case.frames[3]]).compute()
+    weights = torch.zeros(1, len(case.frames))
     weights[0, 0], weights[0, 3] = 2, 1
     again = torch.tensor([[number.value for number in drawn]]).double()
     torch.testing.assert_close(estimate.resample(weights), again, equal_nan=True)
@@ -264,7 +264,7 @@ def test_what_a_draw_of_worlds_gives_is_what_the_metric_gives_over_them():
 @pytest.mark.parametrize("name", OF_FRAMES)
 def test_without_a_world_it_is_what_the_other_frames_say_and_errors_come_from_that(name):
     case = CASES[name]
-    telling = [step["frame"] for step in case.steps if case.over([step]).compute()[0].has_value]
+    telling = [step["frame"] for step in case.frames if case.over([step]).compute()[0].has_value]
     frames = [
         replace(frame, block_index=world) for world, frame in zip(range(10), itertools.cycle(telling), strict=False)
     ]
@@ -307,7 +307,7 @@ def test_the_order_of_points_boxes_and_frames_does_not_matter(case):
             )
         }
 
-    first, second = case.over(case.steps), case.over([shuffled(step) for step in case.steps[::-1]])
+    first, second = case.over(case.frames), case.over([shuffled(step) for step in case.frames[::-1]])
     for one, other in zip(first.compute(), second.compute(), strict=True):
         assert one.value == pytest.approx(other.value, rel=1e-12, nan_ok=True), one.quantity.key
         assert one.count == other.count
@@ -320,18 +320,18 @@ def test_metrics_that_share_a_search_find_what_each_finds_alone(case):
     for metric in together.values():
         metric.query_cache = query_cache
     query_cache.searches_by_sensor = True
-    for step in case.steps:
+    for step in case.frames:
         for metric in together.values():
             metric.update(**step)
     for name in OF_FRAMES:
-        alone = CASES[name].over(case.steps)
+        alone = CASES[name].over(case.frames)
         for one, other in zip(together[name].compute(), alone.compute(), strict=True):
             assert one.value == pytest.approx(other.value, abs=0, nan_ok=True)
 
 
 @EVERY
 def test_an_unknown_number_is_nan_with_a_count_of_0_and_nothing_else_is(case):
-    for metric in (case.over([case.bland]), case.over(case.steps[:1]), case.over(case.steps)):
+    for metric in (case.over([case.bland]), case.over(case.frames[:1]), case.over(case.frames)):
         for number in metric.compute():
             assert math.isnan(number.value) == (number.count == 0), number.quantity.key
             assert math.isnan(number.error) or number.error > 0
@@ -341,12 +341,12 @@ def test_an_unknown_number_is_nan_with_a_count_of_0_and_nothing_else_is(case):
 def test_frames_without_boxes_are_refused_with_the_way_to_them(name):
     metric = CASES[name].make()
     with pytest.raises(ValueError, match=r"no boxes.*SimulatedFrames\(\.\.\., boxes=True\)"):
-        metric.update(replace(CASES[name].steps[0]["frame"], boxes=None))
+        metric.update(replace(CASES[name].frames[0]["frame"], boxes=None))
     assert metric.num_frames == 0
 
 
 def test_square_metres_that_are_missing_are_refused():
-    frame = replace(CASES["k-cover"].steps[0]["frame"], reference_weights=None)
+    frame = replace(CASES["k-cover"].frames[0]["frame"], reference_weights=None)
     with pytest.raises(ValueError, match="square metres"):
         CASES["k-cover"].make().update(frame)
     CASES["k-cover"].make(has_area_weights=False).update(frame)
@@ -355,7 +355,7 @@ def test_square_metres_that_are_missing_are_refused():
 
 def test_sensors_that_nobody_can_tell_apart_are_refused():
     with pytest.raises(ValueError, match="sensor_point_counts"):
-        CASES["k-cover"].make().update(replace(CASES["k-cover"].steps[0]["frame"], sensor_point_counts=None))
+        CASES["k-cover"].make().update(replace(CASES["k-cover"].frames[0]["frame"], sensor_point_counts=None))
 
 
 def test_a_rig_of_which_nobody_knows_the_sensors_has_no_field_of_view():
@@ -365,7 +365,7 @@ def test_a_rig_of_which_nobody_knows_the_sensors_has_no_field_of_view():
 
 def test_another_rig_is_refused():
     with pytest.raises(ValueError, match="no rig 'other'"):
-        ObjectCoverage(rig_name="other").update(CASES["k-cover"].steps[0]["frame"])
+        ObjectCoverage(rig_name="other").update(CASES["k-cover"].frames[0]["frame"])
 
 
 @pytest.mark.parametrize(
