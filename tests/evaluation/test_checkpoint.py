@@ -172,7 +172,7 @@ def test_a_complete_run_goes_on_when_more_steps_are_wanted(frame_of, path):
 
 
 def test_looks_at_a_target_error_go_on_as_they_would_have(frame_of, path, monkeypatch):
-    monkeypatch.setattr("torchcover.evaluation.target_error.MIN_STEPS", 8)
+    monkeypatch.setattr("torchcover.evaluation.target_error.MIN_FRAMES", 8)
     target = {"target_error": "0.2m", "thresholds_m": ()}
     whole = measured(Drive(frame_of), **target)
     assert 8 < whole.run.num_frames < STEPS

@@ -21,7 +21,7 @@ from torchcover.coverage import Maximum, Quantiles
 from torchcover.data import DEFAULT_REFERENCE, BadFrameError, Frame, FrameDataset
 from torchcover.evaluation import Settings, TargetError, task
 from torchcover.evaluation.result_page import HEAVY
-from torchcover.evaluation.target_error import MIN_GROWTH, MIN_STEPS
+from torchcover.evaluation.target_error import MIN_FRAMES, StoppingParams
 
 SMALL = {"num_frames": 2, "cell_m": 4.0, "num_rays": 1024, "test_targets": "pole"}
 
@@ -124,7 +124,7 @@ def test_rigs_and_scenarios_as_objects_and_the_others_against_the_first(tmp_path
 
 def test_no_world_is_built_after_the_run_to_draw_the_ego(monkeypatch):
     built, build = [], Scenario.build_scene
-    monkeypatch.setattr(Scenario, "world", lambda *args: built.append(args) or build(*args))
+    monkeypatch.setattr(Scenario, "build_scene", lambda *args: built.append(args) or build(*args))
     result = torchcover.evaluate("front_roof_32", **SMALL)
     next(iter(result.plot_maps()))
     assert len(built) == 1
@@ -146,7 +146,7 @@ def test_any_source_of_frames_will_do():
 
 def test_a_target_error_is_an_object_here():
     result = torchcover.evaluate(frames=Single(), cell_m=4.0, target_error=TargetError(radius_m=10.0))
-    assert result.run.num_frames == math.ceil(MIN_GROWTH * MIN_STEPS)  # the second look
+    assert result.run.num_frames == math.ceil(StoppingParams().min_growth * MIN_FRAMES)  # the second look
     assert result.target_error_lines[0] == f"Target error reached after {result.run.num_frames} steps."
 
 

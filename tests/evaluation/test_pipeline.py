@@ -16,7 +16,7 @@ from torch.utils.data import Subset
 from torchcover import BevGrid, CoverageMetric, Scenario, evaluate
 from torchcover.data import BadFrameError, RigSubset, SimulatedFrames
 from torchcover.evaluation import CoverageObserver, observe, pipeline
-from torchcover.evaluation.pipeline import MOST_TOGETHER, MeasuredFrames, group_by_scene
+from torchcover.evaluation.pipeline import MAX_FRAMES_PER_TASK, MeasuredFrames, group_by_scene
 from torchcover.evaluation.progress import Progress, handle_termination, show_wait
 from torchcover.frames import build_scene_lookup
 from torchcover.simulation import PaperReference
@@ -71,7 +71,7 @@ class Spoiled:
 
 
 def coverage(rig="a"):
-    return CoverageObserver(CoverageMetric(GRID, blocks=16), rig)
+    return CoverageObserver(CoverageMetric(GRID, num_blocks=16), rig)
 
 
 def values(observer):
@@ -101,7 +101,7 @@ def test_coverage_is_that_of_the_metric_with_weights_and_places_in_time(frames):
     observers = {rig: coverage(rig) for rig in ("a", "b")}
     run = observe(frames, observers.values())
     for rig, observer in observers.items():
-        metric = CoverageMetric(GRID, blocks=16)
+        metric = CoverageMetric(GRID, num_blocks=16)
         for frame in frames:
             metric.update(frame.clouds[rig], frame.reference, weights=frame.reference_weights, block_index=frame.index)
         assert torch.equal(observer.compute().radius, metric.compute().radius)
@@ -153,7 +153,7 @@ def test_of_several_workers_one_makes_the_frames_of_a_world_and_all_come_in_orde
     assert [{spread.simulator.get_run_index(index) for index in task} for task in tasks] == [{0}, {1}, {2}]
     dense = list(group_by_scene(range(700), SimulatedFrames("urban", "front_roof_32", num_frames=1000).get_scene_id))
     assert [index for task in dense for index in task] == [*range(700)]
-    assert max(map(len, dense)) == MOST_TOGETHER
+    assert max(map(len, dense)) == MAX_FRAMES_PER_TASK
     still = SimulatedFrames("courtyard", "front_roof_32", num_frames=3)  # of which every process has the whole
     for alone in (still, []):
         assert list(group_by_scene(range(3), build_scene_lookup(alone))) == [[0], [1], [2]]
@@ -199,7 +199,7 @@ def test_each_world_is_built_by_one_worker_whoever_gives_the_frames(monkeypatch,
             file.write(f"{run}\n")
         return build(self, seed, run, *rest)
 
-    monkeypatch.setattr(Scenario, "world", world)
+    monkeypatch.setattr(Scenario, "build_scene", world)
     evaluate(frames=Told(frames), cell_m=8.0, num_workers=2)
     assert sorted((tmp_path / "built").read_text().split()) == ["0", "1"]
 
@@ -376,7 +376,7 @@ def test_what_there_is_outlives_a_worker_that_is_killed(frames):
     assert (run.num_frames, run.is_complete) == (len(names.names), False)
     assert names.names == ["f0", "f1", "f2", "f3", "f4"][: len(names.names)]
     with pytest.raises(
-        ChildProcessError, match=rf"a worker was killed after step {run.num_frames}, .*; use fewer workers"
+        ChildProcessError, match=rf"a worker was killed after frame {run.num_frames}, .*; use fewer workers"
     ):
         run.raise_failure()
 
@@ -436,7 +436,7 @@ def test_it_runs_in_any_thread(frames):
 class AfterThree:
     """A rule that is content after three steps."""
 
-    words = "nearly there"
+    progress_text = "nearly there"
 
     def is_reached(self, num_frames):
         return num_frames >= 3
@@ -471,7 +471,7 @@ def test_each_worker_is_left_a_core(frame_of, monkeypatch, workers, threads):
 def test_a_wait_without_steps_is_shown_on_a_terminal(capsys, monkeypatch, shown):
     for variable in ("FORCE_COLOR", "TTY_COMPATIBLE", "TTY_INTERACTIVE"):
         monkeypatch.setenv(variable, "1")
-    with show_wait("preparing the scene", shown=shown):
+    with show_wait("preparing the scene", is_shown=shown):
         pass
     assert ("preparing the scene" in capsys.readouterr().err) == shown
 

@@ -24,7 +24,7 @@ REGIONS = (Region("near", (0.0, 1.0), (0.0, 1.0)), Region("far", (1.0, 2.0), (0.
 
 
 def a_metric() -> CoverageMetric:
-    return CoverageMetric(GRID, (0.4, 0.8), blocks=16)
+    return CoverageMetric(GRID, (0.4, 0.8), num_blocks=16)
 
 
 def add(metric: CoverageMetric, index: int, scale: float = 0.3) -> None:
@@ -121,17 +121,17 @@ def test_a_run_stops_once_every_error_is_small_enough_at_two_looks_in_a_row():
     record, lines = summarize_target_error(target, {"a": metric.compute()}, REGIONS, is_confirmed=True)
     assert record["reached"] is True
     assert record["frames_needed"] == steps
-    assert record["unknown"] == ["near above", "far above"]
+    assert record["unobserved"] == ["near above", "far above"]
     assert lines == [
         f"Target error reached after {steps} steps.",
-        "Not waited for, as no cell of it is known: near above, far above.",
+        "Not part of the target, as no cell of it is known: near above, far above.",
     ]
 
 
 def test_small_enough_once_is_not_reached():
     coverages = {"a": filled(64, scale=0.01).compute()}
     record, lines = summarize_target_error(TargetError(radius_m=1.0), coverages, REGIONS, is_confirmed=False)
-    assert all(number["reached"] for number in record["numbers"])
+    assert all(number["is_reached"] for number in record["numbers"])
     assert record["reached"] is False
     assert lines[0].startswith("Target error not reached in 64 steps: every error is small enough now, but was not at")
 
@@ -144,7 +144,7 @@ def test_however_good_it_looks_no_run_ends_before_64_steps(steps):
         watch.target, {"a": filled(steps).compute()}, REGIONS, is_confirmed=False
     )
     assert record["reached"] is False
-    assert first.startswith(f"Target error not reached in {steps} steps")
+    assert first.startswith(f"Target error not reached in {steps} frames")
 
 
 def test_nothing_known_is_not_good_enough():
@@ -156,14 +156,14 @@ def test_nothing_known_is_not_good_enough():
     assert watch.estimate_num_frames(100) == 100
     record, lines = summarize_target_error(watch.target, {"a": metric.compute()}, REGIONS, is_confirmed=False)
     assert (record["reached"], record["frames_needed"], record["numbers"]) == (False, None, [])
-    assert lines[0] == "Target error not reached: no region has a known cell."
+    assert lines[0] == "Target error not reached: no region has an observed cell."
 
 
 def test_what_was_not_reached_is_told_for_each_region_with_the_steps_it_would_take():
     target = TargetError(radius_m=0.005, detection=0.5)
     record, lines = summarize_target_error(target, {"a": filled(64, scale=0.01).compute()}, REGIONS, is_confirmed=False)
     assert re.fullmatch(
-        r"  near all, radius_m of a: error 0\.03\d m \(target 0\.005 m\), about \d,\d00 different steps are needed",
+        r"  near all, radius_m of a: error 0\.03\d m \(target 0\.005 m\), about \d,\d00 different frames are needed",
         lines[1],
     )
     assert re.fullmatch(r"  far all, radius_m of a: error 0\.000\d+ m \(target 0\.005 m\), reached", lines[2])
@@ -178,7 +178,7 @@ def test_what_all_steps_say_alike_is_not_waited_for_and_named():
         TargetError(detection=0.5), {"a": filled(64).compute()}, REGIONS, is_confirmed=True
     )
     assert [line for line in lines if "say the same" in line] == [
-        "Not waited for, as all steps say the same, which proves nothing: far all, detection_0.4m of a; "
+        "Not part of the target, as all frames have the same value: far all, detection_0.4m of a; "
         "far all, detection_0.8m of a."
     ]
 
@@ -189,7 +189,7 @@ def test_without_an_error_no_number_of_steps_is_made_up():
     )
     assert record["frames_needed"] is None
     assert {number["error"] for number in record["numbers"]} == {None}
-    assert lines[1] == "  near all, radius_m of a: not enough steps for an error"
+    assert lines[1] == "  near all, radius_m of a: not enough frames for an error"
     json.dumps(record, allow_nan=False)
 
 

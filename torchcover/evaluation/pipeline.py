@@ -1,4 +1,4 @@
-"""The one loop: frames in order, and every observer is fed with each of them."""
+"""Observation loop: make the frames in order and pass each of them to all observers."""
 
 import os
 import signal
@@ -25,23 +25,22 @@ from torchcover.frames import BadFrameError, Frame, FrameSource, build_scene_loo
 
 Frames = FrameSource | Dataset[Frame] | Sequence[Frame]
 
-# Frames that a worker makes at a time, at most: they wait together in memory.
-MOST_TOGETHER = 16
+# Frames of one task of a worker, at most: all of them wait in memory until the task is done.
+MAX_FRAMES_PER_TASK = 16
 
 
 @dataclass
 class Run:
-    """How a run went.
+    """Outcome of a run.
 
     Args:
-        num_frames: Frames that all observers have seen.
-        counts: Sums of the frames' counts.
-        skipped_frames: What was wrong with the frames that were skipped.
-        is_target_reached: Whether what was waited for ended it.
-        failure: What ended it before its time, if anything did: a bad frame, Ctrl-C, a worker that was killed, an error
-            of an observer.
-        duration_s: How long it took.
-        measurement_s: That part of it that went into the observers.
+        num_frames: Frames that all observers have received.
+        counts: Sums of the counts of all frames.
+        skipped_frames: Reason for each frame that was skipped.
+        is_target_reached: Whether the stopping rule ended the run.
+        failure: Error that ended the run early: a bad frame, Ctrl-C, a worker that was killed, an error of an observer.
+        duration_s: Duration of the run.
+        measurement_s: Time in the observers in this process.
     """
 
     num_frames: int = 0
@@ -54,19 +53,23 @@ class Run:
 
     @property
     def is_complete(self) -> bool:
-        """Whether nothing but the end of the frames, or of what was waited for, ended it."""
+        """Whether the run ended with its last frame or by its stopping rule."""
         return self.failure is None
 
     def raise_failure(self) -> None:
-        """End as the run ended, once what was computed is safe: raise what ended it, if anything did."""
+        """Raise the error that ended the run early, if there is one; call it once the results are saved."""
         if self.failure is not None:
             raise self.failure
 
 
 class MeasuredFrame(NamedTuple):
-    """What is left of a frame where it was measured: what each observer is to add, and how long that took there.
+    """Result of a frame in the process that made it; it is small to send if it contains no frame.
 
-    The frame itself is there if an observer needs it; what travels between processes is small without it.
+    Args:
+        frame: The frame, if an observer needs it.
+        counts: Counts of the frame.
+        sums: Index of each observer that measures where frames are made -> the sums to add.
+        measurement_s: Time for the sums, 0 in a worker.
     """
 
     frame: Frame | None
@@ -76,40 +79,45 @@ class MeasuredFrame(NamedTuple):
 
 
 class MeasuredFrames:
-    """Frames that are measured where they are made, in this process or in a worker.
+    """Map-style dataset that measures frames where they are made, in this process or in a worker.
 
-    By observers with `compute_sums`, but for coverage on another device; others are fed with the frame itself.
+    Observers with `compute_sums` measure there, except coverage on another device; other observers need the frame.
+
+    Args:
+        frames: Source of the frames.
+        observers: All observers of the run.
+        device: Device of the observers.
     """
 
     def __init__(self, frames: Frames, observers: Sequence[AnyObserver], device: torch.device | str) -> None:
-        on_the_cpu = torch.device(device).type == "cpu"
+        is_on_cpu = torch.device(device).type == "cpu"
         self.frames = frames
-        self._observers: dict[int, Any] = {
-            number: one
-            for number, one in enumerate(observers)
-            if hasattr(one, "compute_sums") and (on_the_cpu or not isinstance(one, CoverageObserver))
-        }
+        self._observers: dict[int, Any] = {}
+        for index, observer in enumerate(observers):
+            needs_device = isinstance(observer, CoverageObserver) and not is_on_cpu
+            if hasattr(observer, "compute_sums") and not needs_device:
+                self._observers[index] = observer
         self._needs_frame = len(self._observers) < len(observers)
 
     def __getitem__(self, index: int) -> MeasuredFrame:
         frame, start = self.frames[index], time.perf_counter()
         sums = {number: observer.compute_sums(frame) for number, observer in self._observers.items()}
-        measuring_s = 0.0 if get_worker_info() else time.perf_counter() - start
-        return MeasuredFrame(frame if self._needs_frame else None, frame.counts, sums, measuring_s)
+        measurement_s = 0.0 if get_worker_info() else time.perf_counter() - start
+        return MeasuredFrame(frame if self._needs_frame else None, frame.counts, sums, measurement_s)
 
 
 class StoppingRule(Protocol):
-    """Ends a run before its frames do; see `TargetErrorRule`."""
+    """Rule that ends a run before its last frame; see `TargetErrorRule`."""
 
     def is_reached(self, num_frames: int) -> bool:
-        """Whether the run may end after so many steps."""
+        """Test whether the run may end after this number of frames."""
 
     def estimate_num_frames(self, max_frames: int) -> int:
-        """Steps that the run is thought to take, of so many at most."""
+        """Estimate the number of frames of the whole run, at most `max_frames`."""
 
     @property
     def progress_text(self) -> str:
-        """How far it is, for the progress bar."""
+        """Status for the progress bar."""
 
 
 def observe(
@@ -122,102 +130,79 @@ def observe(
     skip_bad_frames: bool = False,
     stopping_rule: StoppingRule | None = None,
     show_progress: bool = False,
-    title: str = "steps",
+    title: str = "frames",
     keep_partial: bool = False,
     journal: CheckpointManager | None = None,
     ranks: Ranks | None = None,
 ) -> Run:
-    """Feed observers with frames. Whatever ends the run, all of them have seen the same frames.
+    """Pass frames to observers. All observers have received the same frames, however the run ends.
 
-    But for an error of an observer itself: those before it have seen one frame more.
+    The only exception is an error in an observer: the observers before it have received one more frame.
 
     Args:
-        frames: A source of frames, or any map-style dataset or list of them.
-        observers: What looks at them.
-        num_frames: Only so many frames, from the first on; all if not given.
-        num_workers: Processes that make frames; 0 makes them in this one.
-        device: Where the observers get the frames' tensors.
-        skip_bad_frames: Skip and note frames that cannot be used, instead of ending with the first.
-        stopping_rule: Ends the run early.
-        show_progress: Whether to show a bar.
-        title: What stands before the bar.
-        keep_partial: After the first step, what ends the run is noted in it and not raised: for who looks at
-            `Run.complete`.
-        journal: Goes on from a checkpoint, and keeps it; of these observers and this rule.
-        ranks: The processes that share the frames, each of which calls this; the caller adds up what they have seen.
+        frames: Source of frames, or any map-style dataset or list of frames.
+        observers: Observers that receive each frame.
+        num_frames: Number of frames, starting with the first; all if not given.
+        num_workers: Number of processes that make frames; 0 makes them in this process.
+        device: Device of the tensors that observers receive.
+        skip_bad_frames: Skip and record bad frames; otherwise the first bad frame ends the run.
+        stopping_rule: Rule that ends the run early.
+        show_progress: Whether to show a progress bar.
+        title: Title of the progress bar.
+        keep_partial: After the first frame, an error is stored in `Run.failure` instead of raised; check
+            `Run.is_complete`.
+        journal: Checkpoint of these observers and this rule; the run continues from it and is saved to it.
+        ranks: Processes that share the frames; each of them calls this function, and the caller merges the results.
+
+    Returns:
+        Outcome of the run.
 
     Raises:
-        BadFrameError: The frame that ended it.
-        ValueError: Not a single frame could be used.
-        TypeError: Several processes make the frames, which do not say of which worlds they are; see `build_scene_lookup`.
+        BadFrameError: Bad frame that ended the run.
+        ValueError: No frame could be used.
+        TypeError: Several processes make frames, and the frames do not provide scene ids; see `build_scene_lookup`.
         ChildProcessError: A worker was killed.
         KeyboardInterrupt: Ctrl-C.
 
     Example:
         >>> class Names:
         ...     def __init__(self):
-        ...         self.seen = []
+        ...         self.names = []
         ...     def update(self, frame):
-        ...         self.seen.append(frame.name)
+        ...         self.names.append(frame.name)
         ...     def compute(self):
-        ...         return self.seen
+        ...         return self.names
         ...     def merge_state(self, other):
-        ...         self.seen += other.seen
+        ...         self.names += other.names
         >>> frames = [Frame({"rig": torch.rand(9, 3)}, torch.rand(9, 3), index, f"f{index}") for index in range(3)]
         >>> names = Names()
-        >>> observe(frames, [names], steps=2).steps, names.compute()
+        >>> observe(frames, [names], num_frames=2).num_frames, names.compute()
         (2, ['f0', 'f1'])
     """
-    run, observers = Run(), list(observers)
-    most = len(frames) if num_frames is None else min(num_frames, len(frames))  # type: ignore[arg-type]  # map-style: has one
+    run = Run()
+    total = len(frames)  # type: ignore[arg-type]  # map-style datasets have a length
+    max_frames = total if num_frames is None else min(num_frames, total)
     if journal:
         journal.restore(run)
-    world_of = int if num_workers < 2 and ranks is None else build_scene_lookup(frames)
-    todo = iter(range(most)) if ranks is None else ranks.iterate_share(range(most), world_of)
-    todo = _left(todo, run, skip_bad_frames=skip_bad_frames)
-    start = time.perf_counter() - run.duration_s
-    consistent = True  # all observers and the rule know of the same frames
-    run.is_target_reached = (
-        stopping_rule is not None and run.num_frames > 0 and stopping_rule.is_reached(run.num_frames)
+    loop = _ObservationLoop(
+        frames, list(observers), run, num_workers, device, skip_bad_frames, stopping_rule, journal, ranks
     )
-    share = most if ranks is None else -(-most // ranks.num_ranks)
+    tasks = loop.plan_tasks(max_frames)
+    # The largest share of a rank, which the progress bar shows.
+    num_expected = max_frames if ranks is None else -(-max_frames // ranks.num_ranks)
+    start_s = time.perf_counter() - run.duration_s
     try:
         with (
-            _threads_beside(num_workers),
-            Progress(share, title, num_done=run.num_frames, is_shown=show_progress, num_workers=num_workers) as bar,
+            _limit_threads(num_workers),
+            Progress(
+                num_expected, title, num_done=run.num_frames, is_shown=show_progress, num_workers=num_workers
+            ) as bar,
         ):
-            tasks = group_by_scene(() if run.is_target_reached else todo, world_of if num_workers > 1 else int)
-            apart = MeasuredFrames(frames, observers, device)
-            for seen in _each(apart, tasks, num_workers, run, skip_bad_frames=skip_bad_frames):
-                if ranks:
-                    ranks.check_failures()
-                with defer_signals():
-                    consistent = False
-                    _feed(seen, observers, run, device)
-                    run.is_target_reached = stopping_rule is not None and stopping_rule.is_reached(run.num_frames)
-                    consistent = True
-                run.duration_s = time.perf_counter() - start
-                expected = (
-                    share
-                    if stopping_rule is None
-                    else run.num_frames
-                    if run.is_target_reached
-                    else stopping_rule.estimate_num_frames(share)
-                )
-                bar.advance(expected, stopping_rule.progress_text if stopping_rule else "")
-                if run.is_target_reached:
-                    break
-                if journal:
-                    journal.write_if_due(run)
-    except (Exception, KeyboardInterrupt) as error:  # hours of work are not lost to any of them
-        with defer_signals() as signals:
-            clear_frames(error.__traceback__)  # which would keep the workers alive
-            killed = find_killed_worker(error, num_workers, run.num_frames)
-            # Whoever ends workers too, as schedulers do, may have ended them first.
-            run.failure = KeyboardInterrupt() if killed and not set(signals).isdisjoint(ENDS) else killed or error
-            signals.clear()
-    run.duration_s = time.perf_counter() - start
-    if journal and run.num_frames and consistent and (run.failure or journal.keep):
+            loop.process(tasks, bar, num_expected, start_s)
+    except (Exception, KeyboardInterrupt) as error:  # the results of hours must survive any error
+        run.failure = loop.find_failure(error)
+    run.duration_s = time.perf_counter() - start_s
+    if journal and run.num_frames and loop.is_consistent and (run.failure or journal.keep):
         with defer_signals():
             journal.write(run)
     if not (keep_partial and (run.num_frames or ranks)):
@@ -227,113 +212,226 @@ def observe(
     return run
 
 
+@dataclass
+class _ObservationLoop:
+    """State of one call of `observe`, whose arguments these are.
+
+    Args:
+        is_consistent: Whether all observers and the stopping rule have received the same frames.
+    """
+
+    frames: Frames
+    observers: Sequence[AnyObserver]
+    run: Run
+    num_workers: int
+    device: torch.device | str
+    skip_bad_frames: bool
+    stopping_rule: StoppingRule | None
+    journal: CheckpointManager | None
+    ranks: Ranks | None
+    is_consistent: bool = True
+
+    def plan_tasks(self, max_frames: int) -> Iterator[list[int]]:
+        """Plan which frames are made together: the remaining frames of this rank, grouped by scene.
+
+        Args:
+            max_frames: Number of frames of all ranks.
+        """
+        needs_scene_ids = self.num_workers > 1 or self.ranks is not None
+        get_scene_id = build_scene_lookup(self.frames) if needs_scene_ids else int
+        indices = iter(range(max_frames))
+        if self.ranks is not None:
+            indices = self.ranks.iterate_share(range(max_frames), get_scene_id)
+        self._skip_finished(indices)
+        self._update_stopping_rule(is_first=True)
+        return group_by_scene(
+            () if self.run.is_target_reached else indices, get_scene_id if self.num_workers > 1 else int
+        )
+
+    def process(self, tasks: Iterable[list[int]], bar: Progress, num_expected: int, start_s: float) -> None:
+        """Make, measure and add all frames of the tasks, until the stopping rule ends the run.
+
+        Args:
+            tasks: Indices of frames that are made together.
+            bar: Progress bar.
+            num_expected: Expected number of frames without a stopping rule.
+            start_s: Start of the run on the clock `time.perf_counter`.
+        """
+        run, rule = self.run, self.stopping_rule
+        measured_frames = MeasuredFrames(self.frames, self.observers, self.device)
+        for measured in self._iterate_measured(measured_frames, tasks):
+            if self.ranks:
+                self.ranks.check_failures()
+            with defer_signals():  # a signal must not separate the observers
+                self.is_consistent = False
+                self._add_frame(measured)
+                self._update_stopping_rule()
+                self.is_consistent = True
+            run.duration_s = time.perf_counter() - start_s
+            if run.is_target_reached:
+                bar.advance(run.num_frames, rule.progress_text if rule else "")
+                break
+            bar.advance(
+                rule.estimate_num_frames(num_expected) if rule else num_expected, rule.progress_text if rule else ""
+            )
+            if self.journal:
+                self.journal.write_if_due(run)
+
+    def find_failure(self, error: Exception | KeyboardInterrupt) -> Exception | KeyboardInterrupt:
+        """Find the cause of an error: Ctrl-C, a worker that was killed, or the error itself.
+
+        Args:
+            error: Error that ended the loop.
+        """
+        with defer_signals() as signals:
+            clear_frames(error.__traceback__)  # its references would keep the workers alive
+            killed = find_killed_worker(error, self.num_workers, self.run.num_frames)
+            # Schedulers end the workers together with this process, and perhaps first.
+            is_ended_from_outside = killed and not set(signals).isdisjoint(ENDS)
+            signals.clear()
+            return KeyboardInterrupt() if is_ended_from_outside else killed or error
+
+    def _skip_finished(self, indices: Iterator[int]) -> None:
+        """Skip the frames that the checkpoint contains."""
+        run = self.run
+        num_done = run.num_frames + len(run.skipped_frames)
+        num_skipped = sum(1 for _ in islice(indices, num_done))
+        if num_skipped < num_done:
+            raise ValueError(f"num_frames: {num_done} are done in the checkpoint; got {num_skipped}, which is less")
+        if run.skipped_frames and not self.skip_bad_frames:
+            raise ValueError(
+                f"{len(run.skipped_frames)} bad frames were skipped before the checkpoint, such as "
+                f"{run.skipped_frames[0]}; continue to skip them (--set skip_bad_frames=true)"
+            )
+
+    def _update_stopping_rule(self, *, is_first: bool = False) -> None:
+        rule, num_frames = self.stopping_rule, self.run.num_frames
+        self.run.is_target_reached = (
+            rule is not None and (num_frames > 0 or not is_first) and rule.is_reached(num_frames)
+        )
+
+    def _add_frame(self, measured: MeasuredFrame) -> None:
+        start = time.perf_counter()
+        frame = None if measured.frame is None else measured.frame.to(self.device)
+        for index, observer in enumerate(self.observers):
+            if index in measured.sums:
+                observer.add_sums(measured.sums[index])  # type: ignore[attr-defined]  # exists with `compute_sums`
+            elif frame is not None:
+                observer.update(frame)
+        self.run.measurement_s += measured.measurement_s + time.perf_counter() - start
+        self.run.counts.update(measured.counts)
+        self.run.num_frames += 1
+
+    def _iterate_measured(self, frames: MeasuredFrames, tasks: Iterable[list[int]]) -> Iterator[MeasuredFrame]:
+        """Make the frames of all tasks, in this process or in workers; bad ones are recorded or raised."""
+        start_method = get_start_method()
+        loader = DataLoader(
+            FramesOrErrors(frames),
+            batch_sampler=tasks,
+            collate_fn=list,
+            num_workers=self.num_workers,
+            worker_init_fn=end_with_parent(),
+            generator=torch.Generator("cpu"),  # the loader samples a seed, which must not use the user's generator
+            multiprocessing_context=start_method if self.num_workers else None,
+            prefetch_factor=1 if self.num_workers else None,  # prefetched frames occupy shared memory
+        )
+        for batch in iterate_batches(loader):
+            for result in batch:
+                if isinstance(result, MeasuredFrame):
+                    yield result
+                elif self.skip_bad_frames and isinstance(result, BadFrameError):
+                    self.run.skipped_frames.append(str(result))
+                else:
+                    raise result
+
+
 @contextmanager
-def _threads_beside(workers: int) -> Iterator[None]:
-    before = torch.get_num_threads()
-    if workers:
-        torch.set_num_threads(max(1, min(before, count_cores() - workers)))
+def _limit_threads(num_workers: int) -> Iterator[None]:
+    """Leave the cores of the workers to them while the block runs."""
+    num_threads = torch.get_num_threads()
+    if num_workers:
+        torch.set_num_threads(max(1, min(num_threads, count_cores() - num_workers)))
     warn_about_spinning(torch.get_num_threads())
     try:
         yield
     finally:
-        torch.set_num_threads(before)
+        torch.set_num_threads(num_threads)
 
 
 def find_killed_worker(error: BaseException, num_workers: int, num_frames: int) -> ChildProcessError | None:
-    """What torch says, wherever this process is, when a worker dies; as an error that a user can do something about."""
-    told = isinstance(error, RuntimeError) and str(error).startswith("DataLoader worker (pid")
-    # Or its last frame could not be fetched; what a worker itself raises is "Caught ... in DataLoader worker process".
-    cut_off = num_workers > 0 and isinstance(error, EOFError | ConnectionError) and not str(error).startswith("Caught ")
-    if not (told or cut_off):
+    """Recognize the errors that torch raises when a worker was killed.
+
+    Args:
+        error: Error of the run.
+        num_workers: Number of worker processes.
+        num_frames: Number of finished frames, for the message.
+
+    Returns:
+        Error with advice for the user; None for any other error.
+    """
+    is_reported = isinstance(error, RuntimeError) and str(error).startswith("DataLoader worker (pid")
+    # The connection may also end while a frame is received. Errors of a worker itself start with "Caught ".
+    is_cut_off = isinstance(error, EOFError | ConnectionError) and not str(error).startswith("Caught ")
+    if not (is_reported or (num_workers > 0 and is_cut_off)):
         return None
-    # A process that is not forked imports the program, which then starts workers of its own, and may not.
-    forked = get_start_method() == "fork"
-    why = "for want of memory" + ("" if forked else ', or of `if __name__ == "__main__":` around what the program runs')
+    causes = "for want of memory"
+    if get_start_method() != "fork":  # the worker imports the main module, which must not start workers in turn
+        causes += ', or of `if __name__ == "__main__":` around what the program runs'
     return ChildProcessError(
-        f"a worker was killed after step {num_frames:,}, perhaps {why}; use fewer workers ({error!r})"
+        f"a worker was killed after frame {num_frames:,}, perhaps {causes}; use fewer workers ({error!r})"
     )
 
 
-def _feed(seen: MeasuredFrame, observers: Sequence[AnyObserver], run: Run, device: torch.device | str) -> None:
-    start = time.perf_counter()
-    frame = None if seen.frame is None else seen.frame.to(device)
-    for number, observer in enumerate(observers):
-        if number in seen.sums:
-            observer.add_sums(seen.sums[number])  # type: ignore[attr-defined]  # who has `compute_sums` has it
-        elif frame is not None:
-            observer.update(frame)
-    run.measurement_s += seen.measurement_s + time.perf_counter() - start
-    run.counts.update(seen.counts)
-    run.num_frames += 1
-
-
-def _left(indices: Iterator[int], run: Run, *, skip_bad_frames: bool) -> Iterator[int]:
-    done = run.num_frames + len(run.skipped_frames)
-    if (most := sum(1 for _ in islice(indices, done))) < done:
-        raise ValueError(f"steps: {done} are done in the checkpoint; got {most}, which is less")
-    if run.skipped_frames and not skip_bad_frames:
-        raise ValueError(
-            f"{len(run.skipped_frames)} bad frames were skipped before the checkpoint, such as {run.skipped_frames[0]}; go on "
-            "skipping them (--set skip_bad_frames=true)"
-        )
-    return indices
-
-
 def group_by_scene(indices: Iterable[int], get_scene_id: Callable[[int], int]) -> Iterator[list[int]]:
-    """Which frames a worker makes in a row: those of one world, so that only one worker builds it."""
-    for _, of_world in groupby(indices, get_scene_id):
-        while together := list(islice(of_world, MOST_TOGETHER)):
-            yield together
+    """Group consecutive frames of one scene, so that only one worker builds it.
+
+    Args:
+        indices: Indices of frames.
+        get_scene_id: Function from the index of a frame to its scene.
+
+    Returns:
+        Iterator over groups of at most 16 indices.
+    """
+    for _, scene_indices in groupby(indices, get_scene_id):
+        while group := list(islice(scene_indices, MAX_FRAMES_PER_TASK)):
+            yield group
 
 
 class FramesOrErrors(Dataset[Any]):
-    """Frames; what is wrong with one stands in its place, so that it costs none of those that are made with it."""
+    """Dataset that returns the error of a bad frame in its place, so that other frames of a task are not lost.
+
+    Args:
+        frames: Source of the frames.
+    """
 
     def __init__(self, frames: Frames | MeasuredFrames | Dataset[Any]) -> None:
         self.frames = frames
 
-    def __getitem__(self, index: int) -> Any:  # noqa: ANN401  (what the frames are, or an error)
+    def __getitem__(self, index: int) -> Any:  # noqa: ANN401  (a frame, or an error)
         try:
             return self.frames[index]
         except ValueError as error:
             if get_worker_info() is None:
                 return error
-            # Of a kind that is known to survive the way to another process; where it arose stands in a note.
-            copy = (BadFrameError if isinstance(error, BadFrameError) else ValueError)(str(error))
+            # Only these classes are known to survive pickling; the traceback becomes a note.
+            error_class = BadFrameError if isinstance(error, BadFrameError) else ValueError
+            copy = error_class(str(error))
             copy.add_note(format_exc())
             return copy
 
 
-def _each(
-    frames: MeasuredFrames, tasks: Iterable[list[int]], workers: int, run: Run, *, skip_bad_frames: bool
-) -> Iterator[MeasuredFrame]:
-    method = get_start_method()
-    loader = DataLoader(
-        FramesOrErrors(frames),
-        batch_sampler=tasks,
-        collate_fn=list,
-        num_workers=workers,
-        worker_init_fn=end_with_parent(),
-        generator=torch.Generator("cpu"),  # the loader draws a number: not from the generator of the user
-        multiprocessing_context=method if workers else None,
-        prefetch_factor=1 if workers else None,  # what is made ahead waits in shared memory
-    )
-    for batch in iterate_batches(loader):
-        for made in batch:
-            if isinstance(made, MeasuredFrame):
-                yield made
-            elif skip_bad_frames and isinstance(made, BadFrameError):
-                run.skipped_frames.append(str(made))
-            else:
-                raise made
-
-
 def iterate_batches(loader: DataLoader[Any]) -> Iterator[Any]:
-    """Iterate over the batches of a loader, with a warning about each of its workers that is stopped.
+    """Iterate over the batches of a loader and warn about workers that are stopped.
 
-    Whatever ends the loop early kills workers that are stopped, for which the end of the program would wait.
+    If the loop ends early, stopped workers are killed, because the end of the program would wait for them.
+
+    Args:
+        loader: The loader.
+
+    Returns:
+        Iterator over the batches.
     """
-    with torch.device("cpu"):  # the number that the loader draws is a tensor of the default device
+    with torch.device("cpu"):  # the loader samples its seed as a tensor on the default device
         batches = iter(loader)
     workers = [worker.pid or 0 for worker in active_children()] if loader.num_workers else []
     try:
@@ -344,6 +442,7 @@ def iterate_batches(loader: DataLoader[Any]) -> Iterator[Any]:
                 return
             yield batch
     except BaseException:
-        for pid in filter(is_stopped, workers):
-            os.kill(pid, signal.SIGKILL)
+        for pid in workers:
+            if is_stopped(pid):
+                os.kill(pid, signal.SIGKILL)
         raise

@@ -30,7 +30,7 @@ from torchcover.estimation import (
 from torchcover.evaluation.config import STUDY_SETTINGS
 from torchcover.evaluation.measurement import measure_coverage
 from torchcover.evaluation.settings import Settings
-from torchcover.evaluation.target_error import MIN_STEPS, round_up_frames
+from torchcover.evaluation.target_error import MIN_FRAMES, round_up_frames
 from torchcover.evaluation.task import build_simulation_task
 from torchcover.files import AtomicOutput, end_with_parent, report_stopped_processes
 from torchcover.report import (
@@ -385,7 +385,7 @@ def _tried(options: str, settings: Settings, first: Coverage | None) -> tuple[Tr
             bias = abs(difference.value) if difference and (is_biased or math.isnan(difference.value)) else 0.0
             place = region.name, height, region in awaited
             numbers.append(StudiedNumber(*place, quantity, value, ErrorModel(own, bias), difference, is_biased))
-    least = max(MIN_STEPS, estimate_blocks_needed(steps, worlds) if worlds > 0 else steps)
+    least = max(MIN_FRAMES, estimate_blocks_needed(steps, worlds) if worlds > 0 else steps)
     times = result.run.duration_s, processor_s
     return Trial(options, steps, least, *times, coverage.band_frame, numbers), coverage
 

@@ -1,4 +1,4 @@
-"""A run ends once its numbers are good enough: target errors, how far each number is from them, what was reached."""
+"""Target errors: standard errors at which a run stops, the rule that stops it, and a summary of what was reached."""
 
 import math
 import re
@@ -12,87 +12,87 @@ from torchcover.estimation import ROUND_OFF, ErrorModel
 from torchcover.evaluation.observers import Observer
 from torchcover.report import to_json_record
 
-# An error from fewer steps is not believed, though they may fill enough blocks; nor is one that is small enough once,
-# for the looks at which it happens to be too small are those that would end the run.
-MIN_STEPS = 64
-LOOKS_IN_A_ROW = 2
-# Errors are looked at when they should have become small enough, but after 4 to 50 % more steps: a run is as much too
-# long as two looks are apart.
-MIN_GROWTH, MAX_GROWTH = 1.04, 1.5
+# Standard errors of fewer frames are unreliable, even if the frames fill enough blocks.
+MIN_FRAMES = 64
 
 
 @dataclass(frozen=True)
 class TargetError:
-    """The largest standard errors that are good enough; None where any is.
+    """Largest accepted standard errors; None accepts any error.
 
     Args:
-        radius_m: Of every radius in metres.
-        detection: Of every detection, as a share.
+        radius_m: Standard error of every radius in meters.
+        detection: Standard error of every detection rate, as a share.
 
     Raises:
-        ValueError: Neither, or one that is not positive and finite.
+        ValueError: Neither is given, or one is not positive and finite.
     """
 
     radius_m: float | None = None
     detection: float | None = None
 
     def __post_init__(self) -> None:
-        given = {name: size for name, size in vars(self).items() if size is not None}
-        if not given:
+        if self.radius_m is None and self.detection is None:
             raise ValueError("target error: radius_m, detection or both are needed; got neither")
-        for name, size in given.items():
-            if not 0 < size < math.inf:
-                raise ValueError(f"target error: {name} must be positive and finite; got {size}")
+        for name, error in vars(self).items():
+            if error is not None and not 0 < error < math.inf:
+                raise ValueError(f"target error: {name} must be positive and finite; got {error}")
 
     @classmethod
     def parse(cls, text: str | Sequence[str]) -> "TargetError | None":
-        """Read numbers with their units; None for no words.
+        """Parse errors with their units.
+
+        Args:
+            text: One text or several, such as "0.1%" for detection rates or "0.02m" for radii.
+
+        Returns:
+            The target error; None for an empty sequence.
 
         Raises:
-            ValueError: Not a positive number with % or m, or two with the same unit.
-            TypeError: Not words.
+            ValueError: Not a positive number with % or m, or two errors with the same unit.
+            TypeError: Not texts.
 
         Example:
             >>> TargetError.parse(["0.1%", "0.02m"])
             TargetError(radius_m=0.02, detection=0.001)
         """
-        each = [text] if isinstance(text, str) else text
-        if not isinstance(each, Sequence) or not all(isinstance(word, str) for word in each):
+        texts = [text] if isinstance(text, str) else text
+        if not isinstance(texts, Sequence) or not all(isinstance(word, str) for word in texts):
             raise TypeError(
                 f'target error: numbers with their units are needed, "0.1%" or ["0.1%", "0.02m"], or a '
                 f"TargetError; got {text!r}"
             )
-        found: dict[str, float] = {}
-        for word in each:
-            parts = re.fullmatch(r"([0-9.]+(?:e-?[0-9]+)?) ?(%|m)", word.strip())
+        errors: dict[str, float] = {}
+        for word in texts:
+            match = re.fullmatch(r"([0-9.]+(?:e-?[0-9]+)?) ?(%|m)", word.strip())
             try:
-                size = float(parts[1]) if parts else math.nan
+                value = float(match[1]) if match else math.nan
             except ValueError:
-                size = math.nan
-            if not parts or not 0 < size < math.inf:
+                value = math.nan
+            if not match or not 0 < value < math.inf:
                 raise ValueError(
                     f"target error {word}: a positive number with its unit is needed, 0.1% for the detection or "
                     "0.02m for the radius"
                 )
-            name, size = ("radius_m", size) if parts[2] == "m" else ("detection", size / 100)
-            if name in found:
-                raise ValueError(f"target error {word}: another number in {parts[2]} was given before; give one")
-            found[name] = size
-        return cls(**found) if found else None
+            name, error = ("radius_m", value) if match[2] == "m" else ("detection", value / 100)
+            if name in errors:
+                raise ValueError(f"target error {word}: another number in {match[2]} was given before; give one")
+            errors[name] = error
+        return cls(**errors) if errors else None
 
 
 @dataclass(frozen=True)
 class ConvergenceStatus:
-    """How far a number is from the error that is good enough.
+    """Standard error of one number, compared with its target.
 
     Args:
-        rig: Whose number, or `B minus A` for a difference.
+        rig: Name of the rig, or `B minus A` for a difference.
         region: Name of the region.
         band: Name of the height band.
-        quantity: As in the columns of `summary.csv`.
-        error: Standard error now, in metres or as a share; NaN if there are not enough steps.
-        target: What is good enough.
-        num_frames: Steps so far.
+        quantity: Key of the quantity, as in the columns of `summary.csv`.
+        error: Current standard error, in meters or as a share; NaN if there are not enough frames.
+        target: Largest accepted standard error.
+        num_frames: Frames so far.
     """
 
     rig: str
@@ -105,187 +105,242 @@ class ConvergenceStatus:
 
     @property
     def is_reached(self) -> bool:
-        """Whether it is good enough, and known well enough to say so."""
-        return self.num_frames >= MIN_STEPS and self.error <= self.target
+        """Whether the error is small enough, and from enough frames to be reliable."""
+        return self.num_frames >= MIN_FRAMES and self.error <= self.target
 
     @property
     def excess(self) -> float:
-        """How many times the error is what it should be; infinite if it is not known."""
+        """Ratio of the error to its target; infinite if the error is unknown."""
         return math.inf if math.isnan(self.error) else self.error / self.target
 
     @property
     def frames_needed(self) -> int | None:
-        """Steps after which it should be good enough, for errors fall as 1 / sqrt(steps); None if there is no error."""
+        """Expected number of frames for the target, as errors fall with 1 / sqrt(frames); None without an error."""
         if math.isinf(self.excess):
             return None
-        return max(
-            MIN_STEPS,
-            self.num_frames
-            if self.is_reached
-            else ErrorModel.from_error(self.error, self.num_frames).estimate_num_frames(self.target) or 0,
-        )
+        if self.is_reached:
+            return max(MIN_FRAMES, self.num_frames)
+        model = ErrorModel.from_error(self.error, self.num_frames)
+        return max(MIN_FRAMES, model.estimate_num_frames(self.target) or 0)
 
     @property
     def text(self) -> str:
-        """Error and target."""
-        return f"error {_measure(self.error, self.quantity)} (target {_measure(self.target, self.quantity)})"
+        """Error and target in words."""
+        return f"error {_format_error(self.error, self.quantity)} (target {_format_error(self.target, self.quantity)})"
 
 
 def compute_convergence(
     target: TargetError, coverages: Mapping[str, Coverage], regions: Sequence[Region]
 ) -> list[ConvergenceStatus]:
-    """How far every number is: those of each rig, and the differences to the first rig.
+    """Compare the standard error of every number with its target: of each rig, and of its difference to the first.
 
-    A number that is unknown, for want of a known cell, has no error, and nothing waits for it.
+    Numbers of unobserved regions have no error and are left out.
 
     Args:
-        target: What is good enough.
-        coverages: What `CoverageMetric.compute` returned, by the name of the rig, from the same frames.
+        target: Largest accepted standard errors.
+        coverages: Name of each rig -> its coverage, all from the same frames.
         regions: Regions within the grid.
+
+    Returns:
+        One status for each rig or difference, region, height band and quantity with a target.
     """
     (first_name, first), *_ = coverages.items()
-    found = []
-    for region, height in list_region_bands(regions, first.grid):
-        estimates = {name: coverage.estimate(region, height) for name, coverage in coverages.items()}
-        others = [name for name in estimates if name != first_name]
-        paired = {f"{name} minus {first_name}": estimates[name].subtract(estimates[first_name]) for name in others}
-        for name, estimate in (estimates | paired).items():
-            numbers = zip(first.quantities, estimate.value.tolist(), estimate.error.tolist(), strict=True)
-            for quantity, value, error in numbers:
-                good = target.radius_m if quantity.unit == "m" else target.detection
-                if good is not None and not math.isnan(value):
-                    where = (name, region.name, height, quantity.key)
-                    found.append(ConvergenceStatus(*where, error, good, first.counts["num_frames"]))
-    return found
+    statuses = []
+    for region, band in list_region_bands(regions, first.grid):
+        estimates = {name: coverage.estimate(region, band) for name, coverage in coverages.items()}
+        for name in list(estimates):
+            if name != first_name:
+                estimates[f"{name} minus {first_name}"] = estimates[name].subtract(estimates[first_name])
+        for name, estimate in estimates.items():
+            values, errors = estimate.value.tolist(), estimate.error.tolist()
+            for quantity, value, error in zip(first.quantities, values, errors, strict=True):
+                target_value = target.radius_m if quantity.unit == "m" else target.detection
+                if target_value is not None and not math.isnan(value):
+                    location = (name, region.name, band, quantity.key)
+                    statuses.append(ConvergenceStatus(*location, error, target_value, first.counts["num_frames"]))
+    return statuses
+
+
+@dataclass(frozen=True)
+class StoppingParams:
+    """Schedule of the checks of a target error.
+
+    The rule checks when the errors should have become small enough, but not before the frames have grown by
+    `min_growth`, and not after `max_growth`: a run may be longer than necessary by the distance of two checks.
+
+    Args:
+        num_confirmations: Consecutive checks that must be successful. An error that is too small by chance at one check
+            would otherwise end the run.
+        min_growth: Smallest ratio of the frames at two consecutive checks.
+        max_growth: Largest ratio.
+    """
+
+    num_confirmations: int = 2
+    min_growth: float = 1.04
+    max_growth: float = 1.5
 
 
 class TargetErrorRule:
-    """Looks at the errors of a run now and then: what `observe` takes as `until`.
+    """Stopping rule of `observe` that ends a run once all standard errors reach their target.
 
     Args:
-        target: What is good enough.
-        observers: Those whose coverage it is, by the name of the rig.
+        target: Largest accepted standard errors.
+        observers: Name of each rig -> its coverage observer.
         regions: Regions within their grid.
+        params: Schedule of the checks.
+
+    Attributes:
+        next_check_frame: Number of frames at which the errors are checked next.
+        worst: Status with the largest excess at the last check; None before the first check.
     """
 
     def __init__(
-        self, target: TargetError, observers: Mapping[str, Observer[Coverage]], regions: Sequence[Region]
+        self,
+        target: TargetError,
+        observers: Mapping[str, Observer[Coverage]],
+        regions: Sequence[Region],
+        params: StoppingParams = StoppingParams(),
     ) -> None:
         self.target = target
         self.observers = observers
         self.regions = regions
-        self.next_check_frame = MIN_STEPS
+        self.next_check_frame = MIN_FRAMES
         self.worst: ConvergenceStatus | None = None
-        self._good_looks = 0
+        self._params = params
+        self._num_successful_checks = 0
 
     def is_reached(self, num_frames: int) -> bool:
-        """Whether the run may end after so many steps. Between two looks: no."""
+        """Check the errors, if a check is due.
+
+        Args:
+            num_frames: Frames so far.
+
+        Returns:
+            Whether the run may end; False between two checks.
+        """
         if num_frames < self.next_check_frame:
             return False
         coverages = {name: observer.compute() for name, observer in self.observers.items()}
-        found = compute_convergence(self.target, coverages, self.regions)
-        self.worst = max(found, key=lambda standing: standing.excess, default=None)
-        self._good_looks = self._good_looks + 1 if self.worst is not None and self.worst.is_reached else 0
-        if self._good_looks >= LOOKS_IN_A_ROW:
+        statuses = compute_convergence(self.target, coverages, self.regions)
+        self.worst = max(statuses, key=lambda status: status.excess, default=None)
+        is_successful = self.worst is not None and self.worst.is_reached
+        self._num_successful_checks = self._num_successful_checks + 1 if is_successful else 0
+        if self._num_successful_checks >= self._params.num_confirmations:
             return True
-        needed = math.inf if self.worst is None else self.worst.frames_needed or math.inf
-        self.next_check_frame = math.ceil(min(max(needed, MIN_GROWTH * num_frames), MAX_GROWTH * num_frames))
+        frames_needed = math.inf if self.worst is None else self.worst.frames_needed or math.inf
+        earliest, latest = self._params.min_growth * num_frames, self._params.max_growth * num_frames
+        self.next_check_frame = math.ceil(min(max(frames_needed, earliest), latest))
         return False
 
     def state_dict(self) -> dict[str, Any]:
-        """When it looks again, and what the last looks said."""
+        """Return the schedule and the results of the last checks."""
         return {
             "next_check_frame": self.next_check_frame,
-            "good_looks": self._good_looks,
+            "num_successful_checks": self._num_successful_checks,
             "worst": None if self.worst is None else asdict(self.worst),
         }
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Go on as another one would have."""
-        self.next_check_frame, self._good_looks = state_dict["next_check_frame"], state_dict["good_looks"]
+        """Continue from the state of another rule.
+
+        Args:
+            state_dict: Return value of its `state_dict`.
+        """
+        self.next_check_frame = state_dict["next_check_frame"]
+        self._num_successful_checks = state_dict["num_successful_checks"]
         self.worst = None if state_dict["worst"] is None else ConvergenceStatus(**state_dict["worst"])
 
     def estimate_num_frames(self, max_frames: int) -> int:
-        """Steps that the run is thought to take, of so many at most."""
+        """Estimate the number of frames of the whole run.
+
+        Args:
+            max_frames: Upper limit, which is returned while nothing is known.
+        """
         if self.worst is None or self.worst.frames_needed is None:
             return max_frames
         return min(max_frames, max(self.worst.frames_needed, self.next_check_frame))
 
     @property
     def progress_text(self) -> str:
-        """The worst error and its target."""
+        """Worst error and its target, for the progress bar."""
         return self.worst.text if self.worst else ""
 
 
-def _measure(error: float, quantity: str) -> str:
+def _format_error(error: float, quantity: str) -> str:
     return f"{error:.2g} m" if quantity == "radius_m" else f"{100 * error:.2g} %"
 
 
 def summarize_target_error(
     target: TargetError | None, coverages: Mapping[str, Coverage], regions: Sequence[Region], *, is_confirmed: bool
 ) -> tuple[dict[str, Any] | None, list[str]]:
-    """What was aimed at and what was reached at the end of a run.
+    """Summarize at the end of a run whether the target errors were reached.
 
     Args:
-        target: What is good enough; None if nothing was aimed at.
-        coverages: As in `standings`.
+        target: Largest accepted standard errors; None if there is no target.
+        coverages: As in `compute_convergence`.
         regions: Regions within the grid.
-        is_confirmed: Whether the run has ended because every number was good enough at two looks in a row.
+        is_confirmed: Whether the rule ended the run.
 
     Returns:
-        A record for `summary.json`, with errors in metres or as shares, and lines for the terminal.
+        Record for `summary.json`, with errors in meters or as shares, and lines for the terminal.
     """
     if target is None:
         return None, []
-    found, first = compute_convergence(target, coverages, regions), next(iter(coverages.values()))
-    blank = [f"{row.region} {row.band}" for row in first.summary(regions) if not row.observed_cells]
-    lines = _lines(found, first.counts["num_frames"], confirmed=is_confirmed)
-    if blank:
-        lines.append(f"Not waited for, as no cell of it is known: {', '.join(blank)}.")
-    if alike := [f"{one.region} {one.band}, {one.quantity} of {one.rig}" for one in found if one.error <= ROUND_OFF]:
-        lines.append(f"Not waited for, as all steps say the same, which proves nothing: {'; '.join(alike)}.")
-    return {**_record(target, found), "reached": is_confirmed, "unknown": blank}, lines
+    statuses, first = compute_convergence(target, coverages, regions), next(iter(coverages.values()))
+    unobserved = [f"{row.region} {row.band}" for row in first.summary(regions) if not row.observed_cells]
+    lines = _describe_convergence(statuses, first.counts["num_frames"], is_confirmed=is_confirmed)
+    if unobserved:
+        lines.append(f"Not part of the target, as none of its cells is observed: {', '.join(unobserved)}.")
+    # A standard error of 0 is no evidence: it only means that all blocks have the same value.
+    constant = [f"{one.region} {one.band}, {one.quantity} of {one.rig}" for one in statuses if one.error <= ROUND_OFF]
+    if constant:
+        lines.append(f"Not part of the target, as all frames have the same value: {'; '.join(constant)}.")
+    return {**_build_record(target, statuses), "reached": is_confirmed, "unobserved": unobserved}, lines
 
 
-def _record(target: TargetError, found: Sequence[ConvergenceStatus]) -> dict[str, Any]:
-    needed = [standing.frames_needed for standing in found]
-    known = [steps for steps in needed if steps is not None]
-    numbers = []
-    for standing, steps in zip(found, needed, strict=True):
-        record = {name: value for name, value in asdict(standing).items() if name != "num_frames"}
-        numbers.append(to_json_record({**record, "reached": standing.is_reached, "frames_needed": steps}))
-    return {
-        **asdict(target),
-        "frames_needed": max(known) if known and len(known) == len(needed) else None,
-        "numbers": numbers,
-    }
+def _build_record(target: TargetError, statuses: Sequence[ConvergenceStatus]) -> dict[str, Any]:
+    frames_needed, numbers = [], []
+    for status in statuses:
+        frames_needed.append(status.frames_needed)
+        record = asdict(status)
+        del record["num_frames"]
+        record |= {"is_reached": status.is_reached, "frames_needed": status.frames_needed}
+        numbers.append(to_json_record(record))
+    known = [num_frames for num_frames in frames_needed if num_frames is not None]
+    all_known = bool(known) and len(known) == len(frames_needed)
+    return {**asdict(target), "frames_needed": max(known) if all_known else None, "numbers": numbers}
 
 
-def _lines(found: Sequence[ConvergenceStatus], steps: int, *, confirmed: bool) -> list[str]:
-    """That it was reached, or the worst number of each region and band and what it would take."""
-    if not found:
-        return ["Target error not reached: no region has a known cell."]
-    if confirmed:
-        return [f"Target error reached after {steps:,} steps."]
-    after = f"Target error not reached in {steps:,} step{'s' * (steps != 1)}"
-    if all(standing.is_reached for standing in found):
-        return [f"{after}: every error is small enough now, but was not at two looks in a row; take more steps."]
-    lines = [f"{after}; the largest of each region:"]
-    for (region, height), group in groupby(found, key=lambda standing: (standing.region, standing.band)):
-        worst = max(group, key=lambda standing: standing.excess)
-        where = f"  {region} {height}, {worst.quantity} of {worst.rig}"
+def _describe_convergence(
+    statuses: Sequence[ConvergenceStatus], num_frames: int, *, is_confirmed: bool
+) -> list[str]:
+    """Describe the success, or the worst number of each region and band with the frames that it needs."""
+    if not statuses:
+        return ["Target error not reached: no region has an observed cell."]
+    if is_confirmed:
+        return [f"Target error reached after {num_frames:,} frames."]
+    outcome = f"Target error not reached in {num_frames:,} frame{'s' * (num_frames != 1)}"
+    if all(status.is_reached for status in statuses):
+        return [f"{outcome}: every error is small enough, but not yet at two consecutive checks; use more frames."]
+    lines = [f"{outcome}; the largest error of each region:"]
+    for (region, band), group in groupby(statuses, key=lambda status: (status.region, status.band)):
+        worst = max(group, key=lambda status: status.excess)
+        location = f"  {region} {band}, {worst.quantity} of {worst.rig}"
         if worst.frames_needed is None:
-            lines.append(f"{where}: not enough steps for an error")
+            lines.append(f"{location}: not enough frames for an error")
         elif worst.is_reached:
-            lines.append(f"{where}: {worst.text}, reached")
+            lines.append(f"{location}: {worst.text}, reached")
         else:
-            needed = f"about {round_up_frames(worst.frames_needed):,} different steps are needed"
-            lines.append(f"{where}: {worst.text}, {needed}")
+            advice = f"about {round_up_frames(worst.frames_needed):,} different frames are needed"
+            lines.append(f"{location}: {worst.text}, {advice}")
     return lines
 
 
 def round_up_frames(num_frames: int) -> int:
-    """Steps in two digits, never fewer.
+    """Round a number of frames up to two digits.
+
+    Args:
+        num_frames: Number of frames.
 
     Example:
         >>> round_up_frames(99), round_up_frames(1234)
