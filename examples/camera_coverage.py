@@ -88,7 +88,7 @@ def main():
     frames = SimulatedFrames(
         "courtyard", rigs=rigs, num_frames=options.steps, seed=0, reference_sensor=PaperReference(rows=512, columns=512)
     )
-    observers = {name: CoverageObserver(CoverageMetric(GRID, max_radius=GRID.diagonal_m), name) for name in rigs}
+    observers = {name: CoverageObserver(CoverageMetric(GRID, max_radius_m=GRID.diagonal_m), name) for name in rigs}
     observe(frames, observers.values(), show_progress=True)
     coverages = {name: observer.compute() for name, observer in observers.items()}
     console = Console()

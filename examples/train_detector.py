@@ -63,7 +63,7 @@ def in_region(boxes, categories=("car",)):
     """The cars whose centre lies in the region; `categories` is what they are called."""
     x, y, _ = boxes.center_m.T
     inside = (x >= X_M[0]) & (x < X_M[1]) & (y >= Y_M[0]) & (y < Y_M[1])
-    return boxes.select(inside).of_category(*categories)
+    return boxes.select(inside).select_categories(*categories)
 
 
 def thinned(cloud):
@@ -264,11 +264,11 @@ class Training(lightning.LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
 
-def coverage_metric(*, square_metres):
+def coverage_metric(*, has_area_weights):
     """The metric of the region; with the defaults as many blocks as drives, which know nothing of each other."""
-    band_frame = "ground" if square_metres else "vehicle"
+    band_frame = "ground" if has_area_weights else "vehicle"
     grid = BevGrid(x_m=X_M, y_m=Y_M, cell_m=1.6, heights={"body": (0.3, 2.0)}, band_frame=band_frame)
-    return CoverageMetric(grid, max_radius=grid.diagonal_m, blocks=16, square_metres=square_metres)
+    return CoverageMetric(grid, max_radius_m=grid.diagonal_m, num_blocks=16, has_area_weights=has_area_weights)
 
 
 def train(rig, training_frames, validation_frames, metric, options, console, **of_training):
@@ -463,7 +463,7 @@ def main():
     validation_frames = simulate(options.validate, options.seed + 1, surface, "validation frames", keep_clouds=True)
     results = {}
     for rig in RIGS:
-        metric = coverage_metric(square_metres=True)
+        metric = coverage_metric(has_area_weights=True)
         results[rig] = train(rig, training_frames, validation_frames, metric, options, console)
     report(results, console)
     draw(results, options.out / "detector.png")

@@ -63,7 +63,7 @@ def test_levels_are_those_of_nuscenes():
 
 
 def test_what_cannot_be_filtered_is_told():
-    with pytest.raises(ValueError, match="least: a share from 0 to 1 is needed; got 20"):
+    with pytest.raises(ValueError, match="min_visibility: a share from 0 to 1 is needed; got 20"):
         VisibleBoxes([a_frame()], 20)
     with pytest.raises(ValueError, match="frame 'f' has no boxes: SimulatedFrames"):
         VisibleBoxes([Frame({"rig": torch.zeros(1, 3)}, torch.zeros(1, 3), 0, "f")])[0]

@@ -160,7 +160,7 @@ def test_mmengine_needs_the_square_metres_that_the_metric_wants():
         MMEngineCoverage({"grid": GRID, "has_area_weights": True}, get_frames=lambda batch, _: batch) for _ in range(2)
     )
     without.process([frame], [{}])
-    with pytest.raises(ValueError, match="the square metres of each reference point are needed"):
+    with pytest.raises(ValueError, match="of each reference point are needed"):
         without.evaluate(1)
     metric.process([replace(frame, reference_weights=torch.ones(9))], [{}])
     metric.evaluate(1)
@@ -171,7 +171,7 @@ def test_mmengine_evaluates_it_as_any_of_its_metrics():
     """Built from a config by the registry, run by the real `Evaluator`, twice."""
     config = {
         "type": "MMEngineCoverage",
-        "metric": {"grid": GRID, "thresholds": (0.4,), "max_radius": 9.0},
+        "metric": {"grid": GRID, "thresholds_m": (0.4,), "max_radius_m": 9.0},
         "regions": [REGION],
     }
     evaluator = Evaluator([config])

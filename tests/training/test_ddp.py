@@ -57,14 +57,14 @@ def test_two_processes_give_the_numbers_of_one(tmp_path):
             for stage in ("train", "val"):
                 assert_same(Coverage.load(tmp_path / f"{name}_{stage}_{rank}.npz"), truth)
                 np.testing.assert_allclose(job["blocks"][stage], truth.block_sums.sums, rtol=1e-12)
-                assert job["logged"][f"coverage/{stage}/steps"] == 7
+                assert job["logged"][f"coverage/{stage}/num_frames"] == 7
                 for tag, value in truth.scalars([REGION]).items():
                     assert job["logged"][f"coverage/{stage}/{tag}"] == pytest.approx(value, rel=1e-6, nan_ok=True)
             assert job["images"] == (2 if rank == 0 else 0), "maps are drawn by one process"
 
 
 def assert_same(coverage, other):
-    for name in ("observed_frames", "points", "radius", "detection"):
+    for name in ("observed_frames", "point_counts", "radius", "detection"):
         np.testing.assert_allclose(getattr(coverage, name), getattr(other, name), rtol=1e-12, err_msg=name)
     assert coverage.counts == other.counts
 

@@ -1,7 +1,7 @@
+from .batch import FrameBatch as FrameBatch
+from .batch import collate_frames as collate_frames
 from .frame import Frame as Frame
-from .frame import FrameBatch as FrameBatch
 from .frame import Measurement as Measurement
-from .frame import collate_frames as collate_frames
 from .source import BadFrameError as BadFrameError
 from .source import FrameDataset as FrameDataset
 from .source import FrameSource as FrameSource

@@ -1,4 +1,4 @@
-"""What every source of frames says of itself, be it a simulation, a recording or another format."""
+"""Interface of sources of frames: simulations, recordings and other formats."""
 
 import operator
 import re
@@ -13,21 +13,21 @@ from torch.utils.data import Dataset, Subset
 
 from torchcover.frames.frame import Frame
 
-if TYPE_CHECKING:  # what they are is no matter of frames; who draws or measures them knows
+if TYPE_CHECKING:  # frames need neither class at run time
     from torchcover.simulation import Mesh, Sensor
 
 ValueT = TypeVar("ValueT")
 
 
 class BadFrameError(ValueError):
-    """One frame of a recording cannot be used; the others can.
+    """Error of one frame of a recording that cannot be used; other frames can.
 
-    `name` and `index` say which frame. A caller that skips bad frames catches this around `next`, with and without
-    worker processes.
+    `name` and `index` identify the frame. A caller that skips bad frames catches this error around `next`, with and
+    without worker processes.
 
     Args:
-        message: `NAME (frame INDEX): reason`, or a worker's traceback that ends in it: DataLoader knows no other way to
-            build an exception again than from its text.
+        message: `NAME (frame INDEX): reason`, or a worker's traceback that ends in it, since DataLoader rebuilds an
+            exception from its text only.
 
     Example:
         >>> error = BadFrameError("night_7 (frame 6): the reference cloud has no points")
@@ -44,88 +44,113 @@ class BadFrameError(ValueError):
 
 @runtime_checkable
 class FrameSource(Protocol):
-    """A map-style torch Dataset of frames that knows whose they are and where they come from.
+    """Map-style torch dataset of frames with a description of its rigs and of its origin.
 
-    A format of recordings is a class like this that is made from a path; see `FORMATS`.
+    A format of recordings is such a class that is constructed from a path; see `FORMATS`.
     """
 
     @property
     def rigs(self) -> Collection[str]:
-        """The names under which `Frame.clouds` has the rigs."""
+        """Names of the rigs, the keys of `Frame.clouds`."""
 
     @property
     def sensors(self) -> Mapping[str, "Sequence[Sensor]"]:
-        """The sensors of the rigs that they are known of, for drawings; may be empty."""
+        """Sensors of the rigs with known sensors, for plots; may be empty."""
 
     @property
     def sensor_names(self) -> Mapping[str, Sequence[str]]:
-        """The names of the sensors of those rigs whose `Frame.sensor_points` says which points are of which sensor."""
+        """Sensor names of the rigs for which `Frame.sensor_point_counts` is known."""
 
     @property
     def ego_outline_m(self) -> NDArray[np.float64] | None:
-        """(K, 2) corners x, y of the ego in the vehicle frame in metres; None if unknown."""
+        """(K, 2) corners x, y of the ego vehicle in the vehicle frame in meters; None if unknown."""
 
     @property
     def description(self) -> Mapping[str, object]:
-        """Where the frames come from, for `summary.json`: `scenario`, `vehicle` and `seed`, or `frames`; else None."""
+        """Origin of the frames, for `summary.json`: `scenario`, `vehicle`, `seed` or `frames`; other keys are None."""
 
     @property
     def has_area_weights(self) -> bool:
-        """Whether all frames have `Frame.reference_weights`, the square metres of reference points; else none has."""
+        """True if all frames have `Frame.reference_weights`; False if none has."""
 
     @property
     def reference_record(self) -> Mapping[str, object] | None:
-        """Where the reference comes from, for `summary.json`: `sensor` and its settings; None if unknown.
+        """Origin of the reference points, for `summary.json`: `sensor` and its settings; None if unknown.
 
-        It has `notes`, sentences that a reader of the numbers has to know, and if it was simulated `frame_interval_s`.
+        It contains `notes`, sentences that the reader of the numbers needs, and for simulated frames
+        `frame_interval_s`.
         """
 
     @property
     def content(self) -> Mapping[str, object]:
-        """All that the frames depend on, under the names that a message calls it by; for JSON.
+        """Inputs that determine the frames, as JSON values; the keys appear in messages.
 
-        A checkpoint is of frames of this content: it changes if, and only if, a frame may be another one. What is large
-        may be a hash.
+        A checkpoint belongs to one content: it changes if, and only if, a frame may change. Large inputs may be hashed.
         """
 
     def get_scene_id(self, index: int, /) -> int:
-        """Which world a frame is of, by any number: frames of one are made by one process, which builds it once.
+        """Return the number of the scene of a frame.
 
-        The index itself where nothing has to be built, so that any process may make any frame.
+        One process makes all frames of a scene, so that the scene is built once. Sources that build no scenes return
+        the index, so that any process may make any frame.
+
+        Args:
+            index: Index of the frame.
+
+        Returns:
+            Any number that is equal for frames of one scene.
         """
 
     def get_block_index(self, index: int, /) -> int:
-        """`Frame.block_index` of a frame, without making it; of a simulation beyond its last frame, too.
+        """Return `Frame.block_index` of a frame without making the frame.
 
-        IndexError: there is no such frame.
+        Args:
+            index: Index of the frame; a simulation accepts indices beyond its last frame.
+
+        Returns:
+            Block index.
+
+        Raises:
+            IndexError: The frame does not exist.
         """
 
     def has_boxes(self) -> bool:
-        """Whether frames have `Frame.boxes`."""
+        """Return whether frames have `Frame.boxes`."""
 
     def has_heights(self) -> bool:
-        """Whether frames have `Frame.reference_heights_m`: then height bands are over the ground by default."""
+        """Return whether frames have `Frame.reference_heights_m`, the condition for height bands above ground."""
 
     def get_ego_mesh(self) -> "Mesh | None":
-        """The body of the ego in the vehicle frame; None if unknown."""
+        """Return the mesh of the ego vehicle in the vehicle frame; None if unknown."""
 
     def check(self, num_frames: int | None, /) -> Sequence[str]:
-        """What looks wrong about so many frames (None: all), a sentence each: warnings before they are measured."""
+        """Return warnings about the frames, one sentence each, before they are evaluated.
+
+        Args:
+            num_frames: Number of frames to check, from the first; None for all.
+
+        Returns:
+            Warnings; empty if no problem is found.
+        """
 
     def __len__(self) -> int:
-        """Number of frames."""
+        """Return the number of frames."""
 
     def __getitem__(self, index: int, /) -> Frame:
-        """One frame. BadFrameError: it cannot be used; the others can."""
+        """Return one frame, or raise `BadFrameError` if it cannot be used."""
 
 
 def build_scene_lookup(frames: object) -> Callable[[int], int]:
-    """`FrameSource.get_scene_id` of any map-style dataset or list of frames.
+    """Return the function `FrameSource.get_scene_id` for any map-style dataset or list of frames.
 
-    A list holds what was made before; a torch `Subset` has the worlds of what it is of.
+    Args:
+        frames: Dataset with `get_scene_id`, a torch `Subset` of one, or a sequence of frames.
+
+    Returns:
+        Function from the index of a frame to the number of its scene; the index itself for a sequence.
 
     Raises:
-        TypeError: A dataset that does not say which world a frame is of.
+        TypeError: A dataset without `get_scene_id`.
 
     Example:
         >>> build_scene_lookup(["a frame", "another one"])(1)
@@ -137,59 +162,63 @@ def build_scene_lookup(frames: object) -> Callable[[int], int]:
     if isinstance(frames, Sequence):
         return int
     if hasattr(frames, "dataset") and hasattr(frames, "indices"):
-        whole, indices = build_scene_lookup(frames.dataset), frames.indices
-        return lambda index: whole(indices[index])
+        get_dataset_scene_id, indices = build_scene_lookup(frames.dataset), frames.indices
+
+        def get_subset_scene_id(index: int) -> int:
+            return get_dataset_scene_id(indices[index])
+
+        return get_subset_scene_id
     raise TypeError(
-        f"frames: {type(frames).__name__} does not say which world a frame is of, so that each process would build "
-        "every world; give it get_scene_id(index), see FrameSource, or use a single process"
+        f"frames: {type(frames).__name__} does not name the scene of a frame, so every process would build every "
+        "scene; define get_scene_id(index), see FrameSource, or use a single process"
     )
 
 
 class FrameDataset(Dataset[Frame]):
-    """A map-style torch Dataset of frames that a `for` loop goes through in order.
+    """Base class of map-style torch datasets of frames that a `for` loop iterates in order.
 
-    A `FrameSource` that is one of these has to say of the rest of itself only what there is to say.
+    A `FrameSource` that derives from this class overrides only the methods for which it has information.
     """
 
     @property
     def sensor_names(self) -> Mapping[str, Sequence[str]]:
-        """Nothing: which points are of which sensor is unknown."""
+        """Empty: the sensor of each point is unknown."""
         return {}
 
     def get_block_index(self, index: int) -> int:
-        """The index: no two frames are known to be alike. IndexError: there is no such frame."""
+        """Return the index: each frame is independent; see `FrameSource.get_block_index`."""
         return range(len(self))[index]
 
     def has_boxes(self) -> bool:
-        """None of them."""
+        """Return False: frames have no boxes."""
         return False
 
     def has_heights(self) -> bool:
-        """None of them."""
+        """Return False: heights above ground are unknown."""
         return False
 
     def get_ego_mesh(self) -> "Mesh | None":
-        """Unknown."""
+        """Return None: the ego vehicle is unknown."""
         return None
 
     def check(self, num_frames: int | None) -> Sequence[str]:
-        """None."""
+        """Return no warnings; see `FrameSource.check`."""
         return ()
 
     @abstractmethod
     def __len__(self) -> int:
-        """Number of frames."""
+        """Return the number of frames."""
 
     @overload
     def __getitem__(self, index: SupportsIndex, /) -> Frame: ...
     @overload
     def __getitem__(self, index: slice, /) -> Subset[Frame]: ...
     def __getitem__(self, index: SupportsIndex | slice, /) -> Frame | Subset[Frame]:
-        """Make one frame, counted from the end if negative; a slice gives a `Subset`, which makes none yet.
+        """Make one frame; negative indices count from the end; a slice returns a lazy `Subset`.
 
         Raises:
-            IndexError: There are fewer frames.
-            BadFrameError: The frame cannot be used; the others can.
+            IndexError: The frame does not exist.
+            BadFrameError: The frame cannot be used; other frames can.
         """
         if isinstance(index, slice):
             return Subset(self, range(*index.indices(len(self))))
@@ -203,16 +232,18 @@ class FrameDataset(Dataset[Frame]):
         raise NotImplementedError
 
     def __iter__(self) -> Iterator[Frame]:
-        """The frames, one after the other."""
+        """Iterate over the frames in order."""
         return (self[index] for index in range(len(self)))
 
 
 class RigSubset(FrameDataset):
-    """The same frames with the clouds of some rigs only, each under a name of one's own: a `FrameSource` of another.
+    """Frames of another source with the clouds of selected rigs under new names.
+
+    Members without a description return the value of the source.
 
     Args:
-        frames: Where the frames come from.
-        source_rigs: New name of each rig -> its name there, in the order that is wanted.
+        frames: Source of the frames.
+        source_rigs: New name of each rig -> its name in the source, in the desired order.
 
     Raises:
         ValueError: The source has no such rig.
@@ -227,66 +258,66 @@ class RigSubset(FrameDataset):
 
     @property
     def rigs(self) -> tuple[str, ...]:
-        """The new names."""
+        """New names of the rigs."""
         return tuple(self.source_rigs)
 
     @property
     def sensors(self) -> Mapping[str, "Sequence[Sensor]"]:
-        """The sensors of these rigs that they are known of."""
-        return self._chosen(self.frames.sensors)
+        """Known sensors of the selected rigs."""
+        return self._rename_rigs(self.frames.sensors)
 
     @property
     def sensor_names(self) -> Mapping[str, Sequence[str]]:
-        """Those of these rigs, as far as they are known."""
-        return self._chosen(self.frames.sensor_names)
+        """Known sensor names of the selected rigs."""
+        return self._rename_rigs(self.frames.sensor_names)
 
     @property
     def ego_outline_m(self) -> NDArray[np.float64] | None:
-        """As there."""
+        """Outline from the source."""
         return self.frames.ego_outline_m
 
     def get_scene_id(self, index: int) -> int:
-        """As there."""
+        """Return the scene number from the source; see `FrameSource.get_scene_id`."""
         return self.frames.get_scene_id(index)
 
     def get_block_index(self, index: int) -> int:
-        """As there."""
+        """Return the block index from the source; see `FrameSource.get_block_index`."""
         return self.frames.get_block_index(index)
 
     def has_boxes(self) -> bool:
-        """As there."""
+        """Return whether frames of the source have boxes."""
         return self.frames.has_boxes()
 
     def has_heights(self) -> bool:
-        """As there."""
+        """Return whether frames of the source have heights above ground."""
         return self.frames.has_heights()
 
     def get_ego_mesh(self) -> "Mesh | None":
-        """As there."""
+        """Return the ego vehicle of the source."""
         return self.frames.get_ego_mesh()
 
     def check(self, num_frames: int | None) -> Sequence[str]:
-        """As there."""
+        """Return the warnings of the source; see `FrameSource.check`."""
         return self.frames.check(num_frames)
 
     @property
     def description(self) -> Mapping[str, object]:
-        """As there."""
+        """Description from the source."""
         return self.frames.description
 
     @property
     def has_area_weights(self) -> bool:
-        """As there."""
+        """True if reference points of the source have area weights."""
         return self.frames.has_area_weights
 
     @property
     def reference_record(self) -> Mapping[str, object] | None:
-        """As there."""
+        """Record of the reference from the source."""
         return self.frames.reference_record
 
     @property
     def content(self) -> Mapping[str, object]:
-        """As there, and which rigs."""
+        """Content of the source and the selected rigs."""
         return {**self.frames.content, "rigs of the recording": self.source_rigs}
 
     def __len__(self) -> int:
@@ -294,13 +325,17 @@ class RigSubset(FrameDataset):
 
     def _frame_at(self, position: int) -> Frame:
         frame = self.frames[position]
-        boxes = (
-            None if frame.boxes is None else replace(frame.boxes, points_in_box=self._chosen(frame.boxes.points_in_box))
+        boxes, point_counts = frame.boxes, frame.sensor_point_counts
+        if boxes is not None:
+            boxes = replace(boxes, points_in_box=self._rename_rigs(boxes.points_in_box))
+        return replace(
+            frame,
+            clouds={name: frame.get_cloud(source_rig) for name, source_rig in self.source_rigs.items()},
+            boxes=boxes,
+            sensor_point_counts=None if point_counts is None else self._rename_rigs(point_counts),
+            measurements=self._rename_rigs(frame.measurements),
         )
-        points = None if frame.sensor_point_counts is None else self._chosen(frame.sensor_point_counts)
-        clouds = {name: frame.get_cloud(of) for name, of in self.source_rigs.items()}
-        measured = self._chosen(frame.measurements)
-        return replace(frame, clouds=clouds, boxes=boxes, sensor_point_counts=points, measurements=measured)
 
-    def _chosen(self, by_rig: Mapping[str, ValueT]) -> dict[str, ValueT]:
-        return {name: by_rig[of] for name, of in self.source_rigs.items() if of in by_rig}
+    def _rename_rigs(self, by_rig: Mapping[str, ValueT]) -> dict[str, ValueT]:
+        """Select values of the source by rig, under the new names; rigs without a value are omitted."""
+        return {name: by_rig[source_rig] for name, source_rig in self.source_rigs.items() if source_rig in by_rig}
