@@ -241,7 +241,7 @@ class Training(lightning.LightningModule):
             chosen = match_detections(rows, scores, frame.boxes.rows, "distance", MATCH_M)
             found = torch.zeros(len(frame.boxes))
             found[chosen[chosen >= 0]] = scores.cpu()[chosen >= 0]
-            columns = [frame.boxes.center_m[:, 0], frame.boxes.centre_m[:, 1], seen.share.cpu(), found]
+            columns = [frame.boxes.center_m[:, 0], frame.boxes.center_m[:, 1], seen.share.cpu(), found]
             world = torch.full((len(found),), float(frame.index // 4))
             self.objects.append(torch.stack([world, *(column.cpu().float() for column in columns)], dim=1))
 

@@ -59,7 +59,7 @@ def read(frames):
         if len(kept) < trained:
             kept.append(replace(frame, clouds=fed, reference=frame.reference[:0], boxes=boxes))
         else:
-            kept.append(replace(frame, clouds={rig: frame.cloud_of(rig), **fed}, boxes=boxes))
+            kept.append(replace(frame, clouds={rig: frame.get_cloud(rig), **fed}, boxes=boxes))
     return rig, kept[:trained], kept[trained:]
 
 
