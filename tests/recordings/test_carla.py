@@ -208,7 +208,7 @@ def test_an_object_without_a_size_costs_no_other(tmp_path):
     [
         (
             "{location: {x: 0, y: 0, z: 1}, extent: {x: 2, y: 1, z: 1}, rotation: {pitch: 0, yaw: 90, roll: 0}}",
-            "rotation: a box along the vehicle's axes is needed",
+            "rotation: a box aligned with the vehicle's axes is needed",
         ),
         ("{extent: {x: 1, y: 1, z: 1}}", "location: Field required"),
         ("[]", "location and extent, each with x, y, z"),

@@ -120,7 +120,7 @@ def test_points_with_times_are_moved_to_the_instant(tmp_path, field, stored):
     ],
 )
 def test_the_unit_of_times_of_points_is_found_by_the_time_between_scans(tmp_path, stored, words):
-    with pytest.warns(UserWarning, match=f"lidar: the times of points .*{words}; choose another by"):
+    with pytest.warns(UserWarning, match=f"lidar: the point times .*{words}; choose another by"):
         check_points_are_moved(tmp_path, "t", stored)
 
 
@@ -229,13 +229,13 @@ def test_what_was_chosen_is_said(tmp_path):
     lost = [("/b", time_ns, cloud(points(CORNERS_M), time_ns, "nowhere")) for _, time_ns, _ in clouds(count=5)]
     goal = [("/goal", time_ns, posed(np.eye(4), time_ns)) for _, time_ns, _ in clouds(count=5)]
     path = bag(tmp_path / "a", MOUNTED + driven() + chart + lost + goal + clouds(count=5))
-    with pytest.warns(UserWarning, match="left out|taken") as told:
+    with pytest.warns(UserWarning, match="excluded|are read from") as told:
         recording = open_recording(path)
     assert recording.sensors == ("lidar",)
     assert [str(one.message).removeprefix(f"{path}: ") for one in told] == [
-        "left out, for they come so rarely: /chart",
-        "left out, for no static transform links to base_link the frame of /b (nowhere)",
-        "poses are taken from /odom (odometry of base_link), not from /goal (poses)",
+        "excluded because of few messages: /chart",
+        "excluded, since no static transform links to base_link the frame of /b (nowhere)",
+        "poses are read from /odom (odometry of base_link), not from /goal (poses)",
     ]
     recording = RosBag(bag(tmp_path / "b", MOUNTED + clouds()), vehicle_frame="lidar")
     np.testing.assert_allclose(recording.read_scan("lidar", 0).vehicle_T_sensor, np.eye(4), atol=1e-12)
@@ -247,7 +247,7 @@ raised = build_transform(np.eye(3), [0.0, 0.0, 0.2])
 def test_the_frame_on_the_ground_is_the_vehicles(tmp_path):
     mounted = [static(link("base_link", "lidar", mount), link("base_footprint", "base_link", raised))]
     path = bag(tmp_path / "a", mounted + driven() + clouds())
-    with pytest.warns(UserWarning, match="base_footprint is taken for the vehicle's frame, not base_link"):
+    with pytest.warns(UserWarning, match="base_footprint is used as the vehicle frame, not base_link"):
         recording = RosBag(path)
     np.testing.assert_allclose(recording.read_scan("lidar", 0).vehicle_T_sensor, raised @ mount, atol=1e-12)
     np.testing.assert_allclose(recording.get_world_T_vehicle(1), pose_at(0.1) @ invert(raised), atol=1e-9)
@@ -276,7 +276,7 @@ def test_mounts_may_come_with_what_moves(tmp_path, write):
     ]
     head = [("/head", time_ns, cloud(points(CORNERS_M), time_ns, "head")) for _, time_ns, _ in clouds(count=3)]
     path = write(tmp_path / "a", moved + clouds(count=3) + head)
-    with pytest.warns(UserWarning, match=r"left out, .* the frame of /head"):
+    with pytest.warns(UserWarning, match=r"excluded, .* the frame of /head"):
         recording = RosBag(path)
     np.testing.assert_allclose(recording.read_scan("lidar", 0).vehicle_T_sensor, raised @ mount, atol=1e-9)
     np.testing.assert_allclose(recording.get_world_T_vehicle(2), pose_at(0.2), atol=1e-6)
@@ -456,7 +456,9 @@ def test_a_second_way_to_the_same_frame_is_told(tmp_path):
         other = build_transform(np.eye(3), [0.3, 0.0, 0.0]) @ pose_at(0.05 * k)
         second = link("map", "matcher", other, time_ns), link("matcher", "base_link", np.eye(4), time_ns)
         messages.append(("/tf", time_ns, tree(*first, *second)))
-    with pytest.warns(UserWarning, match="map -> (odometry|matcher): not used, since poses are taken on another way"):
+    with pytest.warns(
+        UserWarning, match="map -> (odometry|matcher): not used, since poses are read along another path"
+    ):
         recording = RosBag(bag(tmp_path / "a", MOUNTED + messages + clouds(count=5)))
     off_m = np.diff(
         [recording.get_world_T_vehicle(index)[:3, 3] - pose_at(0.1 * index)[:3, 3] for index in range(5)], axis=0
@@ -499,7 +501,7 @@ def test_a_frame_that_is_mounted_twice_is_told(tmp_path):
 def test_the_frame_of_the_poses_may_lie_above_the_ground(tmp_path):
     mounted = [static(link("base_link", "lidar", mount), link("base_footprint", "base_link", raised))]
     moved = [moved_tree(k) for k in range(8)]
-    with pytest.warns(UserWarning, match="base_footprint is taken"):
+    with pytest.warns(UserWarning, match="base_footprint is used"):
         recording = RosBag(bag(tmp_path / "a", mounted + moved + clouds(count=3)))
     np.testing.assert_allclose(recording.get_world_T_vehicle(2), pose_at(0.2) @ invert(raised), atol=1e-6)
 
@@ -528,12 +530,12 @@ def test_scans_are_paired_by_their_stamps(tmp_path):
     recording = RosBag(bag(tmp_path / "a", [*MOUNTED, *driven(), *clouds(count=5), *second]))
     for sensor in ("b", "lidar"):
         assert recording.read_scan(sensor, 3).offsets_s is None
-    assert recording._stamped_ns["b"].tolist() == recording._stamped_ns["lidar"].tolist()
+    assert recording._stamps_ns["b"].tolist() == recording._stamps_ns["lidar"].tolist()
 
 
 def test_clouds_without_stamps_are_as_recorded(tmp_path):
     unstamped = [(topic, time_ns, cloud(points(CORNERS_M), 0, "lidar")) for topic, time_ns, _ in clouds(count=3)]
-    with pytest.warns(UserWarning, match="clouds of lidar have no stamps: they are taken as made when they were"):
+    with pytest.warns(UserWarning, match="clouds of lidar have no stamps: their log times are used"):
         assert RosBag(bag(tmp_path / "a", MOUNTED + unstamped)).times_s.tolist() == pytest.approx([0.0, 0.1, 0.2])
 
 
@@ -564,8 +566,8 @@ def test_a_sensor_that_pauses_is_missing_there(tmp_path):
     ("change", "told"),
     [
         (("relative_file_paths:", "relative_file_path:"), "relative_file_paths is needed"),
-        (("- a.mcap", "- ../a.mcap"), "beside it are needed; got '../a.mcap'"),
-        (("- a.mcap", "- a.mcap.zstd"), "names of .mcap files beside it are needed"),
+        (("- a.mcap", "- ../a.mcap"), "in its folder are needed; got '../a.mcap'"),
+        (("- a.mcap", "- a.mcap.zstd"), "names of .mcap files in its folder are needed"),
         (("compression_mode: ''", "compression_mode: file"), "use `ros2 bag convert`"),
         (("storage_identifier: mcap", "storage_identifier: rosbag_v2"), "got 'rosbag_v2'"),
     ],

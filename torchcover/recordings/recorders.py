@@ -200,7 +200,7 @@ class KittiRecorder:
             visibility = measure_box_visibility(
                 frame.sensor, frame.reference, frame.boxes, reference_weights=frame.reference_weights
             )
-            self._add_text(f"label_2/{record.name}.txt", _format_labels(frame.boxes, visibility.level.tolist()))
+            self._add_text(f"label_2/{record.name}.txt", _format_labels(frame.boxes, visibility.levels.tolist()))
         arrays = {"points": transform_points(velodyne_T_vehicle, frame.reference.numpy())}
         if frame.reference_weights is not None:
             arrays["weights"] = frame.reference_weights.numpy()

@@ -195,7 +195,7 @@ def test_commonroad_scenarios_report_what_is_left_out_and_drop_a_repeated_initia
     start = text[text.index("<initialState>") + len("<initialState>") : text.index("</initialState>")]
     text = text.replace("<trajectory>", f"<trajectory><state>{start}</state>", 1)
     path.write_text(text.replace("</commonRoad>", building))
-    with pytest.warns(UserWarning, match=r"1 environmentObstacle \(building\) left out"):
+    with pytest.warns(UserWarning, match=r"1 environmentObstacle \(building\) excluded"):
         after = read_objects(path).tracks[0].trajectory
     np.testing.assert_array_equal(after.times_s, before.times_s)
     np.testing.assert_array_equal(after.positions_m, before.positions_m)

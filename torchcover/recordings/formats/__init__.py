@@ -92,8 +92,8 @@ def _open_with_settings(path: Path, settings: RecordingSettings) -> Recording:
             return correct_recording(RosBag(path, settings.vehicle_frame, mounts, settings.point_time_unit), settings)
         if settings.vehicle_frame is not None or settings.mounts or settings.point_time_unit is not None:
             raise ValueError(
-                f"{path}: vehicle_frame, mounts and point_time_unit are settings of bags; {name} stores extrinsics itself "
-                "(a plain folder in frames.yaml)"
+                f"{path}: vehicle_frame, mounts and point_time_unit are settings of bags; {name} stores extrinsics "
+                "itself (a plain folder in frames.yaml)"
             )
         return correct_recording(_check_manifest(recording_format(path), manifest), settings)
     formats = "; ".join(f"{name}: {recording_format.layout}" for name, recording_format in FORMATS.items())

@@ -1,6 +1,6 @@
-"""Bags of ROS 1 and 2: which messages there are and when, single ones of them, and clouds made of these."""
+"""Bags of ROS 1 and 2: index of messages, single messages and their point clouds."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.files import guard_reader, parse_yaml, read_short_text, report_bad_file
+from torchcover.geometry.arrays import Float64, Int64
 from torchcover.recordings.clouds.arrays import Points
 from torchcover.recordings.isolated_readers import (
     METADATA,
@@ -22,24 +23,41 @@ from torchcover.recordings.isolated_readers import (
 )
 from torchcover.recordings.recording import NO_RETURN_M
 
-# Of so many messages the stamps are read, if those were recorded equally late to this time, and so regularly.
-SAMPLED = 65
-STEADY_NS = 2_000_000
-IRREGULAR = 0.5
+# Storage of ROS 2 bags and the suffix of its files.
 SUFFIXES = {"sqlite3": ".db3", "mcap": ".mcap"}
-# What the standard definitions of ROS 1 lack, and what it was called before.
-TREE = "tf2_msgs/msg/TFMessage"
-RENAMED = {"tf/msg/tfMessage": TREE}
+TF_MESSAGE = "tf2_msgs/msg/TFMessage"
+# Former names of message types.
+RENAMED_TYPES = {"tf/msg/tfMessage": TF_MESSAGE}
+
+
+@dataclass(frozen=True)
+class StampParams:
+    """Parameters that decide whether the stamps of a long bag follow from a sample.
+
+    Args:
+        num_samples: Number of messages whose stamps are read.
+        max_delay_change_ns: Largest difference between delays of logging for which the delay counts as constant.
+        max_irregularity: Intervals between log times differ from their median by less than this share.
+    """
+
+    num_samples: int = 65
+    max_delay_change_ns: int = 2_000_000
+    max_irregularity: float = 0.5
 
 
 class Bag:
-    """A folder with `metadata.yaml` and `.db3` or `.mcap` files or with `.bag` files of ROS 1, or one such file.
+    """ROS bag: folder with `metadata.yaml` and `.db3` or `.mcap` files, folder with `.bag` files, or one such file.
 
-    Needs `torchcover[ros]`. Opening reads the index only. Messages are read as what the standard definitions say of
-    their types; those that are in the bag, of which code would be made, are left aside.
+    Needs `torchcover[ros]`. Only the index is read at first. Messages are parsed by the standard definitions of their
+    types; definitions in the bag are ignored, because code would be generated from them.
 
-    FileNotFoundError: a file is missing. BadFileError: what is no bag, or a part of one; files that are compressed as a
-    whole or have no index. ImportError: rosbags is not installed.
+    Args:
+        path: Folder or file.
+
+    Raises:
+        FileNotFoundError: A file is missing.
+        BadFileError: The path is no bag, or an incomplete one, has no index, or is compressed as a whole.
+        ImportError: rosbags is not installed.
     """
 
     def __init__(self, path: Path) -> None:
@@ -54,89 +72,138 @@ class Bag:
             check_metadata(path / METADATA)
         elif not files:
             check_suffix(path)
-        within = [file for suffix in SUFFIXES.values() for file in path.glob(f"*{suffix}")] if path.is_dir() else [path]
-        for file in files or within:
+        if not files and path.is_dir():
+            for suffix in SUFFIXES.values():
+                files.extend(path.glob(f"*{suffix}"))
+        elif not files:
+            files = [path]
+        for file in files:
             check_storage(file)
         with report_bad_file(path, "a bag"):
             index = read_bag_index(path)
         topics, types = index["topics"].tolist(), index["types"].tolist()
         times_ns = np.split(index["times_ns"], np.cumsum(index["counts"]))
-        self.type_by_topic = {topic: RENAMED.get(name, name) for topic, name in zip(topics, types, strict=True)}
-        self._times_ns: dict[str, NDArray[np.int64]] = dict(zip(topics, times_ns, strict=False))
+        self.type_by_topic = {topic: RENAMED_TYPES.get(name, name) for topic, name in zip(topics, types, strict=True)}
+        self._times_ns: dict[str, Int64] = dict(zip(topics, times_ns, strict=False))
 
-    def get_log_times_ns(self, topic: str) -> NDArray[np.int64]:
-        """(M,) when the messages of a topic were recorded, ascending."""
+    def get_log_times_ns(self, topic: str) -> Int64:
+        """Return the (M,) ascending log times of the messages of a topic; empty for an unknown topic."""
         return self._times_ns.get(topic, np.empty(0, np.int64))
 
-    def read_stamps_ns(self, topic: str) -> NDArray[np.int64]:
-        """(M,) when the messages of a topic were made, by their headers, in the order of their recording.
+    def read_stamps_ns(self, topic: str, params: StampParams = StampParams()) -> Int64:
+        """Read the header stamps of the messages of a topic, ordered by log time.
 
-        In a long bag a sample is read; if all of it was recorded equally late, to `STEADY_NS`, so was the rest.
+        If a sample of a long bag shows a constant delay between stamps and regular log times, the delay gives the other
+        stamps.
+
+        Args:
+            topic: Topic whose messages have a header.
+            params: Size of the sample and limits of its variation.
+
+        Returns:
+            (M,) stamps.
+
+        Raises:
+            BadFileError: The bag is damaged.
         """
         times_ns = self.get_log_times_ns(topic)
-        count, steps_ns = len(times_ns), np.diff(times_ns)
-        if count > SAMPLED:
-            sample_ns = times_ns[np.unique(np.linspace(0, count - 1, SAMPLED).astype(int))]
-            late_ns = sample_ns - self._read_stamps(topic, sample_ns)
-            is_regular = (np.abs(steps_ns - np.median(steps_ns)) < IRREGULAR * np.median(steps_ns)).all()
-            if is_regular and np.ptp(late_ns) <= STEADY_NS:
-                return np.asarray(times_ns - np.int64(np.median(late_ns)))
+        if len(times_ns) > params.num_samples:
+            rows = np.unique(np.linspace(0, len(times_ns) - 1, params.num_samples).astype(int))
+            delays_ns = times_ns[rows] - self._read_stamps(topic, times_ns[rows])
+            intervals_ns = np.diff(times_ns)
+            median_ns = np.median(intervals_ns)
+            is_regular = (np.abs(intervals_ns - median_ns) < params.max_irregularity * median_ns).all()
+            if is_regular and np.ptp(delays_ns) <= params.max_delay_change_ns:
+                return np.asarray(times_ns - np.int64(np.median(delays_ns)))
         return self._read_stamps(topic, None)
 
-    def _read_stamps(self, topic: str, times_ns: NDArray[np.int64] | None) -> NDArray[np.int64]:
+    def _read_stamps(self, topic: str, times_ns: Int64 | None) -> Int64:
         with report_bad_file(self.path, f"a bag, in {topic}"):
-            wanted = None if times_ns is None else times_ns.tolist()
-            stamps_ns = read_header_stamps(self.path, topic, wanted)["stamps_ns"]
-            recorded = len(self.get_log_times_ns(topic) if times_ns is None else times_ns)
-            if len(stamps_ns) != recorded:
-                raise ValueError(
-                    f"{recorded} messages are in the index, {len(stamps_ns)} are there; {find_repair_command(self.path)}"
-                )
+            stamps_ns = read_header_stamps(self.path, topic, None if times_ns is None else times_ns.tolist())
+            stamps_ns = stamps_ns["stamps_ns"]
+            expected = len(self.get_log_times_ns(topic) if times_ns is None else times_ns)
+            if len(stamps_ns) != expected:
+                repair = find_repair_command(self.path)
+                raise ValueError(f"{expected} messages are in the index, {len(stamps_ns)} are there; {repair}")
             return np.asarray(stamps_ns)
 
     def list_topics(self, *types: str) -> list[str]:
-        """Topics of these types that have messages, by name."""
-        return sorted(
-            topic for topic, kind in self.type_by_topic.items() if kind in types and len(self.get_log_times_ns(topic))
-        )
+        """List the topics of some types that have messages, by name.
+
+        Args:
+            types: Message types, such as `sensor_msgs/msg/PointCloud2`.
+        """
+        topics = [topic for topic, type_name in self.type_by_topic.items() if type_name in types]
+        return sorted(topic for topic in topics if len(self.get_log_times_ns(topic)))
 
     def read_messages(self, topic: str, start_ns: int | None = None, stop_ns: int | None = None) -> list[Any]:
-        """The messages of a topic that were recorded from a time on, until before another."""
+        """Read the messages of a topic with a log time in [start_ns, stop_ns).
+
+        Args:
+            topic: Topic of the messages.
+            start_ns: First log time; None for the beginning.
+            stop_ns: Log time after the last one; None for the end.
+
+        Returns:
+            Messages of rosbags, ordered by log time.
+
+        Raises:
+            BadFileError: The bag is damaged.
+        """
         with report_bad_file(self.path, f"a bag, in {topic}"), np.errstate(all="ignore"):
             data, ends, types = read_bag_messages(self.path, topic, start_ns, stop_ns).values()
-            deserialize = _deserializer(is_ros1=self._is_ros1)
-            starts = [0, *ends.tolist()]
-            return [
-                deserialize(data[start:end].data, RENAMED.get(name, name))
-                for start, end, name in zip(starts, ends.tolist(), types.tolist(), strict=False)
-            ]
+            deserialize = _get_deserializer(is_ros1=self._is_ros1)
+            messages, start = [], 0
+            for end, type_name in zip(ends.tolist(), types.tolist(), strict=True):
+                messages.append(deserialize(data[start:end].data, RENAMED_TYPES.get(type_name, type_name)))
+                start = end
+            return messages
 
-    def read_message(self, topic: str, time_ns: int) -> Any:  # noqa: ANN401  (of a type that rosbags has made)
-        """The message of a topic that was recorded at a time."""
-        found = self.read_messages(topic, time_ns, time_ns + 1)
-        if not found:
+    def read_message(self, topic: str, time_ns: int) -> Any:  # noqa: ANN401  (of a type that rosbags creates)
+        """Read the message of a topic with a log time.
+
+        Args:
+            topic: Topic of the message.
+            time_ns: Its log time.
+
+        Returns:
+            Message of rosbags.
+
+        Raises:
+            BadFileError: The bag is damaged, or has no such message.
+        """
+        messages = self.read_messages(topic, time_ns, time_ns + 1)
+        if not messages:
             with report_bad_file(self.path, "a bag"):
                 raise ValueError(
                     f"{topic}: the message at {time_ns} is in the index only; {find_repair_command(self.path)}"
                 )
-        return found[0]
+        return messages[0]
 
 
 @cache
-def _deserializer(*, is_ros1: bool) -> Callable[[memoryview, str], Any]:
-    """Return the function that makes a message of its bytes and the name of its standard type."""
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore  # installed, or no bag would have been read
+def _get_deserializer(*, is_ros1: bool) -> Callable[[memoryview, str], Any]:
+    """Get the function that deserializes bytes of a standard type."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore  # installed, since a bag was read
 
     types = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
     if is_ros1:
-        types.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TREE))
+        # The standard definitions of ROS 1 lack this type.
+        types.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TF_MESSAGE))
     deserialize: Callable[[memoryview, str], Any] = types.deserialize_ros1 if is_ros1 else types.deserialize_cdr
     return deserialize
 
 
 @guard_reader("a bag")
 def check_suffix(path: Path) -> None:
-    """Whether a file is called as bags are."""
+    """Check that a file has the suffix of a bag.
+
+    Args:
+        path: File.
+
+    Raises:
+        BadFileError: The suffix is another one.
+    """
     if path.suffix not in SUFFIXES.values():
         suffixes = ", ".join((*SUFFIXES.values(), ROS1_SUFFIX))
         raise ValueError(f"a folder with {METADATA}, or a file of {suffixes} is needed")
@@ -144,9 +211,15 @@ def check_suffix(path: Path) -> None:
 
 @guard_reader("a bag")
 def check_storage(path: Path) -> None:
-    """Refuse a file of a bag that is no regular one, or a database that SQLite would not read by its name alone.
+    """Check that a file of a bag is a regular file that SQLite can read alone.
 
-    A database may have changes in a file beside it, where its recorder was killed or still runs.
+    A database has changes in a separate journal if its recorder was killed or is still running.
+
+    Args:
+        path: File of a bag.
+
+    Raises:
+        BadFileError: SQLite would misread the path, or part of the messages is in a journal.
     """
     if path.suffix == SUFFIXES["sqlite3"] and not set("%?#").isdisjoint(str(path.absolute())):
         raise ValueError("SQLite takes %, ? and # in a path for parts of an address; rename the file, or its folder")
@@ -154,59 +227,62 @@ def check_storage(path: Path) -> None:
         journal = path.with_name(path.name + ending)
         if journal.exists() and journal.stat().st_size:
             raise ValueError(
-                f"some of its messages are in {journal.name} only, since its recorder did not end: copy the files "
-                f"beside each other to where you may write, and run `sqlite3 {path.name} 'PRAGMA quick_check'`"
+                f"some of its messages are in {journal.name} only, since its recorder did not end: copy both "
+                f"files to a folder where you may write, and run `sqlite3 {path.name} 'PRAGMA quick_check'`"
             )
 
 
 @guard_reader("the metadata of a bag")
 def check_metadata(path: Path) -> None:
-    """Whether the files that `metadata.yaml` names can be read one message at a time.
+    """Check that the files named in `metadata.yaml` exist and can be read message by message.
 
-    FileNotFoundError: one is missing. BadFileError: other content, files elsewhere, files that are compressed as a
-    whole.
+    Args:
+        path: `metadata.yaml` of a ROS 2 bag.
+
+    Raises:
+        FileNotFoundError: A file is missing.
+        BadFileError: The content is invalid, files are in other folders, or files are compressed as a whole.
     """
     content = parse_yaml(read_short_text(path))
-    told = content.get("rosbag2_bagfile_information") if isinstance(content, dict) else None
-    names = told.get("relative_file_paths") if isinstance(told, dict) else None
-    if not isinstance(told, dict) or not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+    information = content.get("rosbag2_bagfile_information") if isinstance(content, dict) else None
+    names = information.get("relative_file_paths") if isinstance(information, dict) else None
+    has_names = isinstance(names, list) and all(isinstance(name, str) for name in names)
+    if not isinstance(information, dict) or not isinstance(names, list) or not has_names:
         raise ValueError("rosbag2_bagfile_information with relative_file_paths is needed")
-    suffix = SUFFIXES.get(str(told.get("storage_identifier")))
-    if str(told.get("compression_mode", "")).lower() == "file" or suffix is None:
+    storage, compression = information.get("storage_identifier"), information.get("compression_mode")
+    suffix = SUFFIXES.get(str(storage))
+    if str(information.get("compression_mode", "")).lower() == "file" or suffix is None:
         raise ValueError(
             f"files of {' or '.join(SUFFIXES)} that are not compressed as a whole are needed; got "
-            f"{told.get('storage_identifier')!r}, compression {told.get('compression_mode')!r}: use `ros2 bag convert`"
+            f"{storage!r}, compression {compression!r}: use `ros2 bag convert`"
         )
     for name in names:
         if Path(name).name != name or Path(name).suffix != suffix:
-            raise ValueError(f"names of {suffix} files beside it are needed; got {name!r}")
+            raise ValueError(f"names of {suffix} files in its folder are needed; got {name!r}")
         if not (path.parent / name).exists():
             raise FileNotFoundError(f"{path.parent / name}: no such file; {path} names it")
 
 
-# The data types of fields, by their numbers.
-TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-# Names that drivers give the time of a point, since the time of the message or since 1970, and the number of its laser.
-TIME_FIELDS = ("t", "time", "timestamp", "time_stamp", "offset_time", "time_offset")
-ROW_FIELDS = ("ring", "channel", "laser_number", "laser_id", "line")
-# Units of these times: nanoseconds in each. A turn is the share of the scan period from 0 to 1.
+# Data types of `sensor_msgs/msg/PointField` by number.
+FIELD_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+# Nanoseconds in each unit of point times.
 UNITS_NS = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
-TURN = "scan_share"
-# Settings for the times of points: a unit, or to leave them aside.
-POINT_TIMES = (*UNITS_NS, TURN, "none")
+# Point times that are shares of the scan period, from 0 to 1.
+SCAN_SHARE = "scan_share"
+POINT_TIME_UNITS = (*UNITS_NS, SCAN_SHARE, "none")
 
 
 @dataclass(frozen=True)
 class PointTimeParams:
-    """How the unit of times of points is recognized.
+    """Parameters that decide on the unit of point times.
 
     Args:
-        min_period_share: Points of one scan are measured over at least this share of the scan period; a scanner that looks at
-            a sector, or a recording of every other scan, has less, which is reported.
-        max_period_share: Points of one scan are measured over at most this share of the scan period.
-        min_plausible_period_share: Below this share of the scan period no unit is plausible.
-        default_period_s: Scan period where a recording has one scan: that of most LiDARs.
-        max_offset_s: Times of points are at most this far from the stamp of their message; no LiDAR takes longer.
+        min_period_share: Points of one scan cover at least this share of the scan period; a sector scanner, or a
+            recording of every other scan, covers less, which is reported.
+        max_period_share: Points of one scan cover at most this share of the scan period.
+        min_plausible_period_share: No unit is plausible below this share of the scan period.
+        default_period_s: Scan period of most LiDARs, for recordings with one scan.
+        max_offset_s: Largest difference between a point time and the stamp of its message; no LiDAR takes longer.
         min_absolute_ns: Larger times count from 1970.
     """
 
@@ -218,161 +294,196 @@ class PointTimeParams:
     min_absolute_ns: float = 1e15
 
 
-PARAMS = PointTimeParams()
-
-
 class PointTimes(NamedTuple):
-    """How the times of the points of a sensor are stored: a unit of `POINT_TIMES`, and the period of its scans."""
+    """Storage of the point times of a sensor.
+
+    Args:
+        unit: One of `POINT_TIME_UNITS`.
+        period_s: Scan period.
+    """
 
     unit: str
     period_s: float
 
 
 class CloudMessage(NamedTuple):
-    """A cloud: (N, 3) points in the frame of the sensor, also those that are not finite, and (N,) the laser of each.
+    """Cloud of a message.
 
-    `stamp_ns` is the time of the message, 0 if its sender gave none, `offsets_s` (N,) when each was measured since
-    then.
+    Args:
+        points_m: (N, 3) points in the sensor frame, including points that are not finite.
+        stamp_ns: Stamp of the message; 0 if its sender gave none.
+        offsets_s: (N,) measurement time of each point minus the stamp; None if unknown.
+        rings: (N,) channel of each point; None if unknown.
     """
 
     points_m: Points
     stamp_ns: int
-    offsets_s: NDArray[np.float64] | None
+    offsets_s: Float64 | None
     rings: NDArray[np.integer] | None
 
 
-def parse_cloud(message: Any, point_times: PointTimes) -> CloudMessage:  # noqa: ANN401  (of a type that rosbags has made)
-    """Read the fields x, y, z, and the time of each point if there is one.
+def parse_cloud(
+    message: Any,  # noqa: ANN401  (of a type that rosbags creates)
+    point_times: PointTimes,
+    params: PointTimeParams = PointTimeParams(),
+) -> CloudMessage:
+    """Parse coordinates, point times and rings of a cloud.
 
     Args:
-        message: A `sensor_msgs/msg/PointCloud2`.
-        point_times: As `choose_point_times` chose them for its sensor.
+        message: `sensor_msgs/msg/PointCloud2`.
+        point_times: Result of `choose_point_times` for its sensor.
+        params: Limits of point times.
+
+    Returns:
+        The cloud.
 
     Raises:
-        ValueError: A cloud that contradicts itself, or times far from its stamp.
+        ValueError: The cloud is inconsistent, or point times are far from its stamp.
     """
     fields = {field.name: field for field in message.fields}
-    time_field = _time_field(message) if point_times.unit != "none" else None
-    wanted = [fields[axis] for axis in "xyz" if axis in fields]
-    if len(wanted) < 3 or any(field.datatype not in (7, 8) for field in wanted):
-        told = ", ".join(f"{field.name} ({TYPES.get(field.datatype, field.datatype)})" for field in message.fields)
-        raise ValueError(f"fields x, y, z of float32 or float64 are needed; got {told or 'none'}")
-    ring = next((fields[name] for name in ROW_FIELDS if name in fields), None)
-    table = _table(message, [*wanted, *(field for field in (time_field, ring) if field is not None)])
-    rows = table[ring.name].astype(np.int64) if ring is not None and ring.datatype < 7 else None
+    time_field = _find_time_field(message) if point_times.unit != "none" else None
+    axes = [fields[axis] for axis in "xyz" if axis in fields]
+    if len(axes) < 3 or any(field.datatype not in (7, 8) for field in axes):
+        names = [f"{field.name} ({FIELD_TYPES.get(field.datatype, field.datatype)})" for field in message.fields]
+        raise ValueError(f"fields x, y, z of float32 or float64 are needed; got {', '.join(names) or 'none'}")
+    ring_field = _find_field(message, ("ring", "channel", "laser_number", "laser_id", "line"))
+    optional_fields = [field for field in (time_field, ring_field) if field is not None]
+    table = _read_fields(message, [*axes, *optional_fields])
+    has_rings = ring_field is not None and ring_field.datatype < 7
+    rings = table[ring_field.name].astype(np.int64) if has_rings else None
     points_m: Points = np.stack([table[axis] for axis in "xyz"], axis=1)
     if points_m.dtype.byteorder == ">":
         points_m = points_m.astype(points_m.dtype.newbyteorder("="))
     stamp_ns = get_stamp_ns(message.header)
     if time_field is None:
-        return CloudMessage(points_m, stamp_ns, None, rows)
-    offsets_s = _checked(_offsets_s(table[time_field.name], stamp_ns, point_times), points_m, time_field.name)
-    return CloudMessage(points_m, stamp_ns, offsets_s, rows)
+        return CloudMessage(points_m, stamp_ns, None, rings)
+    offsets_s = _compute_offsets_s(table[time_field.name], stamp_ns, point_times, params)
+    return CloudMessage(points_m, stamp_ns, _check_offsets(offsets_s, points_m, time_field.name, params), rings)
 
 
-def choose_point_times(message: Any, period_s: float | None) -> tuple[PointTimes | None, str]:  # noqa: ANN401
-    """Choose the unit of the times of points by the time that one scan takes.
+def choose_point_times(
+    message: Any,  # noqa: ANN401
+    period_s: float | None,
+    params: PointTimeParams = PointTimeParams(),
+) -> tuple[PointTimes | None, str]:
+    """Choose the unit of point times by the scan period.
 
-    By convention whole numbers are nanoseconds and others seconds; another unit is chosen if with it, and not with
-    that one, the points of a scan are measured over about the scan period.
+    By convention integers are nanoseconds and other numbers seconds. Another unit is chosen if only with that unit the
+    points of a scan cover about one scan period.
 
     Args:
-        message: A scan.
-        period_s: The time from one scan to the next; None if there is one.
+        message: Scan of the sensor.
+        period_s: Scan period; None if the recording has one scan.
+        params: Limits of plausible point times.
 
     Returns:
-        The choice, None if no unit fits, and a sentence about it if it is not the convention, or not certain.
+        The choice, None if no unit fits, and a note if the choice is not the convention or uncertain.
 
     Raises:
-        ValueError: A cloud that contradicts itself.
+        ValueError: The cloud is inconsistent.
     """
-    field, period_s = _time_field(message), period_s or PARAMS.default_period_s
+    field, period_s = _find_time_field(message), period_s or params.default_period_s
     if field is None:
         return PointTimes("none", period_s), ""
     axes = {axis.name: axis for axis in message.fields if axis.name in ("x", "y", "z")}
-    table = _table(message, [field, *axes.values()])
+    table = _read_fields(message, [field, *axes.values()])
     points_m = np.stack([table[axis] for axis in "xyz" if axis in axes], axis=1)
-    measured = np.isfinite(points_m).all(axis=1) & (np.abs(points_m) > NO_RETURN_M).any(axis=1)
-    stored, stamp_ns = table[field.name][measured & np.isfinite(table[field.name])], get_stamp_ns(message.header)
-    usual = "ns" if stored.dtype.kind in "iu" or np.abs(stored).max(initial=0) > PARAMS.min_absolute_ns else "s"
-    units = [usual, *(unit for unit in UNITS_NS if unit != usual), *([TURN] if stored.dtype.kind == "f" else [])]
+    is_measured = np.isfinite(points_m).all(axis=1) & (np.abs(points_m) > NO_RETURN_M).any(axis=1)
+    stored, stamp_ns = table[field.name][is_measured & np.isfinite(table[field.name])], get_stamp_ns(message.header)
+    is_integer = stored.dtype.kind in "iu"
+    default = "ns" if is_integer or np.abs(stored).max(initial=0) > params.min_absolute_ns else "s"
+    units = list(dict.fromkeys([default, *UNITS_NS]))
+    if stored.dtype.kind == "f":
+        units.append(SCAN_SHARE)
     shares = {}
     for unit in units:
-        offsets_s = _offsets_s(stored, stamp_ns, PointTimes(unit, period_s))
-        is_near = bool((np.abs(offsets_s) <= PARAMS.max_offset_s).all())
+        offsets_s = _compute_offsets_s(stored, stamp_ns, PointTimes(unit, period_s), params)
+        is_near = bool((np.abs(offsets_s) <= params.max_offset_s).all())
         shares[unit] = float(np.ptp(offsets_s)) / period_s if len(offsets_s) and is_near else np.inf * len(offsets_s)
-    if shares[usual] == 0 or np.isnan(shares[usual]):  # no point, or all at one time
-        return PointTimes(usual, period_s), ""
-    fitting = [unit for unit in units if PARAMS.min_period_share <= shares[unit] <= PARAMS.max_period_share]
-    span = f"the times of points in {field.name!r} ({TYPES[field.datatype]}) span {float(np.ptp(stored)):g}"
+    if shares[default] == 0 or np.isnan(shares[default]):  # no points, or all at one time
+        return PointTimes(default, period_s), ""
+    fitting = [unit for unit in units if params.min_period_share <= shares[unit] <= params.max_period_share]
+    span = f"the point times in {field.name!r} ({FIELD_TYPES[field.datatype]}) span {float(np.ptp(stored)):g}"
     if fitting:
-        words = "shares of the scan period" if fitting[0] == TURN else fitting[0]
-        note = f"{span} where scans are {period_s:.3g} s apart: they are read as {words}" if fitting[0] != usual else ""
-        return PointTimes(fitting[0], period_s), note
-    if PARAMS.min_plausible_period_share <= shares[usual] < PARAMS.min_period_share:
-        note = f"{span} {usual}, {shares[usual]:.0%} of the {period_s:.3g} s between scans; they are read as {usual}"
-        return PointTimes(usual, period_s), note
+        unit_name = "shares of the scan period" if fitting[0] == SCAN_SHARE else fitting[0]
+        note = f"{span} where scans are {period_s:.3g} s apart: they are read as {unit_name}"
+        return PointTimes(fitting[0], period_s), note if fitting[0] != default else ""
+    if params.min_plausible_period_share <= shares[default] < params.min_period_share:
+        share = f"{shares[default]:.0%} of the {period_s:.3g} s between scans"
+        return PointTimes(default, period_s), f"{span} {default}, {share}; they are read as {default}"
     return None, (
         f"{span} where scans are {period_s:.3g} s apart, or are far from the stamp of the cloud: no unit of "
-        f"{', '.join(UNITS_NS)} and no share of a turn fits; choose one by --set "
-        f"recording.point_time_unit=UNIT ({', '.join(POINT_TIMES)})"
+        f"{', '.join(UNITS_NS)} and no share of the scan period fits; choose one by --set "
+        f"recording.point_time_unit=UNIT ({', '.join(POINT_TIME_UNITS)})"
     )
 
 
-def _time_field(message: Any) -> Any:  # noqa: ANN401
+def _find_field(message: Any, names: Sequence[str]) -> Any:  # noqa: ANN401
+    """Find the first of some fields that a cloud has; None if it has none of them."""
     fields = {field.name: field for field in message.fields}
-    return next((fields[name] for name in TIME_FIELDS if name in fields), None)
+    return next((fields[name] for name in names if name in fields), None)
+
+
+def _find_time_field(message: Any) -> Any:  # noqa: ANN401
+    return _find_field(message, ("t", "time", "timestamp", "time_stamp", "offset_time", "time_offset"))
 
 
 def get_stamp_ns(header: Any) -> int:  # noqa: ANN401
-    """The time of a message in nanoseconds."""
+    """Get the stamp of a `std_msgs/Header` in nanoseconds."""
     return int(header.stamp.sec) * 1_000_000_000 + int(header.stamp.nanosec)
 
 
-def _table(message: Any, fields: list[Any]) -> NDArray[Any]:  # noqa: ANN401
-    """(N,) the points with these fields, without what lies between points and rows."""
-    width, height, step, row = (int(getattr(message, name)) for name in ("width", "height", "point_step", "row_step"))
+def _read_fields(message: Any, fields: list[Any]) -> NDArray[Any]:  # noqa: ANN401
+    """Read the (N,) points with some fields, without padding between points and rows."""
+    width, height = int(message.width), int(message.height)
+    point_bytes, row_bytes = int(message.point_step), int(message.row_step)
     data = np.asarray(message.data)
-    if len(data) == width * height * step:  # without gaps; some senders leave row_step 0, or stale
-        row = width * step
-    if row * height != len(data) or width * step > row:
+    if len(data) == width * height * point_bytes:  # without padding some senders leave row_step 0 or outdated
+        row_bytes = width * point_bytes
+    if row_bytes * height != len(data) or width * point_bytes > row_bytes:
         raise ValueError(
-            f"{height} rows of {row} bytes ({width} points of {step}) do not fit the {len(data)} bytes of the cloud"
+            f"{height} rows of {row_bytes} bytes ({width} points of {point_bytes}) do not fit the {len(data)} bytes of "
+            "the cloud"
         )
-    types = [(">" if message.is_bigendian else "<") + TYPES.get(field.datatype, "V1") for field in fields]
-    ends = [field.offset + np.dtype(kind).itemsize for field, kind in zip(fields, types, strict=True)]
-    if max(ends) > step or any("V" in kind for kind in types):
-        raise ValueError(f"fields within the {step} bytes of a point are needed; one ends at byte {max(ends)}")
+    byte_order = ">" if message.is_bigendian else "<"
+    types = [byte_order + FIELD_TYPES.get(field.datatype, "V1") for field in fields]
+    ends = [field.offset + np.dtype(type_code).itemsize for field, type_code in zip(fields, types, strict=True)]
+    if max(ends) > point_bytes or any("V" in type_code for type_code in types):
+        raise ValueError(f"fields within the {point_bytes} bytes of a point are needed; one ends at byte {max(ends)}")
     layout = np.dtype(
         {
             "names": [field.name for field in fields],
             "formats": types,
             "offsets": [int(field.offset) for field in fields],
-            "itemsize": step,
+            "itemsize": point_bytes,
         }
     )
-    grid = np.ndarray((height, width), layout, data, strides=(row, step))
+    grid = np.ndarray((height, width), layout, data, strides=(row_bytes, point_bytes))
     return grid.reshape(-1)
 
 
-def _offsets_s(stored: NDArray[Any], stamp_ns: int, times: PointTimes) -> NDArray[np.float64]:
-    """(N,) seconds after the stamp."""
-    if times.unit == TURN:
-        return stored.astype(np.float64) * times.period_s
-    unit_ns = UNITS_NS[times.unit]
-    is_absolute = float(np.abs(stored[np.isfinite(stored)]).max(initial=0)) * unit_ns > PARAMS.min_absolute_ns
-    # The whole units first: a float64 of both together would be off by 0.2 us.
-    whole, rest_ns = divmod(stamp_ns, unit_ns) if is_absolute else (0, 0)
-    since = stored.astype(np.int64) - whole if stored.dtype.kind in "iu" else stored.astype(np.float64) - whole
-    return np.asarray(since * (unit_ns * 1e-9) - rest_ns * 1e-9, dtype=np.float64)
+def _compute_offsets_s(
+    stored: NDArray[Any], stamp_ns: int, point_times: PointTimes, params: PointTimeParams
+) -> Float64:
+    """Compute the (N,) seconds between the stamp and the stored point times."""
+    if point_times.unit == SCAN_SHARE:
+        return stored.astype(np.float64) * point_times.period_s
+    unit_ns = UNITS_NS[point_times.unit]
+    is_absolute = float(np.abs(stored[np.isfinite(stored)]).max(initial=0)) * unit_ns > params.min_absolute_ns
+    # Integer units are subtracted first, since float64 rounds nanoseconds since 1970 to 0.2 us.
+    stamp_units, remainder_ns = divmod(stamp_ns, unit_ns) if is_absolute else (0, 0)
+    number_type = np.int64 if stored.dtype.kind in "iu" else np.float64
+    units_since_stamp = stored.astype(number_type) - stamp_units
+    return np.asarray(units_since_stamp * (unit_ns * 1e-9) - remainder_ns * 1e-9, dtype=np.float64)
 
 
-def _checked(offsets_s: NDArray[np.float64], points_m: Points, name: str) -> NDArray[np.float64]:
-    of_points = offsets_s[np.isfinite(points_m).all(axis=1)]
-    is_near = np.abs(of_points) <= PARAMS.max_offset_s
+def _check_offsets(offsets_s: Float64, points_m: Points, name: str, params: PointTimeParams) -> Float64:
+    """Check that finite points have times close to the stamp; other points get times within the limits."""
+    limit_s = params.max_offset_s
+    finite_s = offsets_s[np.isfinite(points_m).all(axis=1)]
+    is_near = np.abs(finite_s) <= limit_s
     if not is_near.all():
         raise ValueError(
-            f"{name}: times of points within {PARAMS.max_offset_s:g} s of the cloud are needed; got "
-            f"{of_points[np.argmin(is_near)]:g} s"
+            f"{name}: point times within {limit_s:g} s of the cloud are needed; got {finite_s[np.argmin(is_near)]:g} s"
         )
-    return np.nan_to_num(offsets_s, nan=0.0, posinf=0.0, neginf=0.0).clip(-PARAMS.max_offset_s, PARAMS.max_offset_s)
+    return np.nan_to_num(offsets_s, nan=0.0, posinf=0.0, neginf=0.0).clip(-limit_s, limit_s)

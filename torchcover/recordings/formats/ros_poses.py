@@ -1,11 +1,11 @@
-"""Poses of a bag: frames that are mounted on each other, and the vehicle between two poses of odometry or tf."""
+"""Poses in a bag: static transforms between frames, and interpolated poses of the vehicle from odometry or tf."""
 
 import warnings
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from torchcover.files import report_bad_file
 from torchcover.geometry import (
@@ -15,21 +15,42 @@ from torchcover.geometry import (
     interpolate_quaternions,
     invert,
 )
+from torchcover.geometry.arrays import Bools, Int64
 from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.formats.bag import Bag, get_stamp_ns
 
-# A transform from a parent frame to a child frame.
-Edge = tuple[str, str]
-# Numbers of two 4x4 transforms that are no farther apart are the same but for rounding.
+Edge = tuple[str, str]  # parent frame, child frame
+# Entries of two equal 4x4 transforms differ by rounding only.
 MOUNT_TOLERANCE = 1e-3
-MAX_NAMED = 3
+ODOMETRY_TYPE = "nav_msgs/msg/Odometry"
+TF_TYPE = "tf2_msgs/msg/TFMessage"
+POSE_TYPE = "geometry_msgs/msg/PoseStamped"
+# Messages are logged at most this long after they were stamped.
+WINDOW_NS = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class PoseSeriesParams:
+    """Parameters of the interpolation of poses.
+
+    Args:
+        max_gap_s: Poses further apart in time are not interpolated.
+        max_extrapolation_s: Poses are extrapolated this long before the first and after the last.
+        min_zigzag_m: Distance from the middle of the neighboring poses that a vehicle cannot have.
+        min_zigzag_share: Share of such poses from which two senders are assumed.
+    """
+
+    max_gap_s: float = 1.0
+    max_extrapolation_s: float = 0.15
+    min_zigzag_m: float = 0.1
+    min_zigzag_share: float = 0.2
 
 
 class FrameTree:
-    """Static transforms, each from its parent frame to its child frame.
+    """Graph of static transforms from parent to child frames.
 
-    A child may have several parents, which tf2 does not allow and bags have nevertheless: the way of the fewest
-    transforms counts, of two for the same edge the later one.
+    A child may have several parents, which tf2 forbids but bags contain: the path with the fewest transforms counts,
+    and the later transform of the same edge.
 
     Args:
         transforms: Messages `geometry_msgs/msg/TransformStamped`.
@@ -37,36 +58,57 @@ class FrameTree:
 
     def __init__(self, transforms: Iterable[Any]) -> None:
         self._mounts: dict[Edge, Matrix] = {}
-        self._repeated: dict[Edge, Matrix] = {}
+        self._replaced: dict[Edge, Matrix] = {}
         for transform in transforms:
             edge, parent_T_child = parse_edge(transform)
-            before = self._mounts.pop(edge, parent_T_child)
-            if np.abs(before - parent_T_child).max() > MOUNT_TOLERANCE:
-                self._repeated[edge] = before
+            earlier = self._mounts.pop(edge, parent_T_child)
+            if np.abs(earlier - parent_T_child).max() > MOUNT_TOLERANCE:
+                self._replaced[edge] = earlier
             self._mounts[edge] = parent_T_child
 
     def add(self, parent: str, child: str, parent_T_child: Matrix) -> None:
-        """Mount a frame, with all that it is mounted together with, if it is not mounted with this one yet."""
+        """Add a transform unless both frames are already connected.
+
+        Args:
+            parent: Parent frame.
+            child: Child frame.
+            parent_T_child: (4, 4) transform.
+        """
         if self.lookup_transform(parent, child) is None:
             self._mounts[parent, child] = parent_T_child
 
     def remove_edges(self, edges: Container[Edge]) -> "FrameTree":
-        """The same without some of the transforms."""
+        """Return a tree without some of the transforms.
+
+        Args:
+            edges: Edges to remove.
+        """
         tree = FrameTree(())
         tree._mounts = {edge: mount for edge, mount in self._mounts.items() if edge not in edges}
         return tree
 
     def find_mounted_frames(self, frame: str) -> set[str]:
-        """The frame, and all that are mounted together with it."""
-        return set(self._reached(frame))
+        """Find all frames that are connected to a frame, including itself.
+
+        Args:
+            frame: Name of the frame.
+        """
+        return set(self._find_transforms(frame))
 
     @property
     def frames(self) -> set[str]:
-        """All frames that are named."""
-        return {frame for edge in self._mounts for frame in edge}
+        """Names of all frames."""
+        return set[str]().union(*self._mounts)
 
     def list_neighbors(self, frame: str) -> Iterator[tuple[str, Matrix]]:
-        """Yield each frame that one transform links to this one, and `this_T_that`; the later transforms first."""
+        """List the frames that one transform connects to a frame, the latest transforms first.
+
+        Args:
+            frame: Name of the frame.
+
+        Yields:
+            Neighbor and `frame_T_neighbor`.
+        """
         for (parent, child), parent_T_child in reversed(self._mounts.items()):
             if parent == frame:
                 yield child, parent_T_child
@@ -74,124 +116,160 @@ class FrameTree:
                 yield parent, invert(parent_T_child)
 
     def lookup_transform(self, destination: str, source: str) -> Matrix | None:
-        """(4, 4) `destination_T_source`; None if the one is not mounted on what the other is."""
-        return self._reached(destination).get(source)
+        """Look up the transform between two frames.
+
+        Args:
+            destination: Frame of the result.
+            source: Frame of the points.
+
+        Returns:
+            (4, 4) `destination_T_source`; None if the frames are not connected.
+        """
+        return self._find_transforms(destination).get(source)
 
     def find_clashes(self, frame: str) -> list[str]:
-        """Name the transforms that contradict the way by which frames are mounted together with this one."""
+        """Find transforms that contradict the used paths to a frame.
+
+        Args:
+            frame: Name of the frame.
+
+        Returns:
+            Sentences about the first three of them.
+        """
         clashes = []
-        for (parent, child), before in self._repeated.items():
-            difference = _difference(before, self._mounts[parent, child])
+        for (parent, child), earlier in self._replaced.items():
+            difference = _format_difference(earlier, self._mounts[parent, child])
             clashes.append(f"{parent} -> {child} is sent with two values, {difference} apart: the later one is used")
-        reached = self._reached(frame)
+        transforms = self._find_transforms(frame)
         for (parent, child), mount in self._mounts.items():
-            if parent not in reached or child not in reached:
+            if parent not in transforms or child not in transforms:
                 continue
-            used = invert(reached[parent]) @ reached[child]
+            used = invert(transforms[parent]) @ transforms[child]
             if np.abs(used - mount).max() > MOUNT_TOLERANCE:
-                others = [f"{one} -> {child}" for one, other in self._mounts if other == child and one != parent]
-                named = " and ".join(others) or f"the other transforms from {frame} on"
-                clashes.append(f"{parent} -> {child} is not used: it is {_difference(used, mount)} off {named}")
-        return clashes[:MAX_NAMED]
+                other_parents = [edge[0] for edge in self._mounts if edge[1] == child and edge[0] != parent]
+                used_edges = " and ".join(f"{other_parent} -> {child}" for other_parent in other_parents)
+                used_edges = used_edges or f"the other transforms from {frame} on"
+                difference = _format_difference(used, mount)
+                clashes.append(f"{parent} -> {child} is not used: it is {difference} off {used_edges}")
+        return clashes[:3]
 
-    def _reached(self, frame: str) -> dict[str, Matrix]:
-        """Each frame that is mounted together with this one, the nearest first -> `this_T_that`."""
-        reached = {frame: np.eye(4)}
-        for here, frame_T_here in _growing(reached):
-            for there, here_T_there in self.list_neighbors(here):
-                reached.setdefault(there, frame_T_here @ here_T_there)
-        return reached
-
-
-def _growing(reached: dict[str, Matrix]) -> Iterator[tuple[str, Matrix]]:
-    """Yield the entries of a dict to which others are added meanwhile."""
-    done = 0
-    while done < len(reached):
-        for frame in list(reached)[done:]:
-            done += 1
-            yield frame, reached[frame]
+    def _find_transforms(self, frame: str) -> dict[str, Matrix]:
+        """Find the frames connected to a frame by breadth-first search, and `frame_T_other` of each."""
+        transforms = {frame: np.eye(4)}
+        queue = [frame]
+        for current in queue:
+            for neighbor, current_T_neighbor in self.list_neighbors(current):
+                if neighbor not in transforms:
+                    transforms[neighbor] = transforms[current] @ current_T_neighbor
+                    queue.append(neighbor)
+        return transforms
 
 
 def normalize_frame_id(frame_id: str) -> str:
-    """Return the name of a frame; older tools begin it with a slash."""
+    """Remove the leading slash of a frame name, which older tools write.
+
+    Args:
+        frame_id: Name in a message.
+    """
     return str(frame_id).removeprefix("/")
 
 
-def parse_edge(message: Any) -> tuple[Edge, Matrix]:  # noqa: ANN401  (of a type that rosbags has made)
-    """Return the parent and the child of a message `TransformStamped`, and `parent_T_child`."""
+def parse_edge(message: Any) -> tuple[Edge, Matrix]:  # noqa: ANN401  (of a type that rosbags creates)
+    """Parse a message `TransformStamped`.
+
+    Args:
+        message: Message of rosbags.
+
+    Returns:
+        Parent and child frame, and the (4, 4) `parent_T_child`.
+
+    Raises:
+        ValueError: Coordinates are not finite, or the quaternion is 0.
+    """
     parent, child = normalize_frame_id(message.header.frame_id), normalize_frame_id(message.child_frame_id)
     return (parent, child), parse_pose(message.transform.translation, message.transform.rotation, child)
 
 
-def parse_pose(translation: Any, rotation: Any, name: str) -> Matrix:  # noqa: ANN401  (of types that rosbags has made)
-    """(4, 4) of a place (or translation) and a quaternion."""
-    place_m = np.array([translation.x, translation.y, translation.z], dtype=np.float64)
-    if not np.isfinite(place_m).all():
-        raise ValueError(f"{name}: three finite coordinates are needed; got {place_m.tolist()}")
+def parse_pose(translation: Any, rotation: Any, name: str) -> Matrix:  # noqa: ANN401  (of types that rosbags creates)
+    """Parse a position and a quaternion.
+
+    Args:
+        translation: Message with x, y and z.
+        rotation: Message with x, y, z and w.
+        name: Frame or topic, for messages.
+
+    Returns:
+        (4, 4) transform.
+
+    Raises:
+        ValueError: Coordinates are not finite, or the quaternion is 0.
+    """
+    position_m = np.array([translation.x, translation.y, translation.z], dtype=np.float64)
+    if not np.isfinite(position_m).all():
+        raise ValueError(f"{name}: three finite coordinates are needed; got {position_m.tolist()}")
     try:
         return build_transform(
-            convert_quaternion_to_rotation([rotation.w, rotation.x, rotation.y, rotation.z]), place_m
+            convert_quaternion_to_rotation([rotation.w, rotation.x, rotation.y, rotation.z]), position_m
         )
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from error
 
 
-def _difference(first: Matrix, second: Matrix) -> str:
-    apart = invert(first) @ second
-    turn_deg = np.rad2deg(np.arccos(np.clip((np.trace(apart[:3, :3]) - 1) / 2, -1, 1)))
-    return f"{np.linalg.norm(apart[:3, 3]):.3g} m and {turn_deg:.3g} degrees"
-
-
-ODOMETRY, TF, POSE = "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage", "geometry_msgs/msg/PoseStamped"
-# Of a tree the frame that never jumps, where it has one; else its root.
-WORLD = "odom"
-# Messages are recorded at most so long after they were stamped.
-WINDOW_NS = 1_000_000_000
-# Where the vehicle was is unknown between two poses that are farther apart; before the first and after the last
-# it goes on as before for a little.
-LONGEST_GAP_S, EDGE_S = 1.0, 0.15
-# What is mounted is written down again and again, to rounding.
-STATIC_TOLERANCE = 1e-6
-# A vehicle cannot be so far off the middle between the poses before and after; two senders of one transform can, in
-# such a share of its poses.
-ZIGZAG_M = 0.1
-ZIGZAG_SHARE = 0.2
-# Bags are recorded no slower than at this multiple of real time.
-SLOWEST = 100.0
+def _format_difference(first: Matrix, second: Matrix) -> str:
+    first_T_second = invert(first) @ second
+    angle_deg = np.rad2deg(np.arccos(np.clip((np.trace(first_T_second[:3, :3]) - 1) / 2, -1, 1)))
+    return f"{np.linalg.norm(first_T_second[:3, 3]):.3g} m and {angle_deg:.3g} degrees"
 
 
 class PoseSeries(NamedTuple):
-    """Poses at ascending times. `times_ns`: (K,); `positions_m`: (K, 3); `wxyz`: (K, 4) unit quaternions.
+    """Poses at ascending times.
 
-    `max_disagreement_m`: how far poses of the same time are apart.
+    Args:
+        times_ns: (K,) stamps.
+        positions_m: (K, 3) positions.
+        wxyz: (K, 4) unit quaternions.
+        max_disagreement_m: Largest distance between poses of the same time.
+        params: Limits of interpolation.
     """
 
-    times_ns: NDArray[np.int64]
+    times_ns: Int64
     positions_m: Matrix
     wxyz: Matrix
     max_disagreement_m: float = 0.0
+    params: PoseSeriesParams = PoseSeriesParams()
 
-    def interpolate(self, times_ns: NDArray[np.int64], name: str) -> Matrix:
-        """(N, 4, 4) at other times: places evenly, rotations the shorter way at an even rate (slerp)."""
+    def interpolate(self, times_ns: Int64, name: str) -> Matrix:
+        """Interpolate positions linearly and rotations by slerp.
+
+        Args:
+            times_ns: (N,) times of the result.
+            name: Topic, for messages.
+
+        Returns:
+            (N, 4, 4) poses.
+
+        Raises:
+            ValueError: A time lies in a gap, or too far before the first or after the last pose.
+        """
+        max_gap_s = self.params.max_gap_s
         if len(self.times_ns) < 2:
             raise ValueError(f"{name}: poses on both sides of the time {int(times_ns[0])} ns are needed; got fewer")
         after = np.searchsorted(self.times_ns, times_ns).clip(1, len(self.times_ns) - 1)
         start_ns, gap_ns = self.times_ns[after - 1], np.diff(self.times_ns)[after - 1]
         since_s, gap_s = (times_ns - start_ns) * 1e-9, gap_ns * 1e-9
-        beyond_s = np.maximum(-since_s, since_s - gap_s)
-        apart = (gap_s > LONGEST_GAP_S) & (since_s > 0) & (since_s < gap_s)
-        if apart.any():
+        is_in_gap = (gap_s > max_gap_s) & (since_s > 0) & (since_s < gap_s)
+        if is_in_gap.any():
             raise ValueError(
-                f"{name}: the poses before and after the time {int(times_ns[apart][0])} ns are "
-                f"{gap_s[apart].max():.3g} s apart; where it was between is known of poses that are at most "
-                f"{LONGEST_GAP_S:g} s apart: record more often, or give poses of all times"
+                f"{name}: the poses before and after the time {int(times_ns[is_in_gap][0])} ns are "
+                f"{gap_s[is_in_gap].max():.3g} s apart; poses are interpolated over at most {max_gap_s:g} s: record "
+                "more often, or give poses of all times"
             )
-        bad = beyond_s > EDGE_S
-        if bad.any():
-            off_s = np.minimum(np.abs(since_s), np.abs(since_s - gap_s))[bad].max()
+        is_too_far = np.maximum(-since_s, since_s - gap_s) > self.params.max_extrapolation_s
+        if is_too_far.any():
+            distance_s = np.minimum(np.abs(since_s), np.abs(since_s - gap_s))[is_too_far].max()
             raise ValueError(
-                f"{name}: the pose nearest to the time {int(times_ns[bad][0])} ns is {off_s:.3f} s off; do the clocks "
-                "of the sensors match?"
+                f"{name}: the pose nearest to the time {int(times_ns[is_too_far][0])} ns is {distance_s:.3f} s off; do "
+                "the clocks of the sensors match?"
             )
         share = (since_s / gap_s)[:, None]
         first_m, second_m = self.positions_m[after - 1], self.positions_m[after]
@@ -201,90 +279,136 @@ class PoseSeries(NamedTuple):
         return build_transform(rotations, first_m + share * (second_m - first_m))
 
     def estimate_zigzag_m(self) -> float:
-        """How far poses jump to and fro, in metres; 0 if a vehicle can move like that."""
+        """Estimate how far poses jump to and fro in meters; 0 if a vehicle can move like that."""
         first_ns, middle_ns, last_ns = self.times_ns[:-2], self.times_ns[1:-1], self.times_ns[2:]
         share = ((middle_ns - first_ns) / (last_ns - first_ns))[:, None]
         expected_m = self.positions_m[:-2] + share * (self.positions_m[2:] - self.positions_m[:-2])
-        off_m = np.linalg.norm(self.positions_m[1:-1] - expected_m, axis=1)
-        jumps_m = off_m[(off_m > ZIGZAG_M) & (last_ns - first_ns < LONGEST_GAP_S * 1e9)]
-        return float(np.median(jumps_m)) if len(jumps_m) > ZIGZAG_SHARE * len(off_m) else 0.0
+        deviations_m = np.linalg.norm(self.positions_m[1:-1] - expected_m, axis=1)
+        is_near = last_ns - first_ns < self.params.max_gap_s * 1e9
+        jumps_m = deviations_m[(deviations_m > self.params.min_zigzag_m) & is_near]
+        has_zigzag = len(jumps_m) > self.params.min_zigzag_share * len(deviations_m)
+        return float(np.median(jumps_m)) if has_zigzag else 0.0
 
 
 class VehiclePoses:
-    """Poses of the vehicle's frame, from a topic of the bag.
+    """Poses of the vehicle frame from a topic of a bag.
 
     Args:
-        bag: The bag.
-        topic: The topic.
-        links: From the world to the vehicle: keys of the poses that are read, see `build_pose_series`, and what is mounted, as
-            (4, 4).
-        source: What was taken, for messages.
+        bag: Bag.
+        topic: Topic of odometry, transforms or poses.
+        links: Transforms from the world to the vehicle: keys of `build_pose_series`, or static (4, 4) transforms.
+        source: Description of the topic, for messages.
+        params: Limits of interpolation.
     """
 
-    def __init__(self, bag: Bag, topic: str, links: Sequence[Edge | Matrix], source: str) -> None:
+    def __init__(
+        self,
+        bag: Bag,
+        topic: str,
+        links: Sequence[Edge | Matrix],
+        source: str,
+        params: PoseSeriesParams = PoseSeriesParams(),
+    ) -> None:
         self.source = source
-        self._bag, self._topic, self._links = bag, topic, links
-        logged_ns = bag.get_log_times_ns(topic)
+        self._bag, self._topic, self._links, self._params = bag, topic, links, params
+        log_times_ns = bag.get_log_times_ns(topic)
         self._window_ns = WINDOW_NS
-        self._last: tuple[int, Mapping[Edge, PoseSeries]] = (-1, {})
-        ends = [self._around(int(logged_ns[end])) for end in (0, -1)]
+        self._cached: tuple[int, Mapping[Edge, PoseSeries]] = (-1, {})  # log time, series around it
+        first, last = (self._read_series(int(log_times_ns[end])) for end in (0, -1))
         moving = [link for link in links if isinstance(link, tuple)]
-        self._span_ns = (
-            max(int(ends[0][link].times_ns[0]) for link in moving),
-            min(int(ends[1][link].times_ns[-1]) if link in ends[1] else 0 for link in moving),
-        )
-        # A bag that was recorded while another one played slowly is read in longer windows of its own clock.
-        slowness = (logged_ns[-1] - logged_ns[0]) / max(self._span_ns[1] - self._span_ns[0], 1)
-        self._window_ns = round(WINDOW_NS * np.clip(slowness, 1.0, SLOWEST))
-        self.max_disagreement_m = max(
-            max(end[link].max_disagreement_m, end[link].estimate_zigzag_m())
-            for end in ends
-            for link in moving
-            if link in end
-        )
+        start_ns = max(int(first[link].times_ns[0]) for link in moving)
+        stop_ns = min(int(last[link].times_ns[-1]) if link in last else 0 for link in moving)
+        self._span_ns = (start_ns, stop_ns)
+        # A bag that was recorded while another one was replayed slowly needs longer windows of its log times. Bags are
+        # replayed at least at a hundredth of real time.
+        slowness = (log_times_ns[-1] - log_times_ns[0]) / max(stop_ns - start_ns, 1)
+        self._window_ns = round(WINDOW_NS * np.clip(slowness, 1.0, 100.0))
+        self.max_disagreement_m = 0.0
+        for series in (first, last):
+            for link in moving:
+                if link in series:
+                    disagreement_m = max(series[link].max_disagreement_m, series[link].estimate_zigzag_m())
+                    self.max_disagreement_m = max(self.max_disagreement_m, disagreement_m)
 
-    def mask_covered_times(self, times_ns: NDArray[np.int64], margin_s: float = 0.0) -> NDArray[np.bool_]:
-        """(N,) whether times lie between the first pose and the last, or nearly."""
-        edge_ns = (EDGE_S - margin_s) * 1e9
-        return (self._span_ns[0] - edge_ns <= times_ns) & (times_ns <= self._span_ns[1] + edge_ns)
+    def mask_covered_times(self, times_ns: Int64, margin_s: float = 0.0) -> Bools:
+        """Mask the times for which a pose can be interpolated or extrapolated.
 
-    def interpolate(self, times_ns: NDArray[np.int64], log_time_ns: int) -> Matrix:
-        """(N, 4, 4) `world_T_vehicle`. `times_ns`: (N,) when; `log_time_ns`: about when such messages were recorded."""
+        Args:
+            times_ns: (N,) times.
+            margin_s: Part of the extrapolation that is not used.
+
+        Returns:
+            (N,) mask.
+        """
+        margin_ns = (self._params.max_extrapolation_s - margin_s) * 1e9
+        return (self._span_ns[0] - margin_ns <= times_ns) & (times_ns <= self._span_ns[1] + margin_ns)
+
+    def interpolate(self, times_ns: Int64, log_time_ns: int) -> Matrix:
+        """Interpolate the poses of the vehicle.
+
+        Args:
+            times_ns: (N,) times of the result.
+            log_time_ns: Log time of messages with about these times.
+
+        Returns:
+            (N, 4, 4) `world_T_vehicle`.
+
+        Raises:
+            BadFileError: Poses are missing or invalid.
+        """
         with report_bad_file(self._bag.path, "a bag"):
-            series = self._around(log_time_ns)
-            world_T_here = np.broadcast_to(np.eye(4), (len(times_ns), 4, 4))
+            series = self._read_series(log_time_ns)
+            world_T_current = np.broadcast_to(np.eye(4), (len(times_ns), 4, 4))
             for link in self._links:
                 if isinstance(link, tuple):
                     if link not in series:
                         raise ValueError(f"{self._topic}: no pose within 1 s of {log_time_ns}")
-                    world_T_here = world_T_here @ series[link].interpolate(times_ns, self._topic)
+                    world_T_current = world_T_current @ series[link].interpolate(times_ns, self._topic)
                 else:
-                    world_T_here = world_T_here @ link
-            return world_T_here
+                    world_T_current = world_T_current @ link
+            return world_T_current
 
-    def _around(self, logged_ns: int) -> Mapping[Edge, PoseSeries]:
-        if self._last[0] != logged_ns:
-            messages = self._bag.read_messages(self._topic, logged_ns - self._window_ns, logged_ns + self._window_ns)
-            self._last = (logged_ns, build_pose_series(messages, self._bag.type_by_topic[self._topic], self._topic))
-        return self._last[1]
+    def _read_series(self, log_time_ns: int) -> Mapping[Edge, PoseSeries]:
+        """Read the poses around a log time; the last result is cached."""
+        if self._cached[0] != log_time_ns:
+            start_ns, stop_ns = log_time_ns - self._window_ns, log_time_ns + self._window_ns
+            messages = self._bag.read_messages(self._topic, start_ns, stop_ns)
+            series = build_pose_series(messages, self._bag.type_by_topic[self._topic], self._topic, self._params)
+            self._cached = (log_time_ns, series)
+        return self._cached[1]
 
 
-def build_pose_series(messages: Sequence[Any], kind: str, name: str) -> dict[Edge, PoseSeries]:
-    """Parent and child of each transform -> its poses; those of `Odometry` and `PoseStamped` are under (type, "")."""
-    stamped: dict[Edge, list[tuple[int, Matrix]]] = {}
+def build_pose_series(
+    messages: Sequence[Any], message_type: str, name: str, params: PoseSeriesParams = PoseSeriesParams()
+) -> dict[Edge, PoseSeries]:
+    """Build the poses of each transform in messages.
+
+    Args:
+        messages: Messages of one topic.
+        message_type: Type of the messages: odometry, transforms or poses.
+        name: Topic, for error messages.
+        params: Limits of interpolation.
+
+    Returns:
+        Parent and child frame of each transform and its poses; `Odometry` and `PoseStamped` have the key (type, "").
+
+    Raises:
+        ValueError: Coordinates are not finite, or a quaternion is 0.
+    """
+    poses_by_edge: dict[Edge, list[tuple[int, Matrix]]] = {}
     for message in messages:
-        if kind == TF:
+        if message_type == TF_TYPE:
             for transform in message.transforms:
-                edge, pose = _named_edge_of(transform, name)
-                stamped.setdefault(edge, []).append((get_stamp_ns(transform.header), pose))
+                edge, pose = _parse_topic_edge(transform, name)
+                poses_by_edge.setdefault(edge, []).append((get_stamp_ns(transform.header), pose))
         else:
-            pose = message.pose.pose if kind == ODOMETRY else message.pose
-            placed = get_stamp_ns(message.header), parse_pose(pose.position, pose.orientation, name)
-            stamped.setdefault((kind, ""), []).append(placed)
-    return {edge: _series(poses) for edge, poses in stamped.items()}
+            content = message.pose.pose if message_type == ODOMETRY_TYPE else message.pose
+            pose = parse_pose(content.position, content.orientation, name)
+            poses_by_edge.setdefault((message_type, ""), []).append((get_stamp_ns(message.header), pose))
+    return {edge: _sort_poses(poses, params) for edge, poses in poses_by_edge.items()}
 
 
-def _named_edge_of(transform: Any, name: str) -> tuple[Edge, Matrix]:  # noqa: ANN401
+def _parse_topic_edge(transform: Any, name: str) -> tuple[Edge, Matrix]:  # noqa: ANN401
     try:
         return parse_edge(transform)
     except ValueError as error:
@@ -292,120 +416,163 @@ def _named_edge_of(transform: Any, name: str) -> tuple[Edge, Matrix]:  # noqa: A
 
 
 def read_static_transforms(bag: Bag) -> list[Any]:
-    """Messages `TransformStamped` of what is mounted: those of tf that never change, and those of tf_static."""
-    statics, sampled = [], dict[Edge, list[Any]]()
-    for topic in bag.list_topics(TF):
-        if topic.endswith("tf_static"):
-            statics += [one for message in bag.read_messages(topic) for one in message.transforms]
-        else:
-            for edge, transforms in _sampled_transforms(bag, topic).items():
-                sampled.setdefault(edge, []).extend(transforms)
-    moving = {edge for edge, transforms in sampled.items() if not _never_changes(transforms)}
-    if both := sorted(f"{parent} -> {child}" for parent, child in {parse_edge(one)[0] for one in statics} & moving):
-        warnings.warn(
-            f"{bag.path}: {', '.join(both)}: sent as static and as moving transforms; those that move are used",
-            stacklevel=2,
-        )
-    constants = [transforms[0] for edge, transforms in sampled.items() if len(transforms) > 1 and edge not in moving]
-    return [*constants, *(transform for transform in statics if parse_edge(transform)[0] not in moving)]
+    """Read the transforms of tf_static and the constant ones of tf.
 
+    Args:
+        bag: Bag.
 
-def _sampled_transforms(bag: Bag, topic: str) -> dict[Edge, list[Any]]:
-    """The messages `TransformStamped` of a topic, at its beginning, in its middle and at its end."""
+    Returns:
+        Messages `TransformStamped`; edges that move in tf are excluded.
+
+    Warns:
+        UserWarning: A transform is sent as static and as moving.
+    """
+    static: list[Any] = []
     sampled: dict[Edge, list[Any]] = {}
-    logged_ns, read_ns = bag.get_log_times_ns(topic), 0
-    for about_ns in (logged_ns[0], logged_ns[len(logged_ns) // 2], logged_ns[-1]):
-        start_ns, read_ns = max(int(about_ns) - WINDOW_NS, read_ns), int(about_ns) + WINDOW_NS
-        for message in bag.read_messages(topic, start_ns, read_ns):
+    for topic in bag.list_topics(TF_TYPE):
+        if topic.endswith("tf_static"):
+            for message in bag.read_messages(topic):
+                static.extend(message.transforms)
+        else:
+            for edge, transforms in _sample_transforms(bag, topic).items():
+                sampled.setdefault(edge, []).extend(transforms)
+    moving = {edge for edge, transforms in sampled.items() if not _are_constant(transforms)}
+    ambiguous = {parse_edge(transform)[0] for transform in static} & moving
+    if ambiguous:
+        names = ", ".join(sorted(f"{parent} -> {child}" for parent, child in ambiguous))
+        warnings.warn(
+            f"{bag.path}: {names}: sent as static and as moving transforms; those that move are used", stacklevel=2
+        )
+    constant = [transforms[0] for edge, transforms in sampled.items() if len(transforms) > 1 and edge not in moving]
+    return [*constant, *(transform for transform in static if parse_edge(transform)[0] not in moving)]
+
+
+def _sample_transforms(bag: Bag, topic: str) -> dict[Edge, list[Any]]:
+    """Read the messages `TransformStamped` at the beginning, in the middle and at the end of a topic."""
+    sampled: dict[Edge, list[Any]] = {}
+    log_times_ns, stop_ns = bag.get_log_times_ns(topic), 0
+    for center_ns in (log_times_ns[0], log_times_ns[len(log_times_ns) // 2], log_times_ns[-1]):
+        start_ns, stop_ns = max(int(center_ns) - WINDOW_NS, stop_ns), int(center_ns) + WINDOW_NS
+        for message in bag.read_messages(topic, start_ns, stop_ns):
             for transform in message.transforms:
                 edge = normalize_frame_id(transform.header.frame_id), normalize_frame_id(transform.child_frame_id)
                 sampled.setdefault(edge, []).append(transform)
     return sampled
 
 
-def _never_changes(transforms: Sequence[Any]) -> bool:
-    mounts = np.array([parse_edge(transform)[1] for transform in transforms])
-    return bool(np.abs(mounts - mounts[0]).max() < STATIC_TOLERANCE)
+def _are_constant(transforms: Sequence[Any]) -> bool:
+    matrices = np.array([parse_edge(transform)[1] for transform in transforms])
+    tolerance = 1e-6  # repeated static transforms differ by rounding only
+    return bool(np.abs(matrices - matrices[0]).max() < tolerance)
 
 
 def find_vehicle_poses(bag: Bag, tree: FrameTree, vehicle_frame: str) -> list[VehiclePoses]:
-    """What says where the vehicle was, the best first: odometry, then a tree of frames, then poses."""
-    found, lost = [], []
-    for topic in sorted(bag.list_topics(ODOMETRY), key=lambda topic: -len(bag.get_log_times_ns(topic))):
-        child = (
-            normalize_frame_id(bag.read_message(topic, int(bag.get_log_times_ns(topic)[0])).child_frame_id)
-            or vehicle_frame
-        )
+    """Find the topics with poses of the vehicle.
+
+    Args:
+        bag: Bag.
+        tree: Static transforms.
+        vehicle_frame: Frame of the vehicle.
+
+    Returns:
+        Sources of poses in the order odometry, transforms, poses.
+
+    Raises:
+        ValueError: Odometry exists, but its frame is not connected to the vehicle frame.
+    """
+    sources, unconnected = [], []
+    for topic in sorted(bag.list_topics(ODOMETRY_TYPE), key=lambda topic: -len(bag.get_log_times_ns(topic))):
+        message = bag.read_message(topic, int(bag.get_log_times_ns(topic)[0]))
+        child = normalize_frame_id(message.child_frame_id) or vehicle_frame
         child_T_vehicle = tree.lookup_transform(child, vehicle_frame)
         if child_T_vehicle is None:
-            lost.append(f"{topic} ({child})")
+            unconnected.append(f"{topic} ({child})")
         else:
-            found.append(VehiclePoses(bag, topic, ((ODOMETRY, ""), child_T_vehicle), f"{topic} (odometry of {child})"))
-    for topic in bag.list_topics(TF):
+            links = ((ODOMETRY_TYPE, ""), child_T_vehicle)
+            sources.append(VehiclePoses(bag, topic, links, f"{topic} (odometry of {child})"))
+    for topic in bag.list_topics(TF_TYPE):
         if not topic.endswith("tf_static"):
-            found += _of_tree(bag, topic, tree, vehicle_frame)
-    found += [VehiclePoses(bag, topic, ((POSE, ""),), f"{topic} (poses)") for topic in bag.list_topics(POSE)]
-    if lost and not found:
-        raise ValueError(f"no static transform links to {vehicle_frame} the frame of the odometry {', '.join(lost)}")
-    return found
+            sources += _find_tree_poses(bag, topic, tree, vehicle_frame)
+    for topic in bag.list_topics(POSE_TYPE):
+        sources.append(VehiclePoses(bag, topic, ((POSE_TYPE, ""),), f"{topic} (poses)"))
+    if unconnected and not sources:
+        names = ", ".join(unconnected)
+        raise ValueError(f"no static transform links to {vehicle_frame} the frame of the odometry {names}")
+    return sources
 
 
-def _of_tree(bag: Bag, topic: str, tree: FrameTree, vehicle_frame: str) -> list[VehiclePoses]:
-    """Poses from a topic of transforms, in each frame that they lead to from the vehicle; the best first."""
-    sampled = _sampled_transforms(bag, topic)
+def _find_tree_poses(bag: Bag, topic: str, tree: FrameTree, vehicle_frame: str) -> list[VehiclePoses]:
+    """Find poses of the vehicle in each world frame of a topic of transforms, the best first."""
+    sampled = _sample_transforms(bag, topic)
     counts = {edge: len(transforms) for edge, transforms in sampled.items()}
-    moving = {edge: count for edge, count in counts.items() if not _never_changes(sampled[edge])}
-    # Of a vehicle that stood still all the time, all transforms look as if they were mounts.
-    still = tree.remove_edges(counts)
-    ways = _ways_to_worlds(moving, tree, vehicle_frame) or _ways_to_worlds(counts, still, vehicle_frame)
-    above = [f"{parent} -> {child}" for parent, child in counts if child in still.find_mounted_frames(vehicle_frame)]
-    if above and not ways:
-        raise ValueError(f"{topic}: {', '.join(above)}: the transforms from {vehicle_frame} upward are a loop")
-    if unused := _unused_edges(moving, tree, list(ways.values())):
+    moving = {edge: count for edge, count in counts.items() if not _are_constant(sampled[edge])}
+    # If the vehicle never moves, all transforms look static.
+    static_tree = tree.remove_edges(counts)
+    paths = _find_world_paths(moving, tree, vehicle_frame) or _find_world_paths(counts, static_tree, vehicle_frame)
+    mounted = static_tree.find_mounted_frames(vehicle_frame)
+    parents = [f"{parent} -> {child}" for parent, child in counts if child in mounted]
+    if parents and not paths:
+        raise ValueError(f"{topic}: {', '.join(parents)}: the transforms from {vehicle_frame} upward are a loop")
+    unused = _list_unused_edges(moving, tree, list(paths.values()))
+    if unused:
         warnings.warn(
-            f"{bag.path}: {topic}: {', '.join(unused)}: not used, since poses are taken on another way", stacklevel=2
+            f"{bag.path}: {topic}: {', '.join(unused)}: not used, since poses are read along another path",
+            stacklevel=2,
         )
-    return [VehiclePoses(bag, topic, way, f"{topic} ({vehicle_frame} in {world})") for world, way in ways.items()]
+    return [VehiclePoses(bag, topic, path, f"{topic} ({vehicle_frame} in {world})") for world, path in paths.items()]
 
 
-def _unused_edges(moving: Mapping[Edge, int], tree: FrameTree, ways: Sequence[Sequence[Edge | Matrix]]) -> list[str]:
-    """Name the transforms that move what the best way passes, and that are on no way."""
-    edges = [{link for link in way if isinstance(link, tuple)} for way in ways]
-    passed = set[str]().union(*(tree.find_mounted_frames(child) for _, child in (edges[0] if edges else ())))
-    used = set[Edge]().union(*edges)
-    return sorted(f"{parent} -> {child}" for parent, child in moving if child in passed and (parent, child) not in used)
+def _list_unused_edges(
+    moving: Mapping[Edge, int], tree: FrameTree, paths: Sequence[Sequence[Edge | Matrix]]
+) -> list[str]:
+    """List the transforms that move frames of the best path and are on no path."""
+    edges_by_path = [{link for link in path if isinstance(link, tuple)} for path in paths]
+    passed_frames = set[str]()
+    for _, child in edges_by_path[0] if edges_by_path else ():
+        passed_frames |= tree.find_mounted_frames(child)
+    used = set[Edge]().union(*edges_by_path)
+    unused = [edge for edge in moving if edge[1] in passed_frames and edge not in used]
+    return sorted(f"{parent} -> {child}" for parent, child in unused)
 
 
-def _ways_to_worlds(moving: Mapping[Edge, int], tree: FrameTree, vehicle_frame: str) -> dict[str, list[Edge | Matrix]]:
-    """Each frame that moves in no other -> links from it to the vehicle; `odom` first, then that of most messages.
+def _find_world_paths(
+    moving: Mapping[Edge, int], tree: FrameTree, vehicle_frame: str
+) -> dict[str, list[Edge | Matrix]]:
+    """Find the links from each world frame to the vehicle; `odom` first, then the frame with most messages.
 
-    Transforms that move are followed from child to parent, mounts both ways; every frame is reached by the fewest.
+    A world frame moves in no other frame. Moving transforms are followed from child to parent, static ones in both
+    directions; every frame is reached by the fewest transforms.
     """
-    ways: dict[str, list[Edge | Matrix]] = {vehicle_frame: []}
-    rates: dict[str, tuple[bool, int]] = {}
+    paths: dict[str, list[Edge | Matrix]] = {vehicle_frame: []}
+    ranks: dict[str, tuple[bool, int]] = {}
     queue = [vehicle_frame]
     for frame in queue:
-        way = ways[frame]
-        here = tree.find_mounted_frames(frame)
-        is_world = frame == WORLD or not any(child in here for _, child in moving)
-        if way and isinstance(way[0], tuple) and is_world:
-            rates[frame] = frame == WORLD, min(moving[link] for link in way if isinstance(link, tuple))
+        path = paths[frame]
+        mounted = tree.find_mounted_frames(frame)
+        is_odom = frame == "odom"  # this frame never jumps (REP-105)
+        is_world = is_odom or not any(child in mounted for _, child in moving)
+        if path and isinstance(path[0], tuple) and is_world:
+            ranks[frame] = is_odom, min(moving[link] for link in path if isinstance(link, tuple))
             continue
-        onward: list[tuple[str, Edge | Matrix]] = [(edge[0], edge) for edge in moving if edge[1] == frame]
-        onward += [(there, invert(here_T_there)) for there, here_T_there in tree.list_neighbors(frame)]
-        for there, link in onward:
-            if there not in ways:
-                ways[there] = [link, *way]
-                queue.append(there)
-    return {world: ways[world] for world in sorted(rates, key=lambda world: rates[world], reverse=True)}
+        neighbors: list[tuple[str, Edge | Matrix]] = [(edge[0], edge) for edge in moving if edge[1] == frame]
+        for neighbor, frame_T_neighbor in tree.list_neighbors(frame):
+            neighbors.append((neighbor, invert(frame_T_neighbor)))
+        for neighbor, link in neighbors:
+            if neighbor not in paths:
+                paths[neighbor] = [link, *path]
+                queue.append(neighbor)
+    return {world: paths[world] for world in sorted(ranks, key=ranks.__getitem__, reverse=True)}
 
 
-def _series(stamped: Sequence[tuple[int, Matrix]]) -> PoseSeries:
-    poses, apart_m = dict[int, Matrix](), 0.0
-    for time_ns, pose in stamped:
-        apart_m = max(apart_m, float(np.linalg.norm(poses.get(time_ns, pose)[:3, 3] - pose[:3, 3])))
-        poses[time_ns] = pose
+def _sort_poses(stamped_poses: Sequence[tuple[int, Matrix]], params: PoseSeriesParams) -> PoseSeries:
+    """Sort poses by stamp; the last pose of a stamp counts."""
+    poses: dict[int, Matrix] = {}
+    max_disagreement_m = 0.0
+    for stamp_ns, pose in stamped_poses:
+        distance_m = float(np.linalg.norm(poses.get(stamp_ns, pose)[:3, 3] - pose[:3, 3]))
+        max_disagreement_m = max(max_disagreement_m, distance_m)
+        poses[stamp_ns] = pose
     times_ns = np.array(sorted(poses), dtype=np.int64)
-    sorted_poses = np.array([poses[int(time_ns)] for time_ns in times_ns])
+    sorted_poses = np.array([poses[int(stamp_ns)] for stamp_ns in times_ns])
     wxyz = np.array([convert_rotation_to_quaternion(pose[:3, :3]) for pose in sorted_poses])
-    return PoseSeries(times_ns, sorted_poses[:, :3, 3], wxyz, apart_m)
+    return PoseSeries(times_ns, sorted_poses[:, :3, 3], wxyz, max_disagreement_m, params)
