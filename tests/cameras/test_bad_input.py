@@ -49,12 +49,12 @@ IMAGE = torch.ones(6, 8)
         (torch.ones(6, 8, dtype=torch.int32), {}, TypeError, "int32, whose unit is unknown"),
         (IMAGE, {"depth_kind": "range"}, ValueError, "'range' is unknown; allowed: z, distance"),
         (IMAGE, {"stride": 0}, ValueError, "stride must be an integer of at least 1; got 0"),
-        (IMAGE, {"valid_mask": torch.ones(6, 8)}, TypeError, "valid must be boolean; got torch.float32"),
+        (IMAGE, {"valid_mask": torch.ones(6, 8)}, TypeError, "valid_mask must be boolean; got torch.float32"),
         (
             IMAGE,
             {"valid_mask": torch.ones(6, 7, dtype=torch.bool)},
             ValueError,
-            r"valid must be \(6, 8\).*got \(6, 7\)",
+            r"valid_mask must be \(6, 8\).*got \(6, 7\)",
         ),
     ],
 )

@@ -157,7 +157,7 @@ def test_opencv_fisheye_and_stereo_names(tmp_path):
     check_matrix(camera)
     assert (camera.model, camera.coefficients.tolist()) == ("kannala_brandt", [0.1, 0.2, 0.3, 0.4])
     with pytest.raises(
-        ValueError, match=r"camera_matrix, .*image_height not in the file; it holds fisheye_model, M1, D1"
+        ValueError, match=r"camera_matrix, .*image_height not in the file; it contains fisheye_model, M1, D1"
     ):
         Camera.from_opencv(tmp_path / "s.yml")
     with (tmp_path / "s.yml").open("a") as file:
@@ -203,7 +203,7 @@ def test_kitti_places_the_camera_through_the_lidar(tmp_path):
     pose[:3, 3] = [0.76, 0.0, 1.73]
     camera = Camera.from_kitti(tmp_path / "c.txt", 0, width=640, height=480, vehicle_T_lidar=pose)
     np.testing.assert_allclose(camera.vehicle_T_camera, pose)
-    with pytest.raises(ValueError, match=r"P2 with 12 numbers is needed; got nothing; the file holds P0, Tr"):
+    with pytest.raises(ValueError, match=r"P2 with 12 numbers is needed; got nothing; the file contains P0, Tr"):
         Camera.from_kitti(tmp_path / "c.txt", 2, width=640, height=480)
 
 
@@ -214,7 +214,7 @@ def test_kitti_places_the_camera_through_the_lidar(tmp_path):
         (("P0: 5", "P0: nan 5"), "P0 with 12 numbers is needed; got nan"),
         (("P0: 5.200000000000e+02", "P0: 0"), "P0 has no focal length"),
         (("Tr: 1.0", "Tr: 2.0"), "P0 from the lidar: not a rigid transform"),
-        (("Tr", "Ts"), "Tr with 12 numbers is needed; got nothing; the file holds P0, Ts"),
+        (("Tr", "Ts"), "Tr with 12 numbers is needed; got nothing; the file contains P0, Ts"),
     ],
 )
 def test_kitti_files_that_are_none(tmp_path, change, message):

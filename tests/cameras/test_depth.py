@@ -18,16 +18,16 @@ from torchcover.cameras.isolated_images import read_exr_image
 from torchcover.files import BadFileError
 
 
-def encode_carla(metres, order):
-    code = round(metres / 1000.0 * (2**24 - 1))
+def encode_carla(depth_m, order):
+    code = round(depth_m / 1000.0 * (2**24 - 1))
     channels = {"R": code % 256, "G": code // 256 % 256, "B": code // 65536, "A": 255}
     return [channels[name] for name in order]
 
 
-@given(metres=st.floats(0.0, 999.9), order=st.sampled_from(["BGRA", "RGBA", "BGR", "RGB"]))
-def test_carla_depth_is_coded_to_a_sixteenth_of_a_millimetre(metres, order):
-    depth = decode_carla(np.array([[encode_carla(metres, order)]], dtype=np.uint8), order)
-    assert depth.item() == pytest.approx(metres, abs=1000.0 / (2**24 - 1) + metres * 1e-7)
+@given(depth_m=st.floats(0.0, 999.9), order=st.sampled_from(["BGRA", "RGBA", "BGR", "RGB"]))
+def test_carla_depth_is_coded_to_a_sixteenth_of_a_millimeter(depth_m, order):
+    depth = decode_carla(np.array([[encode_carla(depth_m, order)]], dtype=np.uint8), order)
+    assert depth.item() == pytest.approx(depth_m, abs=1000.0 / (2**24 - 1) + depth_m * 1e-7)
 
 
 def test_carla_sky_is_infinite_and_the_code_below_it_is_not():
@@ -38,14 +38,14 @@ def test_carla_sky_is_infinite_and_the_code_below_it_is_not():
 
 @pytest.mark.parametrize("order", ["RGB", "RGBA"])
 def test_a_colour_png_is_carlas(tmp_path, order):
-    metres = np.array([[2.5, 7.0], [400.0, 1000.0]])
-    pixels = np.array([[encode_carla(value, order) for value in row] for row in metres], dtype=np.uint8)
+    depth_m = np.array([[2.5, 7.0], [400.0, 1000.0]])
+    pixels = np.array([[encode_carla(value, order) for value in row] for row in depth_m], dtype=np.uint8)
     Image.fromarray(pixels).save(tmp_path / "depth.png")
     expected = torch.tensor([[2.5, 7.0], [400.0, torch.inf]])
     torch.testing.assert_close(read_depth(tmp_path / "depth.png"), expected, rtol=0, atol=1e-4)
 
 
-def test_a_grey_png_is_scaled(tmp_path):
+def test_a_gray_png_is_scaled(tmp_path):
     Image.fromarray(np.array([[0, 1500, 65535]], dtype=np.uint16)).save(tmp_path / "depth.png")
     depth = read_depth(tmp_path / "depth.png", meters_per_unit=0.001)
     assert depth.tolist() == [[0.0, 1.5, torch.inf]]
@@ -126,7 +126,7 @@ def save(path, array):
 @pytest.mark.parametrize(
     ("name", "array", "scale", "message"),
     [
-        ("d.png", np.zeros((2, 2), np.uint8), None, "8 bits, colour type 0"),
+        ("d.png", np.zeros((2, 2), np.uint8), None, "8 bits, color type 0"),
         ("d.png", np.zeros((2, 2), np.uint16), None, "meters_per_unit > 0 .*got None"),
         ("d.png", np.zeros((2, 2), np.uint16), -1.0, "got -1.0"),
         ("d.png", np.zeros((2, 2, 3), np.uint8), 0.001, "takes no meters_per_unit"),

@@ -1,13 +1,21 @@
-"""Reading calibrations: each reader turns one kind of source into a `Calibration`, from which a `Camera` is made."""
+"""Readers of calibration files of ROS, OpenCV, KITTI and nuScenes, each of which returns a `Calibration`."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeGuard
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from torchcover.cameras.calibration_values import (
+    describe_value,
+    get_first_entry,
+    get_integer,
+    get_matrix,
+    get_numbers,
+    is_number_list,
+)
 from torchcover.cameras.lens import to_vector
 from torchcover.cameras.models import check_image, check_model
 from torchcover.files import (
@@ -27,14 +35,10 @@ from torchcover.geometry import (
 )
 from torchcover.geometry.rigid import Matrix
 
-# Beyond, squares of float64 overflow.
-MAX_NUMBER = 1e150
-# A side of an image is shorter.
-MAX_PIXELS = 1_000_000
-# Camera axes (x right, y down, z forward) of a camera that looks along the vehicle's x (forward; y left, z up).
+# Rotation of a camera (x right, y down, z forward) that faces the x axis of the vehicle (x forward, y left, z up).
 LOOKING_FORWARD = build_transform([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]], [0.0, 0.0, 0.0])
 
-# ROS and OpenCV names of the models.
+# Models by their names in ROS and OpenCV.
 _MODEL_NAMES = {
     "plumb_bob": "brown_conrady",
     "rational_polynomial": "brown_conrady",
@@ -43,73 +47,22 @@ _MODEL_NAMES = {
 }
 
 
-def describe_value(value: object) -> str:
-    """What arrived, for a message. YAML may hold lists of lists whose text has no end."""
-    return repr(value)[:80] if isinstance(value, str | int | float | None) else f"a {type(value).__name__}"
-
-
-def get_first_entry(content: Mapping[str, Any], *names: str) -> tuple[str, Any]:
-    """The first entry of these names that there is."""
-    for name in names:
-        if name in content:
-            return name, content[name]
-    raise ValueError(f"{' or '.join(names)} is missing")
-
-
-def get_integer(content: Mapping[str, Any], *names: str) -> int:
-    """The first of these entries, a whole number."""
-    name, value = get_first_entry(content, *names)
-    if type(value) is not int:
-        raise ValueError(f"{name}: a whole number is needed; got {describe_value(value)}")
-    return value
-
-
-def get_matrix(content: Mapping[str, Any], *names: str) -> Matrix:
-    """A matrix that is written as {rows, cols, data}, or a list of numbers."""
-    name, value = get_first_entry(content, *names)
-    data = value.get("data") if isinstance(value, dict) else value
-    if not is_number_list(data):
-        raise ValueError(f"{name}: a list of finite numbers is needed; got {describe_value(data)}")
-    values = np.array([float(number) for number in data])
-    if not isinstance(value, dict):
-        return values
-    rows, columns = get_integer(value, "rows"), get_integer(value, "cols")
-    if min(rows, columns) < 0 or rows * columns != values.size:
-        raise ValueError(f"{name}: {rows} rows and {columns} columns are not {values.size} numbers")
-    return values.reshape(rows, columns)
-
-
-def get_numbers(entries: Mapping[str, Sequence[str]], key: str, count: int) -> Matrix:
-    """The numbers behind a key of a KITTI file."""
-    words = entries.get(key, [])
-    if not is_number_list(words, count):
-        arrived = " ".join(words)[:120] or "nothing"
-        raise ValueError(f"{key} with {count} numbers is needed; got {arrived}; the file holds {', '.join(entries)}")
-    return np.array(words, dtype=np.float64)
-
-
-def is_number_list(values: object, count: int | None = None) -> TypeGuard[list[Any]]:
-    """Whether it is a list of finite numbers, without a look into whatever else may be in it.
-
-    YAML takes 1e-1, without a point, for text.
-    """
-    return (
-        isinstance(values, list)
-        and count in (None, len(values))
-        and all(isinstance(value, int | float | str) and _is_finite(value) for value in values)
-    )
-
-
-def _is_finite(value: float | str) -> bool:
-    try:
-        return not isinstance(value, bool) and abs(float(value)) < MAX_NUMBER
-    except (ValueError, OverflowError):
-        return False
-
-
 @dataclass(frozen=True)
 class Calibration:
-    """What is known about a camera: the arguments of `Camera`."""
+    """Calibration of a camera, with the arguments of `Camera`.
+
+    Args:
+        width: Columns of the image.
+        height: Rows of the image.
+        fx: Focal length in pixels along x.
+        fy: Focal length in pixels along y.
+        cx: Column of the optical axis.
+        cy: Row of the optical axis.
+        model: Name of the lens model.
+        coefficients: Coefficients of the model.
+        vehicle_T_camera: (4, 4) extrinsics; None is the identity.
+        name: Name for messages.
+    """
 
     width: int
     height: int
@@ -124,7 +77,15 @@ class Calibration:
 
 
 def split_matrix(matrix: ArrayLike, name: str) -> tuple[float, float, float, float]:
-    """fx, fy, cx, cy of a 3x3 camera matrix, once it is known to be nothing else."""
+    """Split a camera matrix into fx, fy, cx, cy.
+
+    Args:
+        matrix: (3, 3) matrix without skew.
+        name: Name of the camera for messages.
+
+    Raises:
+        ValueError: Another shape, a skew, another last row, or zeros.
+    """
     K = np.asarray(matrix, dtype=np.float64)
     if K.shape != (3, 3):
         raise ValueError(f"{name}: a camera matrix has shape (3, 3); got {K.shape}")
@@ -136,7 +97,18 @@ def split_matrix(matrix: ArrayLike, name: str) -> tuple[float, float, float, flo
 
 
 def split_projection(numbers: Matrix, name: str) -> tuple[tuple[float, float, float, float], Matrix]:
-    """fx, fy, cx, cy and `camera_T_rectified` of the 12 numbers of KITTI's P = K [I | t]: all cameras are parallel."""
+    """Split a projection P = K [I | t] of KITTI, whose cameras are parallel.
+
+    Args:
+        numbers: (12,) numbers of P.
+        name: Name of the camera for messages.
+
+    Returns:
+        fx, fy, cx, cy, and the (4, 4) `camera_T_rectified`.
+
+    Raises:
+        ValueError: The numbers are not such a projection.
+    """
     P = numbers.reshape(3, 4)
     intrinsics = split_matrix(P[:, :3], name)
     if 0.0 in intrinsics[:2]:
@@ -147,13 +119,13 @@ def split_projection(numbers: Matrix, name: str) -> tuple[tuple[float, float, fl
 def convert_carla_pose(
     location_m: Sequence[float], *, pitch_deg: float = 0.0, yaw_deg: float = 0.0, roll_deg: float = 0.0
 ) -> Matrix:
-    """`vehicle_T_camera` of a camera attached to a vehicle in CARLA, from the carla.Transform that attached it.
+    """Convert the carla.Transform of a camera attached to a vehicle to `vehicle_T_camera`.
 
-    CARLA is left-handed (x forward, y right, z up): y and the signs of yaw (there to the right) and pitch (there
-    upwards) are turned over.
+    CARLA is left-handed (x forward, y right, z up): y, yaw (positive to the right) and pitch (positive upwards) change
+    their signs.
 
     Args:
-        location_m: x, y, z in CARLA's axes.
+        location_m: x, y, z in the axes of CARLA.
         pitch_deg: Upwards positive.
         yaw_deg: To the right positive.
         roll_deg: Right side down positive.
@@ -162,7 +134,7 @@ def convert_carla_pose(
         (4, 4) float64 matrix.
 
     Example:
-        >>> convert_carla_pose([0.0, 1.0, 2.8])[:3, 3]  # a metre to the right
+        >>> convert_carla_pose([0.0, 1.0, 2.8])[:3, 3]  # 1 m to the right
         array([ 0. , -1. ,  2.8])
     """
     x, y, z = location_m
@@ -174,21 +146,22 @@ def read_ros(path: Path) -> Calibration:
     """Read a ROS `camera_info` file, as camera_calibration writes it or as `topic echo` prints the message.
 
     Args:
-        path: A YAML file with size, matrix K, distortion model and coefficients. The unrectified image is described;
-            the matrices R and P of the rectified one are not read. The region of interest and the binning are applied,
-            as image_geometry does. Of several messages all but their headers has to be equal.
+        path: A YAML file with size, matrix K, distortion model and coefficients of the unrectified image; R and P are
+            not read. Region of interest and binning are applied, as by image_geometry. Several messages must be equal
+            except for their headers.
 
     Returns:
         The calibration of the image as it is published; a file without coefficients is a pinhole.
 
     Raises:
         FileNotFoundError: There is no such file.
-        BadFileError: An entry is missing or makes no camera, messages differ, or the distortion model is none of
+        BadFileError: An entry is missing or invalid, messages differ, or the distortion model is none of
             `plumb_bob`, `rational_polynomial`, `equidistant` and `fisheye`.
     """
-    content, *others = map(_check_mapping, parse_yaml_stream(read_short_text(path)) or [None])
-    if any({**other, "header": None} != {**content, "header": None} for other in others):
-        raise ValueError(f"{1 + len(others)} messages of different content; keep one of them")
+    messages = [_check_mapping(message) for message in parse_yaml_stream(read_short_text(path)) or [None]]
+    content = messages[0]
+    if any({**message, "header": None} != {**content, "header": None} for message in messages):
+        raise ValueError(f"{len(messages)} messages of different content; keep one of them")
     size = get_integer(content, "image_width", "width"), get_integer(content, "image_height", "height")
     matrix = get_matrix(content, "camera_matrix", "k", "K")
     if matrix.size != 9:
@@ -199,8 +172,8 @@ def read_ros(path: Path) -> Calibration:
         raise ValueError(f"distortion_model {describe_value(model)} is unknown; allowed: {', '.join(_MODEL_NAMES)}")
     name = content.get("camera_name")
     name = name if isinstance(name, str) else path.stem
-    size, K = _cut_and_binned(content, size, matrix.reshape(3, 3))
-    return _distorted(name, size, K, _MODEL_NAMES[model], distortion.ravel())
+    size, K = _apply_region_and_binning(content, size, matrix.reshape(3, 3))
+    return _build_calibration(name, size, K, _MODEL_NAMES[model], distortion.ravel())
 
 
 @guard_reader("an OpenCV calibration")
@@ -216,26 +189,27 @@ def read_opencv(
 
     Args:
         path: The file.
-        matrix_key: Name of the camera matrix in it; stereo calibrations use M1 and M2.
-        distortion_key: Name of the coefficients in it; there D1 and D2.
+        matrix_key: Name of the camera matrix in the file; M1 and M2 in stereo calibrations.
+        distortion_key: Name of the coefficients in the file; D1 and D2 in stereo calibrations.
         size: (width, height); None takes image_width and image_height from the file.
-        model: None is Brown-Conrady, or Kannala-Brandt where the file says `fisheye_model: 1`.
+        model: Name of the model; None is Brown-Conrady, or Kannala-Brandt if the file has `fisheye_model: 1`.
 
     Raises:
         FileNotFoundError: There is no such file.
-        BadFileError: An entry is missing, and the message lists those that the file has; or makes no camera.
+        BadFileError: An entry is missing or invalid; the message lists the entries of the file.
     """
     content = _read_yaml(path)
-    wanted = [matrix_key, distortion_key] + ([] if size else ["image_width", "image_height"])
-    missing = [key for key in wanted if key not in content]
+    required = [matrix_key, distortion_key] + ([] if size else ["image_width", "image_height"])
+    missing = [key for key in required if key not in content]
     if missing:
-        raise ValueError(f"{', '.join(missing)} not in the file; it holds {', '.join(map(str, content))}")
+        entries = ", ".join(str(key) for key in content)
+        raise ValueError(f"{', '.join(missing)} not in the file; it contains {entries}")
     if "xi" in content:
         raise ValueError("xi: the omnidirectional model of OpenCV is not read; calibrate with its fisheye model")
     size = size or (get_integer(content, "image_width"), get_integer(content, "image_height"))
     model = model or ("kannala_brandt" if content.get("fisheye_model") else "brown_conrady")
     matrix, distortion = get_matrix(content, matrix_key), get_matrix(content, distortion_key)
-    return _distorted(path.stem, size, matrix, model, distortion.ravel())
+    return _build_calibration(path.stem, size, matrix, model, distortion.ravel())
 
 
 @guard_reader("a KITTI calibration")
@@ -246,15 +220,15 @@ def read_kitti(
 
     Args:
         path: The file, with P0 to P3 and Tr_velo_to_cam (or Tr).
-        camera: 0 to 3; 2 is the left colour camera.
-        width: Columns of the images, which the file does not tell.
+        camera: 0 to 3; 2 is the left color camera.
+        width: Columns of the images, which the file does not contain.
         height: Rows of the images.
-        vehicle_T_lidar: Where the lidar sits, through which the camera is placed; None is the identity, so that the
-            lidar frame takes the place of the vehicle frame.
+        vehicle_T_lidar: (4, 4) extrinsics of the LiDAR, from which those of the camera follow; None is the identity, so
+            that the vehicle frame is the LiDAR frame.
 
     Raises:
         FileNotFoundError: There is no such file.
-        BadFileError: An entry is missing, has another length, or makes no camera.
+        BadFileError: An entry is missing, has another length, or is invalid.
     """
     lines = (line.split(":", 1) for line in read_short_text(path).splitlines() if ":" in line)
     table = {key.strip(): value.split() for key, value in lines}
@@ -265,27 +239,27 @@ def read_kitti(
     camera_T_lidar = camera_T_rectified @ build_transform(rotation, np.zeros(3)) @ reference_T_lidar
     vehicle_T_lidar = check_rigid(np.eye(4) if vehicle_T_lidar is None else vehicle_T_lidar, "vehicle_T_lidar")
     pose = vehicle_T_lidar @ invert(check_rigid(camera_T_lidar, f"P{camera} from the lidar"))
-    return _checked(Calibration(width, height, *intrinsics, vehicle_T_camera=pose, name=f"P{camera}"))
+    return _check_calibration(Calibration(width, height, *intrinsics, vehicle_T_camera=pose, name=f"P{camera}"))
 
 
 def read_nuscenes(
     folder: str | Path, channel: str, *, token: str | None = None, width: int = 1600, height: int = 900
 ) -> Calibration:
-    """Read one camera from nuScenes' tables `sensor.json` and `calibrated_sensor.json`. Undistorted: a pinhole.
+    """Read one camera from the tables `sensor.json` and `calibrated_sensor.json` of nuScenes: an undistorted pinhole.
 
     Args:
-        folder: Where the tables lie.
-        channel: "CAM_FRONT" and so on.
-        token: Of the calibrated sensor; needed where the tables hold several calibrations of the channel.
+        folder: Folder of the tables.
+        channel: Name of the camera, such as "CAM_FRONT".
+        token: Token of the calibrated sensor, if the tables contain several calibrations of the channel.
         width: Columns of the images.
         height: Rows of the images.
 
     Returns:
-        The calibration, placed in nuScenes' ego frame, whose origin lies under the rear axle.
+        The calibration; its vehicle frame is the ego frame of nuScenes, with the origin below the rear axle.
 
     Raises:
         FileNotFoundError: One of the tables is missing.
-        BadFileError: Not such tables, no such camera, several that differ, or one that cannot be.
+        BadFileError: The tables are others, the camera is missing or invalid, or several calibrations differ.
     """
     folder = Path(folder)
     table, sensors = (read_json_table(folder / f"{name}.json").rows for name in ("calibrated_sensor", "sensor"))
@@ -310,14 +284,17 @@ def read_nuscenes(
             )
         pose = check_rigid(build_transform(convert_quaternion_to_rotation(rotation), translation), f"{channel!r}")
         intrinsics = split_matrix(matrix, channel)
-        return _checked(Calibration(width, height, *intrinsics, vehicle_T_camera=pose, name=channel))
+        return _check_calibration(Calibration(width, height, *intrinsics, vehicle_T_camera=pose, name=channel))
 
 
-def _cut_and_binned(content: Mapping[str, Any], size: tuple[int, int], K: Matrix) -> tuple[tuple[int, int], Matrix]:
-    """The size and the matrix of the published image: a region of the whole sensor, then binned.
+def _apply_region_and_binning(
+    content: Mapping[str, Any], size: tuple[int, int], K: Matrix
+) -> tuple[tuple[int, int], Matrix]:
+    """Compute size and matrix of the published image: a region of the whole sensor, then binned.
 
-    Some drivers give the size of the region where the size of the whole sensor belongs.
+    Some drivers report the size of the region as that of the whole sensor.
     """
+    max_pixels = 1_000_000  # no image has a longer side
     roi = content.get("roi") or {}
     if not isinstance(roi, dict):
         raise ValueError(f"roi: x_offset, y_offset, width and height are needed; got {describe_value(roi)}")
@@ -326,7 +303,7 @@ def _cut_and_binned(content: Mapping[str, Any], size: tuple[int, int], K: Matrix
         offset, cut = (get_integer({key: 0, **roi}, key) for key in (f"{'xy'[axis]}_offset", name))
         key = f"binning_{'xy'[axis]}"
         binning = max(get_integer({key: 0, **content}, key), 1)
-        is_part = 0 <= offset < offset + cut <= length or (0 <= offset < MAX_PIXELS and cut == length)
+        is_part = 0 <= offset < offset + cut <= length or (0 <= offset < max_pixels and cut == length)
         if (offset or cut) and not is_part:
             raise ValueError(
                 f"roi: a part of the image's {name} of {length} pixels is needed; got {cut} from {offset} on; give the "
@@ -354,15 +331,18 @@ def _check_mapping(content: object) -> dict[str, Any]:
     return content
 
 
-def _distorted(name: str, size: tuple[int, int], matrix: Matrix, model: str, coefficients: Matrix) -> Calibration:
-    """A distorted camera; a file without any coefficient means a pinhole."""
+def _build_calibration(
+    name: str, size: tuple[int, int], matrix: Matrix, model: str, coefficients: Matrix
+) -> Calibration:
+    """Build the calibration of a distorted camera; without coefficients it is a pinhole."""
     values = tuple(float(value) for value in coefficients)
     model = model if values else "pinhole"
-    return _checked(Calibration(*size, *split_matrix(matrix, name), model, values, name=name))
+    return _check_calibration(Calibration(*size, *split_matrix(matrix, name), model, values, name=name))
 
 
-def _checked(source: Calibration) -> Calibration:
-    """Refuse what no camera can be made of, here, where the file is known."""
-    check_image(source.name, source.width, source.height, to_vector([source.fx, source.fy, source.cx, source.cy]))
-    check_model(source.model, source.coefficients)
-    return source
+def _check_calibration(calibration: Calibration) -> Calibration:
+    """Check a calibration while the file is known, so that messages name it."""
+    intrinsics = to_vector([calibration.fx, calibration.fy, calibration.cx, calibration.cy])
+    check_image(calibration.name, calibration.width, calibration.height, intrinsics)
+    check_model(calibration.model, calibration.coefficients)
+    return calibration

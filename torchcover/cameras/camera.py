@@ -1,4 +1,4 @@
-"""The camera: pixels to rays, depth images to points and points to pixels, through a real lens."""
+"""Cameras with real lenses: pixels to rays, depth images to points, and points to pixels."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -30,22 +30,23 @@ from torchcover.geometry.rigid import Matrix
 
 
 class Camera:
-    """A camera with its lens and its place on the vehicle.
+    """Camera with its lens and extrinsics; it cannot be changed.
 
-    Camera frame: x right, y down, z forward, metres. Pixel centres lie at integers, so the image covers
-    [-0.5, width - 0.5) x [-0.5, height - 0.5). A camera does not change once it is made.
+    Camera frame: x right, y down, z forward, in meters. Pixel centers are at integers, so the image covers
+    [-0.5, width - 0.5) x [-0.5, height - 0.5).
 
     Args:
         width: Columns of the image.
         height: Rows of the image.
-        fx: Focal length in pixels along x. Like the next four it may be a tensor with gradients.
+        fx: Focal length in pixels along x. It may be a tensor with gradients, like the next three.
         fy: Focal length in pixels along y.
         cx: Column of the optical axis; it may lie outside the image.
         cy: Row of the optical axis.
         model: "pinhole", "brown_conrady", "kannala_brandt", "theta_polynomial", "mei", "eucm" or "double_sphere".
-        coefficients: Of the model: numbers or a 1-d tensor. Brown-Conrady takes 4, 5, 8, 12 or 14 in OpenCV's order.
-        vehicle_T_camera: (4, 4) rigid transform; None is the identity.
-        name: What messages call it.
+        coefficients: Coefficients of the model, numbers or a 1-d tensor, which may have gradients. Brown-Conrady takes
+            4, 5, 8, 12 or 14 in the order of OpenCV.
+        vehicle_T_camera: (4, 4) extrinsics; None is the identity.
+        name: Name for messages.
 
     Raises:
         ValueError: A size or focal length that is not positive, a value that is not finite, an unknown model, a
@@ -86,38 +87,42 @@ class Camera:
 
     @classmethod
     def from_calibration(cls, source: Calibration) -> "Camera":
-        """A camera from a `Calibration`, whose fields are the arguments of the constructor."""
+        """Create a camera from a calibration.
+
+        Args:
+            source: The calibration, whose fields are the arguments of the constructor.
+        """
         return cls(**vars(source))
 
     @classmethod
-    def from_matrix(cls, matrix: ArrayLike, width: int, height: int, **rest: Any) -> "Camera":  # noqa: ANN401
-        """A camera from its 3x3 matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]].
+    def from_matrix(cls, matrix: ArrayLike, width: int, height: int, **options: Any) -> "Camera":  # noqa: ANN401
+        """Create a camera from its matrix [[fx, 0, cx], [0, fy, cy], [0, 0, 1]].
 
         Args:
-            matrix: Camera matrix for pixel centres at integers (OpenCV's, ROS's).
+            matrix: (3, 3) camera matrix for pixel centers at integers, as in OpenCV and ROS.
             width: Columns of the image.
             height: Rows of the image.
-            **rest: `model`, `coefficients`, `vehicle_T_camera`, `name`.
+            **options: `model`, `coefficients`, `vehicle_T_camera`, `name`.
 
         Raises:
             ValueError: The matrix has another shape, a skew, or another last row.
         """
-        fx, fy, cx, cy = calibration.split_matrix(matrix, str(rest.get("name", "camera")))
-        return cls(width, height, fx, fy, cx, cy, **rest)
+        fx, fy, cx, cy = calibration.split_matrix(matrix, str(options.get("name", "camera")))
+        return cls(width, height, fx, fy, cx, cy, **options)
 
     @classmethod
-    def from_fov(cls, width: int, height: int, fov_deg: float, **rest: Any) -> "Camera":  # noqa: ANN401
-        """A pinhole with square pixels and its axis in the middle of the image, as CARLA's cameras are.
+    def from_fov(cls, width: int, height: int, fov_deg: float, **options: Any) -> "Camera":  # noqa: ANN401
+        """Create a pinhole camera with square pixels and the axis in the middle of the image, as in CARLA.
 
         Args:
             width: Columns of the image.
             height: Rows of the image.
             fov_deg: Horizontal field of view from the left edge of the first pixel to the right edge of the last.
-            **rest: `vehicle_T_camera` (`convert_carla_pose` makes one), `name`.
+            **options: `vehicle_T_camera` (see `convert_carla_pose`), `name`.
 
         Returns:
-            The camera, with its axis at (width - 1) / 2: CARLA's own matrix says width / 2, because it counts from
-            the corner of the first pixel, not from its centre.
+            The camera, with its axis at (width - 1) / 2; the matrix of CARLA has width / 2, because it counts from the
+            corner of the first pixel and not from its center.
 
         Raises:
             ValueError: The field of view is not between 0 and 180 degrees.
@@ -127,28 +132,49 @@ class Camera:
             Camera('camera', 500x420, pinhole, fx=250, fy=250, cx=249.5, cy=209.5)
         """
         if not 0.0 < fov_deg < 180.0:
-            raise ValueError(f"a pinhole's field of view lies between 0 and 180 degrees; got {fov_deg}")
+            raise ValueError(f"the field of view of a pinhole lies between 0 and 180 degrees; got {fov_deg}")
         focal = float(width / (2.0 * np.tan(np.deg2rad(fov_deg) / 2.0)))
-        return cls(width, height, focal, focal, (width - 1) / 2.0, (height - 1) / 2.0, **rest)
+        return cls(width, height, focal, focal, (width - 1) / 2.0, (height - 1) / 2.0, **options)
 
     @classmethod
     def from_ros(cls, path: str | Path) -> "Camera":
-        """A camera from a ROS `camera_info` YAML file; see `calibration.read_ros`."""
+        """Create a camera from a ROS `camera_info` YAML file.
+
+        Args:
+            path: The file; see `calibration.read_ros`.
+        """
         return cls.from_calibration(calibration.read_ros(path))
 
     @classmethod
     def from_opencv(cls, path: str | Path, **options: Any) -> "Camera":  # noqa: ANN401
-        """A camera from an OpenCV FileStorage YAML file; see `calibration.read_opencv` for the options."""
+        """Create a camera from an OpenCV FileStorage YAML file.
+
+        Args:
+            path: The file.
+            **options: Arguments of `calibration.read_opencv`.
+        """
         return cls.from_calibration(calibration.read_opencv(path, **options))
 
     @classmethod
     def from_kitti(cls, path: str | Path, camera: int, **options: Any) -> "Camera":  # noqa: ANN401
-        """A camera from a KITTI calibration file; see `calibration.read_kitti` for the options."""
+        """Create a camera from a KITTI calibration file.
+
+        Args:
+            path: The file.
+            camera: Number of the camera, 0 to 3.
+            **options: Arguments of `calibration.read_kitti`.
+        """
         return cls.from_calibration(calibration.read_kitti(path, camera, **options))
 
     @classmethod
     def from_nuscenes(cls, folder: str | Path, channel: str, **options: Any) -> "Camera":  # noqa: ANN401
-        """A camera from nuScenes' tables; see `calibration.read_nuscenes` for the options."""
+        """Create a camera from the tables of nuScenes.
+
+        Args:
+            folder: Folder of the tables.
+            channel: Name of the camera, such as "CAM_FRONT".
+            **options: Arguments of `calibration.read_nuscenes`.
+        """
         return cls.from_calibration(calibration.read_nuscenes(folder, channel, **options))
 
     def __repr__(self) -> str:
@@ -159,48 +185,48 @@ class Camera:
     def rays(
         self, pixels: Tensor | None = None, *, device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32
     ) -> tuple[Tensor, Tensor]:
-        """Directions in which pixels look.
+        """Compute the rays of pixels.
 
         Args:
-            pixels: (..., 2) columns and rows, not only integers; None is the whole image.
-            device: Where the table of the whole image is made and kept; pixels decide for themselves.
-            dtype: float32 or float64 of that table. The lens is solved in float64 either way.
+            pixels: (..., 2) columns and rows, also between pixel centers; None is the whole image.
+            device: Device of the table of the whole image, which is computed once; ignored with pixels.
+            dtype: float32 or float64 of that table. The lens is solved in float64 in any case.
 
         Returns:
-            Unit directions (H, W, 3), or (..., 3), and a mask (H, W), or (...), of the pixels that have one. The
-            others are NaN: outside the valid region of the lens, or not converged (`count_pixels` tells which).
+            Unit directions (H, W, 3) or (..., 3), and a mask (H, W) or (...) of the pixels that have one. The others
+            are NaN: outside the valid region of the lens, or not converged (see `count_pixels`).
         """
         if pixels is None:
             return self._table.get_points(str(torch.device(device)), dtype, "distance")
         if not pixels.is_floating_point() or pixels.shape[-1:] != (2,):
             raise ValueError(f"{self.name}: pixels are floats (..., 2); got {pixels.dtype} {tuple(pixels.shape)}")
-        return self._rays_of(pixels)
+        return self._compute_rays(pixels)
 
     @run_with_float64
-    def _rays_of(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
+    def _compute_rays(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
         directions, status = self._optics.unproject(pixels.reshape(-1, 2).double())
         shape = pixels.shape[:-1]
         return directions.to(pixels.dtype).reshape(*shape, 3), (status == ANSWERED).reshape(shape)
 
     def count_pixels(self) -> dict[str, int]:
-        """How many pixels of the image have a ray, and why the others have none.
+        """Count the pixels of the image with a ray, and those without by reason.
 
         Returns:
-            `pixels_valid`, `pixels_outside` (no direction of the valid region has this image) and
-            `pixels_unconverged` (the solver gave up); they add up to width * height.
+            `pixels_valid`, `pixels_outside` (no direction in the valid region has this image) and
+            `pixels_unconverged` (the solver did not converge); they add up to width * height.
         """
         return self._table.count_pixels()
 
     @run_with_float64
     def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
-        """Pixels at which points are seen.
+        """Project points to pixels.
 
         Args:
-            points: (N, 3) float points in the camera frame, metres.
+            points: (N, 3) float points in the camera frame, in meters.
 
         Returns:
             (N, 2) columns and rows, NaN for points that the lens cannot show (behind it, beyond its fold, not
-            finite), and (N,) bool: visible, that is, shown and inside the image. Occlusion is not considered.
+            finite), and (N,) bool: visible, that is, shown and inside the image. Occlusion is ignored.
 
         Raises:
             ValueError: The points are not (N, 3) floats.
@@ -221,35 +247,35 @@ class Camera:
         valid_mask: Tensor | None = None,
         max_depth_m: float = float("inf"),
     ) -> Tensor | list[Tensor]:
-        """Points of a depth image.
+        """Compute the points of a depth image.
 
         Args:
-            depth: (H, W) metres, float; or (B, H, W). Values that are zero, negative, NaN, infinite or beyond
-                `max_depth_m` never become points; `count_excluded` counts them.
-            depth_kind: "z", along the optical axis (CARLA, most renderers), or "distance", along the ray. At 90 degrees and
-                more off the axis only distance exists.
-            stride: Take every stride-th row and column, beginning with the first.
-            valid_mask: (H, W) or (B, H, W) bool; pixels to leave out are False.
-            max_depth_m: Largest depth that is a measurement, metres, of the same kind as the depth.
+            depth: (H, W) or (B, H, W) float depth in meters. Zero, negative, NaN and infinite values and those beyond
+                `max_depth_m` do not become points; `count_excluded` counts them.
+            depth_kind: "z", along the optical axis (CARLA, most renderers), or "distance", along the ray. At 90 degrees
+                and more off the axis only the distance exists.
+            stride: Use every stride-th row and column, beginning with the first.
+            valid_mask: (H, W) or (B, H, W) bool; False for pixels to exclude.
+            max_depth_m: Largest depth that is a measurement, of the same kind as the depth.
 
         Returns:
-            (N, 3) points in the camera frame, row by row, of the depth's dtype (half precision becomes float32); for
+            (N, 3) points in the camera frame, row by row, in the type of the depth (float32 for half precision); for
             (B, H, W) a list of B such clouds.
 
         Raises:
-            TypeError: Integer depth: its unit is unknown.
-            ValueError: Depth or mask of another size than the camera, an unknown kind, a stride below 1.
+            TypeError: The depth has integers, whose unit is unknown.
+            ValueError: Depth or mask have another size than the camera, the kind is unknown, or the stride below 1.
 
         Example:
             >>> Camera.from_fov(3, 1, 90.0).unproject(torch.tensor([[2.0, 0.0, 2.0]]))
             tensor([[-1.3333,  0.0000,  2.0000],
                     [ 1.3333,  0.0000,  2.0000]])
         """
-        pixels = self._select(depth, depth_kind, stride, valid_mask)
-        keep = pixels.mask & mask_usable_depths(pixels.depth, max_depth_m)
+        pixels = self._select_pixels(depth, depth_kind, stride, valid_mask)
+        mask = pixels.mask & mask_usable_depths(pixels.depth, max_depth_m)
         if pixels.depth.ndim == 2:
-            return scale_rays(pixels.rays, pixels.depth, keep)
-        return [scale_rays(pixels.rays, *image) for image in zip(pixels.depth, keep, strict=True)]
+            return scale_rays(pixels.rays, pixels.depth, mask)
+        return [scale_rays(pixels.rays, *image) for image in zip(pixels.depth, mask, strict=True)]
 
     def count_excluded(
         self,
@@ -260,34 +286,56 @@ class Camera:
         valid_mask: Tensor | None = None,
         max_depth_m: float = float("inf"),
     ) -> dict[str, int]:
-        """Why pixels of a depth image do not become points; the arguments are those of `unproject`.
+        """Count the pixels of a depth image that do not become points, by reason.
+
+        Args:
+            depth: Depth image or batch; see `unproject`, as for the other arguments.
+            depth_kind: "z" or "distance".
+            stride: Use every stride-th row and column.
+            valid_mask: False for pixels to exclude.
+            max_depth_m: Largest depth that is a measurement.
 
         Returns:
-            `no_ray` (the lens has no answer, or no z-depth in that direction), `masked` (by `valid_mask`), then
-            `depth_zero`, `depth_negative`, `depth_nan`, `depth_infinite`, `depth_beyond_range`. Every pixel is
-            counted once, under the first reason that fits.
+            `no_ray` (no ray, or no z depth in that direction), `masked` (by `valid_mask`), then `depth_zero`,
+            `depth_negative`, `depth_nan`, `depth_infinite`, `depth_beyond_range`. Every pixel is counted once, under
+            the first reason that applies.
         """
-        pixels = self._select(depth, depth_kind, stride, valid_mask)
+        pixels = self._select_pixels(depth, depth_kind, stride, valid_mask)
         has_ray = pixels.has_ray.expand(pixels.depth.shape)
-        allowed = pixels.mask.expand(pixels.depth.shape)
-        counts = {"no_ray": int((~has_ray).sum()), "masked": int((has_ray & ~allowed).sum())}
-        return counts | count_unusable_depths(pixels.depth[allowed], max_depth_m)
+        mask = pixels.mask.expand(pixels.depth.shape)
+        counts = {"no_ray": int((~has_ray).sum()), "masked": int((has_ray & ~mask).sum())}
+        return counts | count_unusable_depths(pixels.depth[mask], max_depth_m)
 
-    def _select(self, depth: Tensor, kind: DepthKind, stride: int, valid: Tensor | None) -> PixelSelection:
-        depth = check_depth(depth, kind, stride, valid, (self.height, self.width), self.name)
-        rays, has_ray = self._table.get_points(str(depth.device), depth.dtype, kind)
-        return select_pixels(rays, has_ray, depth, stride, valid)
+    def _select_pixels(
+        self, depth: Tensor, depth_kind: DepthKind, stride: int, valid_mask: Tensor | None
+    ) -> PixelSelection:
+        depth = check_depth(depth, depth_kind, stride, valid_mask, (self.height, self.width), self.name)
+        rays, has_ray = self._table.get_points(str(depth.device), depth.dtype, depth_kind)
+        return select_pixels(rays, has_ray, depth, stride, valid_mask)
 
     @run_with_float64
     def convert_z_to_distance(self, depth: Tensor) -> Tensor:
-        """Distance along the ray for depth along the axis: (H, W) or (B, H, W), NaN where a pixel has no z-depth."""
+        """Convert depth along the axis to distance along the ray.
+
+        Args:
+            depth: (H, W) or (B, H, W) depth in meters.
+
+        Returns:
+            Distances of the same shape, NaN where a pixel has no z depth.
+        """
         depth = check_depth(depth, "z", 1, None, (self.height, self.width), self.name)
-        forward = self._forward(depth.device)
+        forward = self._compute_axis_cosines(depth.device)
         return (depth.double() / torch.where(forward > 0, forward, torch.nan)).to(depth.dtype)
 
     @run_with_float64
     def convert_distance_to_z(self, depth: Tensor) -> Tensor:
-        """Depth along the axis for distance along the ray: (H, W) or (B, H, W), NaN where a pixel has no ray.
+        """Convert distance along the ray to depth along the axis.
+
+        Args:
+            depth: (H, W) or (B, H, W) distance in meters.
+
+        Returns:
+            Depth of the same shape, NaN where a pixel has no ray.
 
         Example:
             >>> camera = Camera.from_fov(2, 1, 90.0)
@@ -295,17 +343,25 @@ class Camera:
             tensor([[3., 5.]])
         """
         depth = check_depth(depth, "distance", 1, None, (self.height, self.width), self.name)
-        return (depth.double() * self._forward(depth.device)).to(depth.dtype)
+        return (depth.double() * self._compute_axis_cosines(depth.device)).to(depth.dtype)
 
-    def _forward(self, device: torch.device) -> Tensor:
-        """Cosine of the angle between every pixel's ray and the axis, float64."""
+    def _compute_axis_cosines(self, device: torch.device) -> Tensor:
+        """Compute the float64 cosine of the angle between the ray of each pixel and the axis."""
         rays, _ = self._table.get_points(str(device), torch.float64, "distance")
         return rays[..., 2]
 
     def to_vehicle(self, points: Tensor) -> Tensor:
-        """Points (N, 3) of the camera frame in the vehicle frame."""
+        """Transform points from the camera frame to the vehicle frame.
+
+        Args:
+            points: (N, 3) points.
+        """
         return transform_points_tensor(self.vehicle_T_camera, points)
 
     def to_camera(self, points: Tensor) -> Tensor:
-        """Points (N, 3) of the vehicle frame in the camera frame."""
+        """Transform points from the vehicle frame to the camera frame.
+
+        Args:
+            points: (N, 3) points.
+        """
         return transform_points_tensor(invert(self.vehicle_T_camera), points)

@@ -11,15 +11,13 @@ from math import inf, sqrt
 import torch
 from torch import Tensor
 
+from torchcover.cameras.fisheye import AngleChart, KannalaBrandt, ThetaPolynomial
 from torchcover.cameras.lens import (
-    AngleChart,
     BrownConrady,
-    KannalaBrandt,
     Lens,
     PlaneChart,
     Scalar,
     SensorTilt,
-    ThetaPolynomial,
     to_float,
 )
 
