@@ -7,7 +7,7 @@ from pydantic import ValidationError
 
 from torchcover.simulation import Lidar, Material, PaperReference, Rig, Scenario, Simulator, list_builtin_names
 from torchcover.simulation.documents import format_validation_error
-from torchcover.simulation.returns import SURE, compute_extinction_per_m, compute_log_excess, compute_return_probability
+from torchcover.simulation.returns import MAX_RETURN_PROBABILITY, compute_extinction_per_m, compute_log_excess, compute_return_probability
 
 KEYS = {
     "name": "a",
@@ -25,9 +25,9 @@ def test_every_other_ray_returns_from_where_the_data_sheet_says(range_at_10_perc
     """Four times as bright is twice as far."""
     range_m = range_at_10_percent_m * np.sqrt(reflectivity / 0.1)
     excess = compute_log_excess(range_m, 1.0, reflectivity, 1.0, range_at_10_percent_m)
-    assert compute_return_probability(excess, 0.3) == pytest.approx(SURE / 2, abs=1e-15)
+    assert compute_return_probability(excess, 0.3) == pytest.approx(MAX_RETURN_PROBABILITY / 2, abs=1e-15)
     one_spread_nearer = compute_log_excess(range_m * np.exp(-0.3), 1.0, reflectivity, 1.0, range_at_10_percent_m)
-    assert compute_return_probability(one_spread_nearer, 0.3) / SURE == pytest.approx(0.8413447460685429)
+    assert compute_return_probability(one_spread_nearer, 0.3) / MAX_RETURN_PROBABILITY == pytest.approx(0.8413447460685429)
 
 
 def test_lambert_on_a_road_falls_with_the_cube_of_the_range():
@@ -60,7 +60,7 @@ def test_whatever_is_worse_returns_less(worse):
 
 def test_what_reflects_nothing_never_returns_and_a_retroreflector_always_does():
     excess = compute_log_excess(50.0, 0.1, np.array([0.0, np.inf]), 1.0, 1.0)
-    assert compute_return_probability(excess, 0.3).tolist() == [0.0, SURE]
+    assert compute_return_probability(excess, 0.3).tolist() == [0.0, MAX_RETURN_PROBABILITY]
 
 
 def test_a_contrast_of_five_percent_is_left_at_the_visibility():
@@ -178,7 +178,7 @@ def test_what_reflects_returns_from_farther():
 
     assert of("glass") < of("tyre") < of("road") < of("lane_paint") < of("sign")
     assert of("sign") == pytest.approx(
-        SURE * len(seen(range_at_10_percent_m=None, bodies=PLAIN["bodies"][:1]).ray_indices), rel=0.01
+        MAX_RETURN_PROBABILITY * len(seen(range_at_10_percent_m=None, bodies=PLAIN["bodies"][:1]).ray_indices), rel=0.01
     )
 
 

@@ -5,7 +5,7 @@ from functools import lru_cache
 import mpmath
 import numpy as np
 
-from torchcover.simulation.returns import SURE, compute_log_excess, compute_return_probability
+from torchcover.simulation.returns import MAX_RETURN_PROBABILITY, compute_log_excess, compute_return_probability
 
 from .case import Case, most
 
@@ -34,7 +34,7 @@ def exact_log_excess():
 def exact_probability():
     with mpmath.workdps(60):
         width = 2 * mpmath.mpf(SPREAD)
-        return np.array([float(mpmath.mpf(SURE) * mpmath.ncdf(excess / width)) for excess in exact_log_excess()])
+        return np.array([float(mpmath.mpf(MAX_RETURN_PROBABILITY) * mpmath.ncdf(excess / width)) for excess in exact_log_excess()])
 
 
 def our_excess():
@@ -64,7 +64,7 @@ def logistic_error():
     """What is at hand where there is no error function, of the same slope in the middle."""
     slope = 4 / np.sqrt(2 * np.pi) / (2 * SPREAD)
     with np.errstate(over="ignore"):
-        return most(SURE / (1 + np.exp(-slope * our_excess())) - exact_probability())
+        return most(MAX_RETURN_PROBABILITY / (1 + np.exp(-slope * our_excess())) - exact_probability())
 
 
 CASES = (

@@ -1,4 +1,4 @@
-"""The kinds of sensors, of reference sensors and of traffic, by the names that files and options call them."""
+"""Registries of sensors, reference sensors and traffic, by the names that files and options use."""
 
 from torchcover.simulation.camera_sensor import CameraSensor
 from torchcover.simulation.lidar import Lidar
@@ -11,12 +11,12 @@ from torchcover.simulation.surface_reference import SurfaceReference
 from torchcover.simulation.traffic import HighwayTraffic, ParkingTraffic, UrbanTraffic
 from torchcover.simulation.traffic.kind import Traffic
 
-# By the key `type` in a rig's file.
+# Keys are values of `type` of a sensor in a rig file.
 SENSORS: dict[str, type[Sensor]] = {"lidar": Lidar, "camera": CameraSensor, "radar": Radar}
 REFERENCE_SENSORS: dict[str, type[ReferenceSensor]] = {
     sensor.name: sensor for sensor in (PaperReference, SurfaceReference)
 }
-# By the key `type` of a scenario's `traffic`.
+# Keys are values of `type` of `traffic` in a scenario.
 TRAFFIC: dict[str, type[Traffic]] = {
     "urban": UrbanTraffic,
     "highway": HighwayTraffic,

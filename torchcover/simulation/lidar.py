@@ -1,4 +1,4 @@
-"""LiDAR: a table of rows, turned through its columns, and the models on the market that it may start from."""
+"""LiDAR sensors: scan patterns, and models on the market that a sensor may start from."""
 
 from typing import Annotated, Any, ClassVar, Literal, Self
 
@@ -18,41 +18,36 @@ from torchcover.simulation.returns import (
 )
 from torchcover.simulation.sensor import Elevation, RangeSensor, RayHits, Returns, ScanTimes, SensorNoise
 
-# Two ways to write rows: a sensor that chooses one of them takes nothing of the other from its model.
-SPACED_ROWS = ("channels", "vertical_fov_deg")
-ROW_TABLE = ("elevations_deg", "azimuth_offsets_deg", "range_factors")
-# A hundred times what there is on the market.
-MAX_ROWS, MAX_COLUMNS = 100_000, 1_000_000
-
 
 class ScanPattern(RangeSensor):
-    """Where the rays of a LiDAR point, and which of their hits become points.
+    """Ray directions of a LiDAR and the model of its returns.
 
-    The ray of row i in column j points to elevation `E[i]` and azimuth `A[j] + D[i]`, where the rows' elevations E are
-    a table or evenly spaced over the field of view, both ends included; the columns' azimuths A are evenly spaced over
-    the field of view, in the middle of `columns` equal sectors; and D are offsets of the rows.
+    The ray of row i in column j has the elevation `E[i]` and the azimuth `A[j] + D[i]`: elevations E are a table or
+    evenly spaced over the vertical field of view, both ends included; azimuths A are the centers of `columns` equal
+    sectors of the horizontal field of view; D are offsets of the rows.
 
     Args:
-        channels: Number of rows, when they are evenly spaced.
+        channels: Number of rows with evenly spaced elevations.
         vertical_fov_deg: Lowest and highest elevation of evenly spaced rows.
-        elevations_deg: Elevation of each row instead, in any order.
-        azimuth_offsets_deg: Offset of each row; positive is left. None if not given.
-        horizontal_fov_deg: Field of view about the x axis, 360 for a full turn.
-        columns: Number of columns.
-        range_at_10_percent_m: Range at which a surface of reflectivity 10 %, met head-on, returns every other ray; see
-            `log_excess`. None: every hit within `max_range_m` returns.
-        log_range_std: Standard deviation of ln of that range between one ray and the next.
-        range_factors: Of each row, what its range at 10 % is multiplied with; 1 if not given.
-        scan: When its columns are cast; all at once if not given.
-        min_range_m, max_range_m, range_noise_m, dropout: As in `Ranging`.
+        elevations_deg: Elevation of each row, in any order, in place of `channels` and `vertical_fov_deg`.
+        azimuth_offsets_deg: Azimuth offset of each row, positive to the left; None for no offsets.
+        horizontal_fov_deg: Azimuth range, centered at the x axis; 360 for a full turn.
+        columns: Number of azimuths.
+        range_at_10_percent_m: Range at which half of the rays return from a surface of 10 % reflectivity at normal
+            incidence, see `compute_log_excess`. None: every hit within `max_range_m` returns.
+        log_range_std: Standard deviation of ln of that range between rays.
+        range_factors: Factor on `range_at_10_percent_m` for each row; None for 1.
+        scan: Times of the columns; None if all rays are cast at once.
+        min_range_m, max_range_m, range_noise_m, dropout: See `RangeSensor`.
     """
 
-    channels: Annotated[int, Field(gt=0, le=MAX_ROWS)] | None = None
+    # Limits are 100 times those of products on the market.
+    channels: Annotated[int, Field(gt=0, le=100_000)] | None = None
     vertical_fov_deg: tuple[Elevation, Elevation] | None = None
     elevations_deg: tuple[Elevation, ...] | None = Field(default=None, min_length=1)
     azimuth_offsets_deg: tuple[float, ...] | None = None
     horizontal_fov_deg: Annotated[float, Field(gt=0.0, le=360.0)]
-    columns: Annotated[int, Field(gt=0, le=MAX_COLUMNS)]
+    columns: Annotated[int, Field(gt=0, le=1_000_000)]
     range_at_10_percent_m: PositiveFloat | None = None
     log_range_std: PositiveFloat = 0.3
     range_factors: tuple[PositiveFloat, ...] | None = None
@@ -60,61 +55,68 @@ class ScanPattern(RangeSensor):
 
     @model_validator(mode="after")
     def _check_rows(self) -> Self:
-        spaced = (self.channels is not None, self.vertical_fov_deg is not None)
-        if self.elevations_deg is not None and any(spaced):
+        is_spaced = (self.channels is not None, self.vertical_fov_deg is not None)
+        if self.elevations_deg is not None and any(is_spaced):
             raise ValueError("give the rows as elevations_deg, or as channels and vertical_fov_deg, not both")
-        if self.elevations_deg is None and not all(spaced):
+        if self.elevations_deg is None and not all(is_spaced):
             raise ValueError("the rows are missing: give channels and vertical_fov_deg, or elevations_deg")
         if self.vertical_fov_deg is not None and self.vertical_fov_deg[0] > self.vertical_fov_deg[1]:
             raise ValueError(f"vertical_fov_deg: the lower elevation comes first; got {self.vertical_fov_deg}")
-        rows = len(self.compute_elevations_deg())
+        num_rows = len(self.compute_elevations_deg())
         for key in ("azimuth_offsets_deg", "range_factors"):
-            given = getattr(self, key)
-            if given is not None and len(given) != rows:
-                raise ValueError(f"{key}: one for each of the {rows} rows is needed; got {len(given)}")
+            values = getattr(self, key)
+            if values is not None and len(values) != num_rows:
+                raise ValueError(f"{key}: one for each of the {num_rows} rows is needed; got {len(values)}")
         return self
 
     @property
     def is_exact(self) -> bool:
-        """Whether it has neither noise nor drop-out, and every hit returns."""
+        """True if there is neither noise nor drop-out, and every hit returns."""
         return self.range_at_10_percent_m is None and super().is_exact
 
     def measure(self, hits: RayHits, noise: SensorNoise) -> Returns:
-        """A point for each hit that returns enough light and is not too close; see `Ranging.measure`."""
+        """Measure a point at each hit that returns enough light and is not too close.
+
+        Args:
+            hits: Hits of the rays.
+            noise: Source of all random numbers.
+
+        Returns:
+            Hits that give a point, and their range errors, see `RangeSensor.measure`.
+        """
         if self.range_at_10_percent_m is None:
             return super().measure(hits, noise)
-        returned = noise.sample_return_uniform(hits.ray_indices) < self._return_probability(
-            hits, self.range_at_10_percent_m
-        )
-        return self.sample_returns(hits, np.flatnonzero(returned & (hits.range_m >= self.min_range_m)), noise)
+        probability = self._compute_return_probability(hits, self.range_at_10_percent_m)
+        is_returned = noise.sample_return_uniform(hits.ray_indices) < probability
+        return self.sample_returns(hits, np.flatnonzero(is_returned & (hits.range_m >= self.min_range_m)), noise)
 
-    def _return_probability(self, hits: RayHits, range_at_10_percent_m: float) -> NDArray[np.floating]:
+    def _compute_return_probability(self, hits: RayHits, range_at_10_percent_m: float) -> NDArray[np.floating]:
         material, weather = hits.attributes.material_indices, hits.weather
         if weather.road == "wet":
             material = np.where(material == get_material_index("road"), get_material_index("wet_road"), material)
-        known = load_materials()
-        reach_m: float | Float32 = range_at_10_percent_m
+        materials = load_materials()
+        row_range_m: float | Float32 = range_at_10_percent_m
         if self.range_factors is not None:
-            of_rows_m = range_at_10_percent_m * np.array(self.range_factors, dtype=np.float32)
-            reach_m = of_rows_m[hits.pixel_indices // self.columns]
-        excess = compute_log_excess(
+            range_per_row_m = range_at_10_percent_m * np.array(self.range_factors, dtype=np.float32)
+            row_range_m = range_per_row_m[hits.pixel_indices // self.columns]
+        log_excess = compute_log_excess(
             hits.range_m,
             hits.attributes.cos_incidence,
-            known.reflectivity[material],
-            known.incidence_exponent[material],
-            reach_m,
+            materials.reflectivity[material],
+            materials.incidence_exponent[material],
+            row_range_m,
             weather.extinction_per_m,
         )
-        excess += known.body_log_std[material] * compute_brightness_offsets(hits.attributes.body_indices)
-        return compute_return_probability(excess, self.log_range_std, known.point_log_std[material])
+        log_excess += materials.body_log_std[material] * compute_brightness_offsets(hits.attributes.body_indices)
+        return compute_return_probability(log_excess, self.log_range_std, materials.point_log_std[material])
 
     @property
     def num_rays(self) -> int:
-        """How many rays there are: rows times columns."""
+        """Number of rays: rows times columns."""
         return (self.channels or len(self.elevations_deg or ())) * self.columns
 
     def compute_elevations_deg(self) -> Float64:
-        """(rows,) elevation of each row."""
+        """Compute the (rows,) elevations of the rows."""
         if self.elevations_deg is not None:
             return np.array(self.elevations_deg)
         assert self.channels is not None  # checked in _check_rows
@@ -122,31 +124,28 @@ class ScanPattern(RangeSensor):
         return np.linspace(*self.vertical_fov_deg, self.channels)
 
     def compute_ray_times_s(self) -> Float64 | None:
-        """(rows, columns) when each ray is cast, after the time of the frame; None if all are at that time."""
-        rows = len(self.compute_elevations_deg())
-        return None if self.scan is None else np.tile(self.scan.compute_times_s(self.columns), (rows, 1))
+        """Compute (rows, columns) times of the rays relative to the frame; None if all rays are cast at that time."""
+        num_rows = len(self.compute_elevations_deg())
+        return None if self.scan is None else np.tile(self.scan.compute_times_s(self.columns), (num_rows, 1))
 
     def compute_directions(self) -> Float64:
-        """(3, rows, columns) unit directions in the LiDAR's frame."""
-        middle = (np.arange(self.columns) + 0.5) / self.columns - 0.5
-        offsets = (
-            np.zeros(len(self.compute_elevations_deg()))
-            if self.azimuth_offsets_deg is None
-            else self.azimuth_offsets_deg
-        )
-        azimuths_deg = np.add.outer(offsets, self.horizontal_fov_deg * middle)
-        return compute_unit_directions(self.compute_elevations_deg()[:, None], azimuths_deg)
+        """Compute (3, rows, columns) unit directions in the LiDAR frame."""
+        elevations_deg = self.compute_elevations_deg()
+        column_shares = (np.arange(self.columns) + 0.5) / self.columns - 0.5
+        offsets_deg = np.zeros(len(elevations_deg)) if self.azimuth_offsets_deg is None else self.azimuth_offsets_deg
+        azimuths_deg = np.add.outer(offsets_deg, self.horizontal_fov_deg * column_shares)
+        return compute_unit_directions(elevations_deg[:, None], azimuths_deg)
 
 
 class LidarModel(ScanPattern, BuiltInDocument):
-    """What is known of a LiDAR on the market: the scan pattern that a sensor starts from.
+    """LiDAR on the market: scan pattern and defaults that a `Lidar` starts from.
 
     Args:
-        name: What a sensor's `model` calls it.
-        description: What it is, and where its numbers come from.
+        name: Name that `model` of a sensor refers to.
+        description: Product and source of the numbers.
 
     Example:
-        >>> len(LidarModel.load("velodyne_vlp16").rows_deg())
+        >>> len(LidarModel.load("velodyne_vlp16").compute_elevations_deg())
         16
     """
 
@@ -156,35 +155,40 @@ class LidarModel(ScanPattern, BuiltInDocument):
     description: str = ""
 
     def complete_keys(self, sensor_keys: dict[str, Any]) -> dict[str, Any]:
-        """The keys of a sensor, and those of the model that it does not give.
+        """Complete the keys of a sensor with those of the model.
 
         Args:
-            sensor_keys: The sensor's keys. One with evenly spaced rows takes no table from the model; one with a table of its
-                own takes neither spacing nor offsets.
+            sensor_keys: Keys of the sensor, which take precedence. A sensor with evenly spaced rows takes no row table
+                from the model; a sensor with its own elevations takes neither spacing nor row table.
+
+        Returns:
+            Keys of the sensor and of the model.
         """
-        pattern = self.model_dump(exclude={"name", "description"}, exclude_unset=True)
-        left_out: tuple[str, ...] = ()
-        if any(sensor_keys.get(key) is not None for key in SPACED_ROWS):
-            left_out = ROW_TABLE
+        spacing_keys = {"channels", "vertical_fov_deg"}
+        table_keys = {"elevations_deg", "azimuth_offsets_deg", "range_factors"}
+        model_keys = self.model_dump(exclude={"name", "description"}, exclude_unset=True)
+        excluded_keys: set[str] = set()
+        if any(sensor_keys.get(key) is not None for key in spacing_keys):
+            excluded_keys = table_keys
         elif sensor_keys.get("elevations_deg") is not None:
-            left_out = SPACED_ROWS + ROW_TABLE
-        return {key: value for key, value in pattern.items() if key not in left_out} | sensor_keys
+            excluded_keys = spacing_keys | table_keys
+        return {key: value for key, value in model_keys.items() if key not in excluded_keys} | sensor_keys
 
 
 class Lidar(ScanPattern):
-    """A scanning LiDAR at its place on the vehicle. Its frame is x forward, y left, z up.
+    """Scanning LiDAR at its mounting pose on the vehicle. The sensor frame is x forward, y left, z up.
 
     Args:
-        name: What maps and messages call it.
-        mount: `vehicle_T_lidar`.
-        model: Name of a built-in `LidarModel`, or path of a YAML file. It stands for every key of the scan pattern that
-            is not given here.
+        name: Name in maps and messages.
+        mount: Extrinsics `vehicle_T_lidar`.
+        model: Name of a built-in `LidarModel` or path of a YAML file; it supplies all keys of the scan pattern that are
+            not given here.
 
     Example:
         >>> lidar = Lidar(
         ...     name="a", channels=3, vertical_fov_deg=(-10, 10), columns=360, horizontal_fov_deg=360, max_range_m=99
         ... )
-        >>> lidar.directions().shape
+        >>> lidar.compute_directions().shape
         (3, 3, 360)
         >>> Lidar.model_validate({"name": "b", "model": "velodyne_vlp16", "max_range_m": 50}).columns
         1800
@@ -197,7 +201,7 @@ class Lidar(ScanPattern):
 
     @model_validator(mode="before")
     @classmethod
-    def _complete_from_model(cls, content: Any, info: ValidationInfo) -> Any:  # noqa: ANN401  (what stood in the file)
+    def _complete_from_model(cls, content: Any, info: ValidationInfo) -> Any:  # noqa: ANN401  (raw content of a file)
         if not isinstance(content, dict) or not isinstance(content.get("model"), str):
             return content
         try:

@@ -11,7 +11,7 @@ from torchcover.geometry.arrays import Bools, Float32, Float64, Int64
 from torchcover.recordings.recording import Recording
 from torchcover.recordings.vehicle_cloud import transform_to_vehicle
 from torchcover.simulation.lidar import Lidar
-from torchcover.simulation.returns import SURE, Material, compute_log_excess
+from torchcover.simulation.returns import MAX_RETURN_PROBABILITY, Material, compute_log_excess
 from torchcover.simulation.rig import Rig
 
 # Of a road that is straight ahead; beside it there are kerbs and grass. Its height is fitted to the inner part.
@@ -220,7 +220,7 @@ def fit_returns(rays: GroundRays, road_material: Material) -> ReturnFit:
     def surprise(logs: Float64) -> float:
         """Of logarithms of both."""
         excess = (at_one_metre + 2 * logs[0]) / np.hypot(2 * np.exp(logs[1]), road_material.log_reflectivity_std)
-        log_seen = np.log(SURE) + log_ndtr(excess)
+        log_seen = np.log(MAX_RETURN_PROBABILITY) + log_ndtr(excess)
         prior = ((logs[1] - np.log(USUAL_SPREAD)) / SPREAD_IS_SURE_TO) ** 2 / 2
         return float(prior - (returned * log_seen + (1 - returned) * np.log1p(-np.exp(log_seen))).sum())
 

@@ -1,9 +1,9 @@
-"""What comes back from a hit: materials, weather, and whether there is a return.
+"""Returns of LiDAR rays: materials, weather, and the probability that a hit returns.
 
-The range equation has the two numbers of a data sheet, and a material. A target wider than the beam sends back power in
-proportion to q = (rho / 0.1) cos(incidence)^k exp(-2 alpha R) (R10 / R)^2, scaled so that q = 1 is just enough at the
-range R10 that data sheets give for a reflectivity rho of 10 %. What is enough differs from pulse to pulse:
-P(return) = p0 Phi(ln q / (2 s)), where s spreads the range.
+The range equation uses two numbers of a data sheet and a material. A target wider than the beam returns power in
+proportion to q = (rho / 0.1) cos(incidence)^k exp(-2 alpha R) (R10 / R)^2, scaled so that q = 1 is the detection
+threshold at the range R10 that data sheets give for a reflectivity rho of 10 %. The threshold varies from pulse to
+pulse: P(return) = p0 Phi(ln q / (2 s)), with the standard deviation s of ln range.
 """
 
 from functools import cache
@@ -19,34 +19,33 @@ from torchcover.geometry.arrays import Float32
 from torchcover.simulation.builtin import list_builtin_names
 from torchcover.simulation.documents import BuiltInDocument
 
-# What nobody said the material of is scenery: walls for the most part.
-UNSAID = "brick"
-# Materials from files that were met so far, in this process, and how many there may be for numbers of one byte.
-_FROM_FILES: list["Material"] = []
+# Materials from user files that this process has loaded; their indices follow those of the built-in materials.
+_USER_MATERIALS: list["Material"] = []
 _LOCK = Lock()
-MOST = 255
-# A body has its own tone, the same at every time and for every rig: that of its number among so many.
-TONES = np.append(np.random.default_rng(905).standard_normal(4095), 0.0).astype(np.float32)
+# Brightness offset of a body relative to its material, in standard deviations, indexed by body index modulo 4096. It is
+# the same in all frames and for all rigs. The last entry serves index -1 (no body).
+BRIGHTNESS_OFFSETS = np.append(np.random.default_rng(905).standard_normal(4095), 0.0).astype(np.float32)
+# P(return) of the strongest returns: 98 to 99 % of near road in scans of VLP-32C, HDL-32E and HDL-64E.
+MAX_RETURN_PROBABILITY = 0.985
 
 
-def _reflecting(given: Any) -> Any:  # noqa: ANN401  (whatever stood in the file)
-    if given != "retroreflective" and not (type(given) in (int, float) and 0.0 <= given <= 1.0):
-        raise ValueError(f"a share of light from 0 to 1, or `retroreflective`, is needed; got {given!r:.60}")
-    return given
+def _check_reflectivity(value: Any) -> Any:  # noqa: ANN401  (raw content of a file)
+    if value != "retroreflective" and not (type(value) in (int, float) and 0.0 <= value <= 1.0):
+        raise ValueError(f"a share of light from 0 to 1, or `retroreflective`, is needed; got {value!r:.60}")
+    return value
 
 
 class Material(BuiltInDocument):
-    """A surface, as light of 905 nm meets it.
+    """Surface with its optical properties at 905 nm.
 
     Args:
-        name: What a body's `material` calls it.
-        description: What it is, and where its numbers come from.
-        reflectivity: Share of light that a white, rough surface would return, 0 to 1: the median. `retroreflective`:
-            it sends light back to where it came from, and always returns.
-        incidence_exponent: k; what returns falls as the cosine of the incidence to the power of k. 1 is Lambert's law.
+        name: Name that `material` of a body refers to.
+        description: Surface and source of the numbers.
+        reflectivity: Median share of light that the surface reflects, relative to a white Lambertian surface, 0 to 1;
+            `retroreflective` for a surface that always returns light to its source.
+        incidence_exponent: Exponent k of the cosine of the incidence angle; 1 is Lambert's law.
         log_reflectivity_std: Standard deviation of ln reflectivity.
-        varies_by: Whether that is between places, drawn for each ray, or between bodies, so that a dark one is dark all
-            over.
+        varies_by: `point` samples the reflectivity for each ray, `body` once for each body.
 
     Example:
         >>> Material.load("road").incidence_exponent
@@ -57,19 +56,26 @@ class Material(BuiltInDocument):
 
     name: str
     description: str = ""
-    reflectivity: Annotated[float | Literal["retroreflective"], BeforeValidator(_reflecting)]
+    reflectivity: Annotated[float | Literal["retroreflective"], BeforeValidator(_check_reflectivity)]
     incidence_exponent: NonNegativeFloat = 1.0
     log_reflectivity_std: NonNegativeFloat = 0.0
-    varies_by: Literal["place", "body"] = "place"
+    varies_by: Literal["point", "body"] = "point"
 
     @property
     def numeric_reflectivity(self) -> float:
-        """The reflectivity as a number: infinite for a retroreflector."""
+        """Reflectivity as a number; infinite for a retroreflector."""
         return np.inf if self.reflectivity == "retroreflective" else float(self.reflectivity)
 
 
 class MaterialTable(NamedTuple):
-    """What all materials are, by number: `reflectivity`, `incidence_exponent`, and `spread` of ln reflectivity by what varies."""
+    """Properties of all M materials, indexed by material index.
+
+    Args:
+        reflectivity: (M,) median reflectivity.
+        incidence_exponent: (M,) exponent of the cosine of the incidence angle.
+        point_log_std: (M,) standard deviation of ln reflectivity between points; 0 if it varies by body.
+        body_log_std: (M,) standard deviation of ln reflectivity between bodies; 0 if it varies by point.
+    """
 
     reflectivity: Float32
     incidence_exponent: Float32
@@ -78,52 +84,61 @@ class MaterialTable(NamedTuple):
 
 
 def get_material_index(material_name: str) -> int:
-    """The number of a material by name or YAML file, which meshes have in this process; 0 is where none was said.
+    """Look up the index of a material, which is valid in this process; 0 stands for an unspecified material.
 
-    FileNotFoundError: there is none; the message lists those that there are. ValueError: a file that is not valid, or
-    more materials than there are numbers.
+    Args:
+        material_name: Name of a built-in material or path of a YAML file.
+
+    Raises:
+        FileNotFoundError: No such material; the message lists the built-in ones.
+        ValueError: The file is not valid, or there are more materials than indices of one byte.
     """
-    known = _builtin_numbers()
-    if material_name in known:
-        return known[material_name]
-    own = Material.load(material_name)
+    builtin_indices = _index_builtin_materials()
+    if material_name in builtin_indices:
+        return builtin_indices[material_name]
+    material = Material.load(material_name)
+    max_materials = 255
     with _LOCK:
-        if own not in _FROM_FILES:
-            if len(known) + len(_FROM_FILES) == MOST:
-                raise ValueError(f"{material_name}: {MOST} materials are too many already")
-            _FROM_FILES.append(own)
+        if material not in _USER_MATERIALS:
+            if len(builtin_indices) + len(_USER_MATERIALS) == max_materials:
+                raise ValueError(f"{material_name}: at most {max_materials} materials are possible; use fewer")
+            _USER_MATERIALS.append(material)
             load_materials.cache_clear()
-        return 1 + len(known) + _FROM_FILES.index(own)
+        return 1 + len(builtin_indices) + _USER_MATERIALS.index(material)
 
 
 @cache
-def _builtin_numbers() -> dict[str, int]:
-    return {name: number for number, name in enumerate(list_builtin_names("materials"), 1)}
+def _index_builtin_materials() -> dict[str, int]:
+    return {name: index for index, name in enumerate(list_builtin_names("materials"), 1)}
 
 
 @cache
 def load_materials() -> MaterialTable:
-    """All materials by their numbers."""
-    each = [Material.load(name) for name in (UNSAID, *list_builtin_names("materials"))] + _FROM_FILES
-    of_body = [one.log_reflectivity_std if one.varies_by == "body" else 0.0 for one in each]
-    of_place = [one.log_reflectivity_std - spread for one, spread in zip(each, of_body, strict=True)]
-    columns = ([one.numeric_reflectivity for one in each], [one.incidence_exponent for one in each], of_place, of_body)
-    return MaterialTable._make(np.array(column, dtype=np.float32) for column in columns)
+    """Load the properties of all materials; an unspecified material (index 0) is brick, as most walls."""
+    materials = [Material.load(name) for name in ("brick", *list_builtin_names("materials"))] + _USER_MATERIALS
+    log_std = np.array([material.log_reflectivity_std for material in materials])
+    varies_by_body = np.array([material.varies_by == "body" for material in materials])
+    return MaterialTable(
+        reflectivity=np.array([material.numeric_reflectivity for material in materials], dtype=np.float32),
+        incidence_exponent=np.array([material.incidence_exponent for material in materials], dtype=np.float32),
+        point_log_std=np.where(varies_by_body, 0.0, log_std).astype(np.float32),
+        body_log_std=np.where(varies_by_body, log_std, 0.0).astype(np.float32),
+    )
 
 
 def compute_brightness_offsets(body_indices: NDArray[np.integer]) -> Float32:
-    """(N,) by how many spreads each body is brighter than its material, by its number; 0 for what is no body, -1."""
-    return np.asarray(TONES[body_indices % len(TONES)])
+    """Compute how much brighter bodies are than the median of their material.
+
+    Args:
+        body_indices: (N,) body of each hit; -1 for no body.
+
+    Returns:
+        (N,) offsets in standard deviations of ln reflectivity; 0 for no body.
+    """
+    return np.asarray(BRIGHTNESS_OFFSETS[body_indices % len(BRIGHTNESS_OFFSETS)])
 
 
 Floats = NDArray[np.floating]
-
-# Of the strongest returns as many come back: 98 to 99 % of near road in sweeps of VLP-32C, HDL-32E and HDL-64E.
-SURE = 0.985
-# Contrast of 5 % (Koschmieder 1924, and the meteorological optical range since): visibility = ln(20) / alpha.
-LN_20 = float(np.log(20.0))
-# No face is met at a smaller cosine: float32 leaves open what it would be.
-LEAST_COSINE = 1e-4
 
 
 def compute_log_excess(
@@ -134,49 +149,71 @@ def compute_log_excess(
     range_at_10_percent_m: float | Floats,
     extinction_per_m: float = 0.0,
 ) -> Floats:
-    """(N,) ln q of N hits, above 0 where what comes back is more than enough.
+    """Compute ln q of N hits: the logarithm of the returned power relative to the detection threshold.
 
-    In the type of the ranges: logarithms of float32 are good to 1e-6. The reflectivity is from 0 to 1, infinite for a
-    retroreflector, the exponent k of the cosine of the incidence 1 for Lambert's law. At the range that is given, a
-    reflectivity of 10 % met head-on is just enough; the air's extinction is alpha, one way.
+    Args:
+        range_m: (N,) range; its dtype is that of the result (logarithms of float32 have errors of 1e-6).
+        cos_incidence: (N,) cosine of the incidence angle.
+        reflectivity: (N,) reflectivity from 0 to 1; infinite for a retroreflector.
+        incidence_exponent: (N,) exponent k of the cosine; 1 for Lambert's law.
+        range_at_10_percent_m: (N,) range at which 10 % reflectivity at normal incidence reaches the threshold.
+        extinction_per_m: One-way extinction coefficient alpha of the air.
+
+    Returns:
+        (N,) ln q; positive above the threshold, minus infinity for reflectivity 0.
     """
-    with np.errstate(divide="ignore"):  # of what reflects nothing: minus infinity
-        excess: Floats = np.log(np.asarray(reflectivity) / 0.1)
-    excess = excess + incidence_exponent * np.log(np.maximum(cos_incidence, LEAST_COSINE))
-    excess = excess + 2.0 * np.log(range_at_10_percent_m / range_m)
-    return excess - 2.0 * extinction_per_m * range_m if extinction_per_m else excess
+    min_cosine = 1e-4  # smaller cosines are rounding errors of float32
+    with np.errstate(divide="ignore"):  # reflectivity 0 gives minus infinity
+        log_excess: Floats = np.log(np.asarray(reflectivity) / 0.1)
+    log_excess = log_excess + incidence_exponent * np.log(np.maximum(cos_incidence, min_cosine))
+    log_excess = log_excess + 2.0 * np.log(range_at_10_percent_m / range_m)
+    return log_excess - 2.0 * extinction_per_m * range_m if extinction_per_m else log_excess
 
 
 def compute_return_probability(
     log_excess: float | Floats, log_range_std: float | Floats, log_reflectivity_std: float | Floats = 0.0
 ) -> Floats:
-    """(N,) P(return) of hits with (N,) ln q, `log_range_std` the standard deviation of ln range of the sensor.
+    """Compute P(return) of hits.
 
-    `log_reflectivity_std` (N,) is that of ln reflectivity between places of the material.
+    Args:
+        log_excess: (N,) ln q of the hits, see `compute_log_excess`.
+        log_range_std: Standard deviation of ln range of the sensor.
+        log_reflectivity_std: (N,) standard deviation of ln reflectivity between points of the material.
+
+    Returns:
+        (N,) probabilities, at most 0.985.
     """
     sigmas = np.asarray(log_excess / np.hypot(2.0 * np.asarray(log_range_std), log_reflectivity_std))
-    return np.asarray(SURE * torch.special.ndtr(torch.from_numpy(sigmas)).numpy())
+    return np.asarray(MAX_RETURN_PROBABILITY * torch.special.ndtr(torch.from_numpy(sigmas)).numpy())
 
 
 def compute_extinction_per_m(visibility_m: float | None, rain_mm_h: float = 0.0) -> float:
-    """Extinction of light of 905 nm in air, one way: of fog by Koschmieder's law, if there is any, and of rain.
+    """Compute the one-way extinction coefficient of air at 905 nm.
 
-    Rain: 1.076 R^0.67 dB/km, R in mm/h (Carbonneau & Wisely 1998, Proc. SPIE 3232).
+    Fog: Koschmieder's law (1924) with a contrast of 5 %, alpha = ln(20) / visibility. Rain: 1.076 R^0.67 dB/km with R
+    in mm/h (Carbonneau & Wisely 1998, Proc. SPIE 3232).
+
+    Args:
+        visibility_m: Meteorological optical range; None for no fog.
+        rain_mm_h: Rain rate in mm/h.
+
+    Returns:
+        Extinction coefficient in 1/m.
     """
     decibels_per_km = 1.076 * rain_mm_h**0.67
-    of_rain = decibels_per_km * np.log(10.0) / 10.0 / 1e3
-    return float(of_rain + (0.0 if visibility_m is None else LN_20 / visibility_m))
+    rain_per_m = decibels_per_km * np.log(10.0) / 10.0 / 1e3
+    return float(rain_per_m + (0.0 if visibility_m is None else float(np.log(20.0)) / visibility_m))
 
 
 class Weather(BuiltInDocument):
-    """What the air and the road are like.
+    """State of air and road.
 
     Args:
-        name: What tables call it.
-        description: What it is, and where its numbers come from.
-        visibility_m: How far one sees in fog: the meteorological optical range, 5 % of contrast. None if it is clear.
-        rain_mm_h: Rate of the rain.
-        road: A wet one mirrors light ahead, as the material `wet_road`.
+        name: Name in tables.
+        description: Weather and source of the numbers.
+        visibility_m: Meteorological optical range in fog (5 % contrast); None for clear air.
+        rain_mm_h: Rain rate in mm/h.
+        road: A wet road reflects light forwards, see the material `wet_road`.
 
     Example:
         >>> Weather.load("fog_100m").extinction_per_m > Weather.load("rain_50mm_h").extinction_per_m
@@ -193,7 +230,7 @@ class Weather(BuiltInDocument):
 
     @property
     def extinction_per_m(self) -> float:
-        """Of light on its way through the air, one way."""
+        """One-way extinction coefficient of the air in 1/m."""
         return compute_extinction_per_m(self.visibility_m, self.rain_mm_h)
 
 
