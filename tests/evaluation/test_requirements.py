@@ -18,7 +18,7 @@ from torchcover.placement.selection_space import SelectionSpace
 from torchcover.placement.space import SearchSpace
 from torchcover.simulation import RegionsOfInterest, Rig, Scenario, documents, list_builtin_names
 from torchcover.simulation.bodies import Vehicle
-from torchcover.simulation.documents import format_validation_error
+from torchcover.simulation.document_errors import format_validation_error
 from torchcover.targets import SIDES, Raster, Target, measure_target_visibility
 
 CAR = BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5))

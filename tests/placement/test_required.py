@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from tests.placement.worlds import EGO, LOT, held, lidar, rig
-from torchcover.evaluation.requirements_check import check
 from torchcover.evaluation.requirements import Requirements
+from torchcover.evaluation.requirements_check import check
 from torchcover.evaluation.target_visibility import build_flat_ground
 from torchcover.placement import Objective, PlacementSearch, SearchPlan, SearchSpace, run_search
 from torchcover.targets import Target, measure_visibility_at_positions

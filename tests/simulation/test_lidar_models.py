@@ -140,7 +140,7 @@ def test_a_model_can_be_a_file_beside_the_rig(tmp_path):
         ("model: hesai_pandar64, channels: 8", r"sensors\.0: the rows are missing"),
         ("model: hesai_pandar64, azimuth_offsets_deg: [1]", "one for each of the 64 rows is needed; got 1"),
         ("model: velodyne_vlp16, max_range_m: 0.2", r"min_range_m \(0\.4\) must be below"),
-        ("model: velodyne_vlp16, colums: 9", r"sensors\.0\.colums: Extra inputs"),
+        ("model: velodyne_vlp16, colums: 9", r"sensors\.0\.colums: unknown key"),
         ("model: velodyne_vlp16, dropout: 1.1", r"dropout: .*less than or equal to 1 \(got 1\.1\)"),
         ("model: velodyne_vlp16, dropout: -0.1", r"dropout: .*greater than or equal to 0"),
         ("model: velodyne_vlp16, range_noise_m: -1", r"range_noise_m: .*greater than or equal to 0"),

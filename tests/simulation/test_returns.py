@@ -6,8 +6,13 @@ import yaml
 from pydantic import ValidationError
 
 from torchcover.simulation import Lidar, Material, PaperReference, Rig, Scenario, Simulator, list_builtin_names
-from torchcover.simulation.documents import format_validation_error
-from torchcover.simulation.returns import MAX_RETURN_PROBABILITY, compute_extinction_per_m, compute_log_excess, compute_return_probability
+from torchcover.simulation.document_errors import format_validation_error
+from torchcover.simulation.returns import (
+    MAX_RETURN_PROBABILITY,
+    compute_extinction_per_m,
+    compute_log_excess,
+    compute_return_probability,
+)
 
 KEYS = {
     "name": "a",
@@ -27,7 +32,9 @@ def test_every_other_ray_returns_from_where_the_data_sheet_says(range_at_10_perc
     excess = compute_log_excess(range_m, 1.0, reflectivity, 1.0, range_at_10_percent_m)
     assert compute_return_probability(excess, 0.3) == pytest.approx(MAX_RETURN_PROBABILITY / 2, abs=1e-15)
     one_spread_nearer = compute_log_excess(range_m * np.exp(-0.3), 1.0, reflectivity, 1.0, range_at_10_percent_m)
-    assert compute_return_probability(one_spread_nearer, 0.3) / MAX_RETURN_PROBABILITY == pytest.approx(0.8413447460685429)
+    assert compute_return_probability(one_spread_nearer, 0.3) / MAX_RETURN_PROBABILITY == pytest.approx(
+        0.8413447460685429
+    )
 
 
 def test_lambert_on_a_road_falls_with_the_cube_of_the_range():

@@ -34,7 +34,9 @@ def exact_log_excess():
 def exact_probability():
     with mpmath.workdps(60):
         width = 2 * mpmath.mpf(SPREAD)
-        return np.array([float(mpmath.mpf(MAX_RETURN_PROBABILITY) * mpmath.ncdf(excess / width)) for excess in exact_log_excess()])
+        return np.array(
+            [float(mpmath.mpf(MAX_RETURN_PROBABILITY) * mpmath.ncdf(excess / width)) for excess in exact_log_excess()]
+        )
 
 
 def our_excess():

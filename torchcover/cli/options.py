@@ -200,7 +200,7 @@ def combine_regions(regions_file: Path | None, regions: Sequence[str] | None) ->
     from pydantic import ValidationError
 
     from torchcover.simulation import RegionsOfInterest
-    from torchcover.simulation.documents import format_validation_error
+    from torchcover.simulation.document_errors import format_validation_error
 
     content = {} if regions_file is None else RegionsOfInterest.load(regions_file).model_dump(exclude_unset=True)
     if regions:

@@ -19,7 +19,8 @@ from pydantic import (
 )
 
 from torchcover.simulation.bodies import Shape, Vehicle, VehicleShape
-from torchcover.simulation.documents import BuiltInDocument, Document, build_name_validator, format_validation_error
+from torchcover.simulation.document_errors import format_validation_error
+from torchcover.simulation.documents import BuiltInDocument, Document, build_name_validator
 from torchcover.simulation.returns import CLEAR, Weather
 
 # Of a family: ten times what anybody would wait for.

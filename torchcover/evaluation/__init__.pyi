@@ -1,5 +1,3 @@
-from .requirements_check import CheckResult as CheckResult
-from .requirements_check import check as check
 from .checkpoint import Checkpoint as Checkpoint
 from .encounter_evaluation import evaluate_encounters as evaluate_encounters
 from .encounter_evaluation import evaluate_recorded_encounters as evaluate_recorded_encounters
@@ -23,6 +21,8 @@ from .ranks import join_ranks as join_ranks
 from .reporting import Report as Report
 from .reporting import report as report
 from .requirements import Requirements as Requirements
+from .requirements_check import CheckResult as CheckResult
+from .requirements_check import check as check
 from .result import Result as Result
 from .result_page import Omission as Omission
 from .result_page import build_sensor_views as build_sensor_views

@@ -10,11 +10,11 @@ from typing import Any, Literal
 
 from torchcover.encounters import EncounterResults, EncounterSet
 from torchcover.estimation import MIN_BLOCKS
-from torchcover.evaluation.requirements_check import CheckResult, check
 from torchcover.evaluation.encounter_evaluation import build_encounters_page, evaluate_encounters
 from torchcover.evaluation.measurement import measure_coverage
 from torchcover.evaluation.progress import Progress, defer_signals
 from torchcover.evaluation.requirements import Requirements
+from torchcover.evaluation.requirements_check import CheckResult, check
 from torchcover.evaluation.result import Result
 from torchcover.evaluation.settings import DEFAULT_STEPS, FILES, Settings, parse_file_kinds
 from torchcover.evaluation.target_visibility import (

@@ -11,10 +11,10 @@ from pydantic import Field, NonNegativeFloat, model_validator
 from torchcover.coverage import Region
 from torchcover.coverage.grid import PAPER_HEIGHTS
 from torchcover.estimation import Estimate, Quantity
-from torchcover.evaluation.requirements_check import check
 from torchcover.evaluation.requirements import AnyRequirement, RegionRequirement, Requirements
-from torchcover.evaluation.verdicts import Verdict
+from torchcover.evaluation.requirements_check import check
 from torchcover.evaluation.target_visibility import build_flat_ground
+from torchcover.evaluation.verdicts import Verdict
 from torchcover.simulation import Document, Rig, Scenario
 from torchcover.simulation.regions_of_interest import RegionOfInterest
 

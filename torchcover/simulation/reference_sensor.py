@@ -1,6 +1,6 @@
-"""What a reference sensor is, what it finds at one step (vehicle, scene, random numbers), and that of the paper.
+"""Reference sensors: the protocol, the context of one frame, and the reference sensor of the paper.
 
-Another pattern is a class with the members of `ReferenceSensor` and a line in `kinds.py`.
+A new reference sensor is a class with the members of `ReferenceSensor` and an entry in `kinds.py`.
 """
 
 import math
@@ -19,23 +19,20 @@ from torchcover.simulation.rays import Tile, compute_unit_directions, split_into
 from torchcover.simulation.regions_of_interest import QueryPlan
 from torchcover.simulation.scene import SceneGeometry
 
-# From the ego's bounding box and the random numbers to a (4, 4) pose in the vehicle frame.
+# (bounding box of the ego vehicle, random numbers) -> (4, 4) pose in the vehicle frame.
 PoseSampler = Callable[[BoundingBox, np.random.Generator], Float64]
-
-# A place inside a body is drawn again, at most this often.
-MAX_DRAWS = 100
 
 
 @dataclass(frozen=True, eq=False)
 class ReferenceContext:
-    """One step, as the simulator offers it to a reference sensor.
+    """One frame as a reference sensor needs it.
 
     Args:
-        scene_geometry: The geometry of the world.
-        snapshot: It at the time of the step.
+        scene_geometry: Geometry of the scene.
+        snapshot: Scene at the time of the frame.
         rng: Source of all random numbers of the sensor.
-        frame_name: What messages call the step.
-        num_threads: On how many threads rays may be cast; no result depends on it.
+        frame_name: Name of the frame in messages.
+        num_threads: Threads that may cast rays; the result does not depend on it.
     """
 
     scene_geometry: SceneGeometry
@@ -44,43 +41,43 @@ class ReferenceContext:
     frame_name: str
     num_threads: int = 1
 
-    def sample_free_pose(self, sample_pose: PoseSampler) -> tuple[Float64, int]:
-        """Draw a pose until it lies inside no body.
+    def sample_free_pose(self, sample_pose: PoseSampler, max_attempts: int = 100) -> tuple[Float64, int]:
+        """Sample poses until one is neither inside a body nor below the ground.
 
         Args:
-            sample_pose: From the ego's bounding box and the random numbers to a (4, 4) pose in the vehicle frame.
+            sample_pose: Samples a (4, 4) pose in the vehicle frame.
+            max_attempts: Number of poses after which the search fails.
 
         Returns:
-            The pose, and how many were thrown away.
+            The pose, and the number of rejected poses.
 
         Raises:
-            ValueError: 100 poses in a row lie inside bodies or below the ground.
+            ValueError: All poses are inside bodies or below the ground.
         """
-        for redrawn in range(MAX_DRAWS):
+        for num_rejected in range(max_attempts):
             vehicle_T_reference = sample_pose(self.scene_geometry.ego_box, self.rng)
             if not self.snapshot.is_occupied(vehicle_T_reference[:3, 3]):
-                return vehicle_T_reference, redrawn
+                return vehicle_T_reference, num_rejected
         raise ValueError(
-            f"{self.frame_name}: {MAX_DRAWS} places beside and above the ego lie inside other bodies or below the ground; "
-            "does the ego stand on the ground, and do faces point outwards?"
+            f"{self.frame_name}: {max_attempts} positions next to and above the ego vehicle are inside other bodies or "
+            "below the ground; does the ego vehicle stand on the ground, and do faces point outwards?"
         )
 
 
 class ReferenceScan(NamedTuple):
-    """What a reference sensor saw at one step.
+    """Reference points of one frame.
 
     Args:
-        points: (M, 3) float32 in the vehicle frame, without those on the ego.
-        weights: (M,) float32, positive and finite: the visible square metres that each point stands for; None if all
-            count the same.
-        num_rays: How many rays were cast.
-        self_hits: How many of them the ego took.
-        num_body_casts: At how many pairs of a ray and a moving body; the other pairs could not meet.
-        num_resampled_poses: How often its place was drawn again, because it lay inside a body or below the ground.
-        sampled_point_counts: (objects,) int64 how many points were drawn on each of `World.objects`, be they seen or not; None from a
-            sensor that draws none.
-        heights_m: (M,) heights of the points above the local ground, from a sensor that has asked for them.
-        num_poses: From how many places it has looked.
+        points: (M, 3) float32 points in the vehicle frame, without points on the ego vehicle.
+        weights: (M,) float32 area weights in m², positive and finite; None if all points count the same.
+        num_rays: Number of cast rays.
+        self_hits: Number of rays that hit the ego vehicle.
+        num_body_casts: Number of tested pairs of a ray and a moving body; other pairs cannot hit.
+        num_resampled_poses: Number of poses that were rejected because they were inside a body or below the ground.
+        sampled_point_counts: (objects,) int64 number of points sampled on each of `Scene.objects`, visible or not; None
+            if the sensor samples none.
+        heights_m: (M,) heights above the local ground; None if the sensor does not compute them.
+        num_poses: Number of poses from which rays were cast.
     """
 
     points: Float32
@@ -95,102 +92,109 @@ class ReferenceScan(NamedTuple):
 
 
 class ReferenceSensor(Protocol):
-    """A sensor that no rig is measured to be better than: at every step it looks from other places at the ego.
+    """Best-case sensor that rigs are compared with: it observes the scene from new random poses in each frame.
 
-    A value: equal ones see the same, with random numbers of the generator that they are given and no others. It can be
-    pickled, for it travels to the workers of a DataLoader.
+    A reference sensor is a value: equal sensors with equal random generators give equal points. It uses no other random
+    numbers and can be pickled, since it is sent to DataLoader workers.
     """
 
     name: ClassVar[str]
-    """What it is registered as, and what `--reference` and `summary.json` call it."""
+    """Name in the registry, for `--reference` and in `summary.json`."""
     has_area_weights: ClassVar[bool]
-    """Whether its points have weights, the square metres that they stand for. The same in every scan."""
+    """True if all scans have area weights in m², False if none has."""
 
     @property
     def band_frame(self) -> BandFrame:
-        """What its height bands are over: "ground" if all of its scans have heights, "vehicle" if none has."""
+        """Frame of the height bands: "ground" if all scans have heights, "vehicle" if none has."""
 
     @classmethod
     def from_query_plan(cls, query_plan: QueryPlan, num_rays: int | None) -> Self:
-        """The sensor for a question.
+        """Create the sensor for a query plan.
 
         Args:
-            query_plan: Its areas, heights and what these are measured from.
-            num_rays: About how many rays it casts at a step; None for the number that it does best with.
+            query_plan: Areas, height bands and their frame.
+            num_rays: Approximate number of rays per frame; None for the default of the sensor.
 
         Raises:
-            ValueError: Areas or a number of rays that it cannot do with.
+            ValueError: The sensor cannot cover the areas, or the number of rays is too small.
         """
 
     @property
     def num_rays(self) -> int:
-        """About how many rays it casts at a step: asked before it is made to scan."""
+        """Approximate number of rays per frame, known before the first scan."""
 
     @property
     def shell_m(self) -> float:
-        """How far its places lie from the ego's bounding box in metres, at most."""
+        """Largest distance of the sensor positions from the bounding box of the ego vehicle."""
 
     @property
     def max_range_m(self) -> float:
-        """What is farther from its place, in metres, gives no point."""
+        """Largest distance of a point from the sensor position."""
 
     def scan(self, context: ReferenceContext) -> ReferenceScan:
-        """What it sees at one step.
+        """Observe the scene in one frame.
 
         Args:
-            context: The vehicle, the scene around it, and the random numbers.
+            context: Vehicle, scene and random numbers.
 
         Returns:
-            The points and what they count for; no point at all is an answer too.
+            Points and their weights; a scan may be empty.
 
         Raises:
-            ValueError: There is no place for it that is not inside a body.
+            ValueError: No position for the sensor outside of bodies was found.
         """
 
 
 def check_ranges(shell_m: float, max_range_m: float) -> None:
-    """Refuse a shell or a range that is not positive."""
+    """Check that the shell and the range are positive.
+
+    Args:
+        shell_m: Thickness of the shell around the ego vehicle.
+        max_range_m: Maximum range.
+
+    Raises:
+        ValueError: One of them is not positive.
+    """
     if not shell_m > 0:
-        raise ValueError(f"shell_m: a positive thickness in metres is needed; got {shell_m}")
+        raise ValueError(f"shell_m: a positive thickness in meters is needed; got {shell_m}")
     if not max_range_m > 0:
-        raise ValueError(f"max_range_m: a positive distance in metres is needed; got {max_range_m}")
+        raise ValueError(f"max_range_m: a positive distance in meters is needed; got {max_range_m}")
 
 
 def sample_position_in_shell(ego_box: BoundingBox, shell_m: float, rng: np.random.Generator) -> Float64:
-    """(3,) place in metres, uniform between the ego's bounding box and that box grown sideways and upwards.
+    """Sample a position uniformly between a bounding box and that box extended sideways and upwards.
 
     Args:
-        ego_box: Bounding box of the ego in the vehicle frame.
-        shell_m: How far it is grown.
+        ego_box: Bounding box of the ego vehicle in the vehicle frame.
+        shell_m: Length of the extension.
         rng: Source of the random numbers.
+
+    Returns:
+        (3,) position in meters.
     """
-    lower, upper = np.array(ego_box.lower_m), np.array(ego_box.upper_m)
-    outer_lower, outer_upper = lower - [shell_m, shell_m, 0.0], upper + shell_m
+    lower_m, upper_m = np.array(ego_box.lower_m), np.array(ego_box.upper_m)
+    outer_lower_m, outer_upper_m = lower_m - [shell_m, shell_m, 0.0], upper_m + shell_m
     while True:
-        position = rng.uniform(outer_lower, outer_upper)
-        if ((position < lower) | (position > upper)).any():
-            return position
-
-
-# Pitch and roll of the paper's sensor are uniform between minus this and this.
-MAX_TILT_DEG = 45.0
+        position_m = rng.uniform(outer_lower_m, outer_upper_m)
+        if ((position_m < lower_m) | (position_m > upper_m)).any():
+            return position_m
 
 
 @dataclass(frozen=True)
 class PaperReference:
-    """The paper's reference sensor: rays over the lower hemisphere, from a new pose at every step.
+    """Reference sensor of the paper: rays over the lower hemisphere, from one new pose per frame.
 
-    The position is uniform in the shell between the ego's bounding box and that box grown sideways and upwards, yaw
-    is uniform in +-180 degrees, pitch and roll in +-`max_tilt_deg`. Rows are evenly spaced over elevations 0 to -90
-    degrees, both ends included (Uecker & Zöllner 2024, section III).
+    The position is uniform in the shell between the bounding box of the ego vehicle and that box extended sideways and
+    upwards, yaw is uniform in +-180 degrees, pitch and roll in +-`max_tilt_deg`. Rows are evenly spaced over elevations
+    0 to -90 degrees, both ends included (Uecker & Zöllner 2024, section III).
 
     Args:
         rows: Number of elevations.
         columns: Number of azimuths over 360 degrees.
         shell_m: Thickness of the shell.
-        max_tilt_deg: Bound of pitch and roll.
-        max_range_m: Farther hits give no point. The default reaches every corner of the paper's regions.
-        keep_ego_points: Whether hits on the ego give points; the paper does not say.
+        max_tilt_deg: Largest absolute pitch and roll.
+        max_range_m: Farther hits give no point. The default reaches every corner of the regions of the paper.
+        keep_ego_points: True if hits on the ego vehicle give points; the paper does not specify it.
 
     Raises:
         ValueError: A number of rows or columns below 1, a shell without thickness, a tilt outside 0 to 90 degrees,
@@ -198,8 +202,8 @@ class PaperReference:
 
     Example:
         >>> sensor = PaperReference(rows=4, columns=8)
-        >>> ego = BoundingBox((-2.4, -1.0, 0.0), (2.4, 1.0, 1.6))
-        >>> sensor.vehicle_T_reference(ego, np.random.default_rng(0)).shape
+        >>> ego_box = BoundingBox((-2.4, -1.0, 0.0), (2.4, 1.0, 1.6))
+        >>> sensor.sample_pose(ego_box, np.random.default_rng(0)).shape
         (4, 4)
     """
 
@@ -210,7 +214,7 @@ class PaperReference:
     rows: int = 1024
     columns: int = 1024
     shell_m: float = 0.5
-    max_tilt_deg: float = MAX_TILT_DEG
+    max_tilt_deg: float = 45.0
     max_range_m: float = 250.0
     keep_ego_points: bool = False
 
@@ -223,7 +227,15 @@ class PaperReference:
 
     @classmethod
     def from_query_plan(cls, query_plan: QueryPlan, num_rays: int | None) -> Self:
-        """The paper's 1024 x 1024 rays, or a square of about as many; it looks everywhere, whatever is asked about."""
+        """Create the sensor; it observes all directions, so the query plan is ignored.
+
+        Args:
+            query_plan: Ignored.
+            num_rays: Approximate number of rays, rounded to a square; None for the 1024 x 1024 rays of the paper.
+
+        Raises:
+            ValueError: A number of rays below 1.
+        """
         if num_rays is None:
             return cls()
         if num_rays < 1:
@@ -233,15 +245,25 @@ class PaperReference:
 
     @property
     def num_rays(self) -> int:
-        """Rows times columns."""
+        """Number of rays: rows times columns."""
         return self.rows * self.columns
 
     def scan(self, context: ReferenceContext) -> ReferenceScan:
-        """What its rays hit at one step; see `ReferenceSensor.scan`."""
-        pose, redrawn = context.sample_free_pose(self.sample_pose)
+        """Cast the rays in one frame.
+
+        Args:
+            context: Vehicle, scene and random numbers.
+
+        Returns:
+            Hits of the rays, without weights.
+
+        Raises:
+            ValueError: No position for the sensor outside of bodies was found.
+        """
+        pose, num_rejected = context.sample_free_pose(self.sample_pose)
         scan = context.snapshot.scan(
             pose,
-            _tiles_of(self),
+            _get_tiles(self),
             max_range_m=self.max_range_m,
             keep_ego_points=self.keep_ego_points,
             num_threads=context.num_threads,
@@ -252,33 +274,32 @@ class PaperReference:
             num_rays=scan.num_rays,
             self_hits=scan.self_hits,
             num_body_casts=scan.num_body_casts,
-            num_resampled_poses=redrawn,
+            num_resampled_poses=num_rejected,
         )
 
     def compute_directions(self) -> Float64:
-        """(3, rows, columns) unit directions in the sensor's frame."""
-        elevation = np.linspace(0.0, -90.0, self.rows)
-        azimuth = 360.0 * np.arange(self.columns) / self.columns
-        return compute_unit_directions(elevation[:, None], azimuth[None, :])
+        """Compute (3, rows, columns) unit directions in the sensor frame."""
+        elevations_deg = np.linspace(0.0, -90.0, self.rows)
+        azimuths_deg = 360.0 * np.arange(self.columns) / self.columns
+        return compute_unit_directions(elevations_deg[:, None], azimuths_deg[None, :])
 
     def sample_pose(self, ego_box: BoundingBox, rng: np.random.Generator) -> Float64:
-        """Draw the pose of one step.
+        """Sample the pose of one frame.
 
         Args:
-            ego_box: Bounding box of the ego in the vehicle frame.
+            ego_box: Bounding box of the ego vehicle in the vehicle frame.
             rng: Source of the random numbers.
 
         Returns:
-            (4, 4) transform.
+            (4, 4) pose in the vehicle frame.
         """
-        yaw = rng.uniform(-180.0, 180.0)
-        pitch, roll = rng.uniform(-self.max_tilt_deg, self.max_tilt_deg, size=2)
-        return build_transform(
-            convert_euler_to_rotation(yaw, pitch, roll), sample_position_in_shell(ego_box, self.shell_m, rng)
-        )
+        yaw_deg = rng.uniform(-180.0, 180.0)
+        pitch_deg, roll_deg = rng.uniform(-self.max_tilt_deg, self.max_tilt_deg, size=2)
+        rotation = convert_euler_to_rotation(yaw_deg, pitch_deg, roll_deg)
+        return build_transform(rotation, sample_position_in_shell(ego_box, self.shell_m, rng))
 
 
-# Kept for the process, not with the sensor, which travels to DataLoader workers.
+# Cached per process, not in the sensor, which is pickled for DataLoader workers.
 @lru_cache(maxsize=2)
-def _tiles_of(sensor: PaperReference) -> tuple[Tile, ...]:
+def _get_tiles(sensor: PaperReference) -> tuple[Tile, ...]:
     return split_into_tiles(sensor.compute_directions())

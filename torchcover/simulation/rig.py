@@ -1,4 +1,4 @@
-"""A rig: the sensors of a vehicle, where they are mounted, and what carries them."""
+"""Sensor rigs: the sensors of one vehicle with their extrinsics, and the vehicle that carries them."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
@@ -20,33 +20,41 @@ from torchcover.simulation.sensor import Sensor
 from torchcover.simulation.shapes import Mesh, MeshFile
 
 
-def parse_sensor(content: Any, info: ValidationInfo) -> Sensor:  # noqa: ANN401  (whatever stood in the file, or a sensor)
-    """A sensor of the kind that its `type` names."""
+def parse_sensor(content: Any, info: ValidationInfo) -> Sensor:  # noqa: ANN401  (raw content of a file, or a sensor)
+    """Parse a sensor of the type that its key `type` names.
+
+    Args:
+        content: Keys of the sensor, or a sensor.
+        info: Context of the validation.
+
+    Raises:
+        ValueError: The type is unknown, or a key or value is wrong.
+    """
     kind = content.get("type", "lidar") if isinstance(content, dict) else getattr(content, "type", type(content))
     if not isinstance(kind, str) or kind not in SENSORS:
         raise ValueError(f"type: a sensor is a {' or a '.join(map(repr, SENSORS))}; got {kind!r}")
     return TypeAdapter(SENSORS[kind]).validate_python(content, context=info.context)
 
 
-def _read_mounted(content: Any, info: ValidationInfo) -> Sensor:  # noqa: ANN401
-    is_known = isinstance(content, dict) and str(content.get("type", "lidar")) in SENSORS
-    if is_known and not get_close_matches("mount", map(str, content)):
-        raise ValueError("mount: missing; metres from the ground under the vehicle's middle, as {x_m: 1.5, z_m: 1.7}")
+def _parse_mounted_sensor(content: Any, info: ValidationInfo) -> Sensor:  # noqa: ANN401
+    has_known_type = isinstance(content, dict) and str(content.get("type", "lidar")) in SENSORS
+    if has_known_type and not get_close_matches("mount", map(str, content)):
+        raise ValueError("mount: missing; meters from the ground under the vehicle's center, as {x_m: 1.5, z_m: 1.7}")
     return parse_sensor(content, info)
 
 
 class Rig(BuiltInDocument):
-    """The sensors of a vehicle.
+    """Sensor rig of a vehicle.
 
     Args:
-        name: What tables and maps call it.
-        description: What it is, and where its numbers come from.
-        vehicle: What carries it, a built-in vehicle or the YAML file of one, where neither the user nor the scenario
-            decides that.
-        weather: What it is measured in, in place of the scenario's.
-        bodies: What the rig carries in addition to its sensors, such as a roof box, in the vehicle frame. Its sensors
-            look around that; other rigs and the reference do not, so that rigs with and without it can be compared.
-        sensors: The sensors, each of a kind in `SENSORS`; their clouds are fused.
+        name: Name in tables and maps.
+        description: Rig and source of its numbers.
+        vehicle: Built-in vehicle or YAML file of the vehicle that carries the rig, unless the user or the scenario
+            chooses one.
+        weather: Weather of the measurement, in place of that in the scenario.
+        bodies: Bodies that the rig adds to the vehicle, such as a roof box, in the vehicle frame. They occlude only the
+            sensors of this rig, neither other rigs nor the reference, so that rigs with and without them are comparable.
+        sensors: Sensors, each of a type in `SENSORS`; their points are merged.
 
     Example:
         >>> [sensor.name for sensor in Rig.load("front_roof_128").sensors]
@@ -61,7 +69,7 @@ class Rig(BuiltInDocument):
     vehicle: NameOrFile | None = None
     weather: Weather | None = None
     bodies: tuple[Body, ...] = ()
-    sensors: tuple[Annotated[Sensor, PlainValidator(_read_mounted)], ...] = Field(min_length=1)
+    sensors: tuple[Annotated[Sensor, PlainValidator(_parse_mounted_sensor)], ...] = Field(min_length=1)
 
     @model_validator(mode="after")
     def _check_names(self) -> Self:
@@ -71,9 +79,12 @@ class Rig(BuiltInDocument):
         return self
 
     def save(self, path: str | Path) -> None:
-        """Write it to a YAML file from which `load` makes the same rig, wherever that is put.
+        """Write the rig to a YAML file from which `load` reads an equal rig, wherever the file is moved.
 
-        A LiDAR model from a file is written out, and so is the place of any other file.
+        A LiDAR model from a file is expanded to its keys; paths of other files become absolute.
+
+        Args:
+            path: YAML file to write.
 
         Raises:
             OSError: The file cannot be written.
@@ -86,29 +97,41 @@ class Rig(BuiltInDocument):
             True
         """
         keys = self.model_dump(mode="json", exclude_unset=True, exclude={"sensors"})
-        keys["sensors"] = [_written(sensor) for sensor in self.sensors]
-        write_atomically(Path(path), lambda aside: aside.write_text(to_yaml(keys), encoding="utf-8"))
+        keys["sensors"] = [_dump_sensor(sensor) for sensor in self.sensors]
+        text = to_yaml(keys)
+        write_atomically(Path(path), lambda temporary_path: temporary_path.write_text(text, encoding="utf-8"))
 
     def build_occluder_mesh(self, ego_mesh: Mesh) -> Mesh:
-        """All that hides something from its sensors on a vehicle: the body of that, and what the rig carries."""
-        return merge_meshes([ego_mesh, *(mesh for body in self.bodies for mesh in body.build_meshes())])
+        """Build the mesh that occludes the sensors of the rig: the ego vehicle and the bodies of the rig.
+
+        Args:
+            ego_mesh: Mesh of the ego vehicle in the vehicle frame.
+        """
+        meshes = [ego_mesh]
+        for body in self.bodies:
+            meshes += body.build_meshes()
+        return merge_meshes(meshes)
 
     @property
     def sensor_model(self) -> Literal["ideal", "real"]:
-        """`real` if what returns too little light to one of its LiDARs is no point; else every hit is one."""
-        return "real" if any(isinstance(one, Lidar) and one.range_at_10_percent_m for one in self.sensors) else "ideal"
+        """`real` if range-limited returns of at least one LiDAR are simulated; `ideal` if every hit returns."""
+        is_real = any(isinstance(sensor, Lidar) and sensor.range_at_10_percent_m for sensor in self.sensors)
+        return "real" if is_real else "ideal"
 
     def apply_sensor_model(self, sensor_model: Literal["ideal", "real"] | None) -> Self:
-        """The rig with ideal sensors, or as it is.
+        """Apply a sensor model.
 
         Args:
-            sensor_model: `ideal` takes the range at 10 % from every LiDAR.
+            sensor_model: `ideal` removes `range_at_10_percent_m` from each LiDAR; `real` and None keep it.
+
+        Returns:
+            Rig with that sensor model.
 
         Raises:
-            ValueError: `real` of a rig of which no range at 10 % is known.
+            ValueError: `real` for a rig without a LiDAR that has `range_at_10_percent_m`.
 
         Example:
-            >>> Rig.load("kitti").sensor_model, Rig.load("kitti").sensing("ideal").sensor_model
+            >>> Rig.load("kitti").sensor_model, Rig.load("kitti").apply_sensor_model("ideal").sensor_model
             ('real', 'ideal')
         """
         if sensor_model == "real" and self.sensor_model == "ideal":
@@ -118,38 +141,39 @@ class Rig(BuiltInDocument):
             )
         if sensor_model != "ideal":
             return self
-        sensors = [
-            one.model_copy(update={"range_at_10_percent_m": None}) if isinstance(one, Lidar) else one
-            for one in self.sensors
-        ]
+        sensors: list[Sensor] = []
+        for sensor in self.sensors:
+            is_lidar = isinstance(sensor, Lidar)
+            sensors.append(sensor.model_copy(update={"range_at_10_percent_m": None}) if is_lidar else sensor)
         return self.model_copy(update={"sensors": tuple(sensors)})
 
     def collect_content(self) -> dict[str, Any]:
-        """Its sensors; the vehicle is in the scenario that it is simulated in, if it is the one."""
+        """Collect all that influences a simulation; the vehicle belongs to the content of the scenario."""
         return {key: value for key, value in super().collect_content().items() if key != "vehicle"}
 
 
-def _written(sensor: Sensor) -> dict[str, Any]:
-    """The keys of a sensor, without those that its model stands for."""
-    assert isinstance(sensor, Document)  # as all sensors of a rig
+def _dump_sensor(sensor: Sensor) -> dict[str, Any]:
+    """Return the keys of a sensor without those that its built-in model supplies."""
+    assert isinstance(sensor, Document)  # all sensors of a rig are documents
     keys = sensor.model_dump(mode="json", exclude_unset=True)
-    keys = {key: keys[key] for key in ("type", "name") if key in keys} | {"mount": {}} | keys
-    if isinstance(sensor, Lidar) and sensor.model is not None:
-        if is_file_name(sensor.model):
-            return {key: value for key, value in keys.items() if key != "model"}
-        same = LidarModel.load(sensor.model).model_dump(mode="json", exclude={"name", "description"})
-        return {key: value for key, value in keys.items() if key not in same or same[key] != value}
-    return keys
+    leading_keys = {key: keys[key] for key in ("type", "name") if key in keys}
+    keys = leading_keys | {"mount": {}} | keys
+    if not isinstance(sensor, Lidar) or sensor.model is None:
+        return keys
+    if is_file_name(sensor.model):
+        return {key: value for key, value in keys.items() if key != "model"}
+    model_keys = LidarModel.load(sensor.model).model_dump(mode="json", exclude={"name", "description"})
+    return {key: value for key, value in keys.items() if key not in model_keys or model_keys[key] != value}
 
 
 @dataclass(frozen=True)
 class RoadsideParams:
-    """When a rig counts as one on a mast beside the road.
+    """Limits from which a rig counts as mounted on a mast at the roadside.
 
     Args:
-        min_height_m: Its highest sensor is at least so high, above the sensors of most cars and robots.
-        slenderness: That height is more than so many times the length and the width of its body, as of a mast;
-        above_body_m: or the sensor is so much higher than its body, as where the mast was left out.
+        min_height_m: Smallest height of the highest sensor, above the sensors of most cars and robots.
+        slenderness: Smallest ratio of that height to the length and the width of the body, as for a mast.
+        above_body_m: Alternatively, smallest height of the sensor above the body, as for a mast without a mesh.
     """
 
     min_height_m: float = 2.5
@@ -158,7 +182,12 @@ class RoadsideParams:
 
 
 def is_roadside(rigs: Iterable[Rig], ego_box: BoundingBox, params: RoadsideParams = RoadsideParams()) -> bool:
-    """Whether a rig is on a mast rather than on a vehicle, by the heights of its sensors and the size of its body.
+    """Return True if a rig is on a mast rather than on a vehicle, by sensor heights and the size of the body.
+
+    Args:
+        rigs: Rigs of one run.
+        ego_box: Bounding box of the body that carries them, in the vehicle frame.
+        params: Limits.
 
     Example:
         >>> car = BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5))
@@ -172,17 +201,21 @@ def is_roadside(rigs: Iterable[Rig], ego_box: BoundingBox, params: RoadsideParam
 
 
 def set_ego(scenario: Scenario, rigs: Mapping[str, Rig], vehicle: str | Path | None = None) -> Scenario:
-    """The scenario with the body of what carries the rigs: the first of these that is given.
+    """Choose the ego vehicle of a scenario.
 
-    `vehicle`; the shape of the scenario's own ego; the vehicle that the rigs name; an SUV.
+    The first of these that exists is taken: `vehicle`, the shape of the ego in the scenario, the vehicle that the rigs
+    name, an SUV.
 
     Args:
-        scenario: The scenario.
-        rigs: What is carried; those that name no vehicle go on any.
-        vehicle: A built-in vehicle, the YAML file of one, or a mesh file in metres.
+        scenario: Scenario.
+        rigs: Rigs by name; rigs without a vehicle fit any vehicle.
+        vehicle: Built-in vehicle, YAML file of a vehicle, or mesh file in meters.
+
+    Returns:
+        Scenario with the shape of the ego vehicle.
 
     Raises:
-        ValueError: The rigs name different vehicles, and nothing else decides; or a vehicle that cannot be used.
+        ValueError: The rigs name different vehicles and nothing else decides, or a vehicle cannot be used.
         FileNotFoundError: No such vehicle.
 
     Example:
@@ -192,28 +225,29 @@ def set_ego(scenario: Scenario, rigs: Mapping[str, Rig], vehicle: str | Path | N
         'van'
     """
     ego = scenario.ego or ActorDescription()
-    shape = ego.shape if vehicle is None else _found_body("vehicle", create_body_shape(vehicle))
-    return scenario.model_copy(update={"ego": ego.model_copy(update={"shape": shape or _of_rigs(rigs)})})
+    shape = ego.shape if vehicle is None else _check_files("vehicle", create_body_shape(vehicle))
+    ego_with_shape = ego.model_copy(update={"shape": shape or _find_vehicle_of_rigs(rigs)})
+    return scenario.model_copy(update={"ego": ego_with_shape})
 
 
-def _of_rigs(rigs: Mapping[str, Rig]) -> Shape:
-    named = {name: rig.vehicle for name, rig in rigs.items() if rig.vehicle is not None}
-    if len(set(named.values())) > 1:
-        told = ", ".join(f"{name} {vehicle}" for name, vehicle in named.items())
+def _find_vehicle_of_rigs(rigs: Mapping[str, Rig]) -> Shape:
+    vehicles = {name: rig.vehicle for name, rig in rigs.items() if rig.vehicle is not None}
+    if len(set(vehicles.values())) > 1:
+        listing = ", ".join(f"{name} {vehicle}" for name, vehicle in vehicles.items())
         raise ValueError(
-            f"the rigs name different vehicles ({told}), but all are compared in the same frames, which have one ego: "
+            f"the rigs name different vehicles ({listing}), but all are compared in the same frames, which have one ego: "
             "say which by --vehicle (in Python, vehicle=), and give a rig what its vehicle has in addition as `bodies`"
         )
-    if not named:
+    if not vehicles:
         return DEFAULT_EGO
-    name, vehicle = next(iter(named.items()))
-    return _found_body(f"rig {name!r}: vehicle", VehicleShape(type="vehicle", vehicle=vehicle))
+    name, vehicle = next(iter(vehicles.items()))
+    return _check_files(f"rig {name!r}: vehicle", VehicleShape(type="vehicle", vehicle=vehicle))
 
 
-def _found_body(owner: str, shape: VehicleShape | MeshFile) -> VehicleShape | MeshFile:
-    """The shape, once its file was found."""
+def _check_files(key: str, shape: VehicleShape | MeshFile) -> VehicleShape | MeshFile:
+    """Return the shape, or raise FileNotFoundError with the key if a file of it is missing."""
     try:
         shape.collect_content()
     except FileNotFoundError as error:
-        raise FileNotFoundError(f"{owner}: {error}") from error
+        raise FileNotFoundError(f"{key}: {error}") from error
     return shape

@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 from torchcover import __version__
 from torchcover.files import BadFileError, check_dtype_kind, guard_reader, parse_json, read_limit_gb, read_npz
 from torchcover.geometry.trajectory import Trajectory
-from torchcover.simulation.builtin import list_builtin_names
-from torchcover.simulation.documents import hash_builtin_documents
+from torchcover.simulation.builtin import hash_builtin_documents, list_builtin_names
 from torchcover.simulation.scenario import ActorDescription, Scenario
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.sumo.simulating import find_sumo_home

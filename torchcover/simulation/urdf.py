@@ -16,7 +16,7 @@ from torchcover.geometry import BoundingBox, build_transform, convert_quaternion
 from torchcover.geometry.arrays import Float64
 from torchcover.recordings.unsupported_formats import find_remedy
 from torchcover.simulation.bodies import merge_meshes
-from torchcover.simulation.documents import format_validation_error
+from torchcover.simulation.document_errors import format_validation_error
 from torchcover.simulation.gazebo_sensors import PlacedSensor, read_numbers, read_pose, read_sensors
 from torchcover.simulation.instant import is_enclosed
 from torchcover.simulation.raycaster import RayCaster

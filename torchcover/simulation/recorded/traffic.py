@@ -16,7 +16,8 @@ from torchcover.recordings.formats import read_objects
 from torchcover.recordings.formats.tracks import read_trajectory
 from torchcover.recordings.objects import Ego, RecordedObjects
 from torchcover.simulation.bodies import build_checked_mesh
-from torchcover.simulation.documents import Pose, RelativePath, hash_builtin_documents
+from torchcover.simulation.builtin import hash_builtin_documents
+from torchcover.simulation.documents import Pose, RelativePath
 from torchcover.simulation.recorded.bodies import (
     BodyLibrary,
     apply_ground_tilt,

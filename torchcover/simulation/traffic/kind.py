@@ -8,7 +8,8 @@ import numpy as np
 from pydantic import Field
 
 from torchcover.geometry.arrays import Float64
-from torchcover.simulation.documents import Document, hash_builtin_documents
+from torchcover.simulation.builtin import hash_builtin_documents
+from torchcover.simulation.documents import Document
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.traffic.fleet import Fleet, load_bodies
 from torchcover.simulation.traffic.scenery import Scenery
