@@ -67,6 +67,7 @@ class CorrectedRecording:
 
     @cached_property
     def _poses(self) -> Matrix | None:
+        """Corrected poses of all frames; None if any pose is missing."""
         poses = [self.recording.get_world_T_vehicle(index) for index in range(len(self.recording.frame_names))]
         if any(pose is None for pose in poses):
             return None

@@ -29,6 +29,8 @@ FileVersion = tuple[tuple[str, int, int], ...]  # path, size in bytes and modifi
 
 
 class _OpenBag(NamedTuple):
+    """Open readers of rosbags, one per ROS 1 file or one for a ROS 2 bag."""
+
     readers: list[Any]
     is_ros1: bool
 
@@ -184,6 +186,7 @@ def _parse_stamp_ns(raw: bytes, *, is_ros1: bool) -> int:
 
 
 def _open_bag(path: Path) -> _OpenBag:
+    """Open a bag, or get it from the cache if its files have not changed."""
     files = find_ros1_files(path) or (sorted(path.iterdir()) if path.is_dir() else [path])
     version = []
     for file in files:
@@ -195,6 +198,7 @@ def _open_bag(path: Path) -> _OpenBag:
 # Four bags stay open, so that a mixture of recordings does not read their indices again and again.
 @lru_cache(4)
 def _open_version(path: Path, _: FileVersion) -> _OpenBag:
+    """Open a bag; the second argument is only a key of the cache."""
     try:
         from rosbags import rosbag1, rosbag2
     except ImportError as error:
@@ -210,6 +214,7 @@ def _open_version(path: Path, _: FileVersion) -> _OpenBag:
 
 
 def _index_ros1_bag(reader: Any) -> TimesByTopic:  # noqa: ANN401  (rosbags has no types)
+    """Index log times by topic from the connection records."""
     times: dict[str, list[int]] = {}
     for connection in reader.connections:
         times.setdefault(connection.topic, []).extend(entry.time for entry in reader.indexes[connection.id])
@@ -217,6 +222,7 @@ def _index_ros1_bag(reader: Any) -> TimesByTopic:  # noqa: ANN401  (rosbags has 
 
 
 def _index_ros2_bag(reader: Any) -> TimesByTopic:  # noqa: ANN401
+    """Index log times by topic over all files of the bag."""
     parts: dict[str, list[NDArray[np.int64]]] = {}
     for storage in getattr(reader.storage, "storages", [reader.storage]):
         index_file: Callable[[Any], TimesByTopic] = _index_database if storage.path.suffix == ".db3" else _index_mcap
@@ -226,6 +232,7 @@ def _index_ros2_bag(reader: Any) -> TimesByTopic:  # noqa: ANN401
 
 
 def _index_database(storage: Any) -> TimesByTopic:  # noqa: ANN401
+    """Index log times by topic from an SQLite file."""
     topics = storage.dbconn.execute("SELECT id, name FROM topics").fetchall()
     rows = storage.dbconn.execute("SELECT topic_id, timestamp FROM messages").fetchall()
     table = np.array(rows, dtype=np.int64).reshape(-1, 2)
@@ -233,6 +240,7 @@ def _index_database(storage: Any) -> TimesByTopic:  # noqa: ANN401
 
 
 def _index_mcap(storage: Any) -> TimesByTopic:  # noqa: ANN401
+    """Index log times by topic from the message indices of an MCAP file."""
     topics = {connection.id: connection.topic for connection in storage.connections}
     parts: dict[str, list[NDArray[np.int64]]] = {}
     for chunk in storage.chunks:

@@ -100,6 +100,7 @@ class ObjectInterpolator:
     def _interpolate(
         self, states: Sequence[ObjectState], times_s: Sequence[float], time_s: float
     ) -> ObjectState | None:
+        """Interpolate one object; None before its first state, after its last one and in gaps."""
         tolerance_s = 1e-3  # rounding of times between tables of one data set
         after = bisect_left(times_s, time_s - tolerance_s)
         if after == len(states):
@@ -299,7 +300,7 @@ def find_vehicle_class(category: str) -> str | None:
         >>> find_vehicle_class("Car"), find_vehicle_class("walker.pedestrian.07"), find_vehicle_class("static.barrier")
         ('passenger', 'pedestrian', None)
     """
-    classes = load_road_user_classes()["usual"]
+    classes: dict[str, str] = load_road_user_classes()["usual"]
     for word in reversed(category.strip().lower().split(".")):
         if word in classes:
             return classes[word]
@@ -307,6 +308,7 @@ def find_vehicle_class(category: str) -> str | None:
 
 
 def _read_states(recording: Recording, times_s: Float64, world_T_vehicle: Matrix) -> Iterator[ObjectState]:
+    """Read the labels of all frames as states in the world frame."""
     has_labels = False
     for index, (frame_name, time_s) in enumerate(zip(recording.frame_names, times_s.tolist(), strict=True)):
         boxes = recording.read_boxes(index)

@@ -81,6 +81,7 @@ class RecordingSettings(BaseModel):
     @field_validator("time_offset_s")
     @classmethod
     def _check_time_offset(cls, time_offset_s: float) -> float:
+        """Check that the time offset is at most one second."""
         # The two nearest poses are extrapolated before the first and after the last, which a second allows.
         if abs(time_offset_s) > 1.0:
             raise ValueError(
@@ -132,6 +133,7 @@ def merge_recording_settings(recording: Path, settings: RecordingSettings | None
 
 
 def _read_settings(path: Path) -> dict[str, Any]:
+    """Read and validate `recording.yaml`."""
     from torchcover.files import parse_yaml, read_short_text
 
     content = parse_yaml(read_short_text(path))

@@ -138,6 +138,7 @@ def find_points_in_box(points_m: Points, box: BoundingBox) -> NDArray[np.intp]:
 
 
 def _check_range(max_coordinate_m: float, source: str) -> None:
+    """Check that coordinates are small enough for float32."""
     limit_m = 1e5  # float32 resolves 8 mm here; clouds in world coordinates lie far beyond and would lose digits
     if max_coordinate_m > limit_m:
         raise ValueError(

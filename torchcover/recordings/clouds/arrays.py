@@ -167,10 +167,12 @@ def _describe_unknown_layout(records: Float32) -> str | None:
 
 
 def _are_intensities(values: Float32) -> bool:
+    """Test whether all values lie in [0, 255]."""
     return bool(((values >= 0) & (values <= 255)).all())
 
 
 def _are_rings(values: Float32) -> bool:
+    """Test whether all values are integers in [0, 255]."""
     return bool(((values >= 0) & (values <= 255) & (values == np.round(values))).all())
 
 
@@ -290,17 +292,20 @@ def read_heights(path: Path, num_points: int) -> Float32 | None:
 
 
 def _extract_coordinates(points: Points) -> Points:
+    """Extract x, y and z; float16 becomes float32."""
     xyz = points[:, :3]
     return xyz.astype(np.float32) if xyz.dtype.itemsize < np.dtype(np.float32).itemsize else xyz
 
 
 def _require_array(name: str, names: Collection[str]) -> Collection[str]:
+    """Choose an array that has to exist."""
     if name not in names:
         raise ValueError(f"the arrays points and weights are needed; got {_format_names(names)}")
     return (name,)
 
 
 def _choose_array(path: Path, names: Collection[str]) -> Collection[str]:
+    """Choose the array of points: `points`, else the only array, else the only one of shape (N, 3)."""
     if "points" in names:
         return ("points",)
     if len(names) == 1:
@@ -318,14 +323,17 @@ def _choose_array(path: Path, names: Collection[str]) -> Collection[str]:
 
 
 def _format_names(names: Collection[str]) -> str:
+    """Format up to ten names for a message."""
     return ", ".join(sorted(names)[:10]) or "none"
 
 
 def _is_float(dtype: np.dtype[Any]) -> bool:
+    """Test for float16, float32 and float64 in any byte order."""
     return dtype.newbyteorder("=") in (np.float16, np.float32, np.float64)
 
 
 def _check_cloud_header(header: NpyHeader) -> None:
+    """Check that an array is floating point of shape (N, 3) or slightly wider."""
     max_columns = 16  # a transposed (3, N) cloud must not pass for 3 points with N columns
     shape, dtype = header
     if not _is_float(dtype):
@@ -335,6 +343,7 @@ def _check_cloud_header(header: NpyHeader) -> None:
 
 
 def _check_values_header(name: str, header: NpyHeader) -> None:
+    """Check that an array is floating point of shape (N,)."""
     shape, dtype = header
     if not _is_float(dtype) or len(shape) != 1:
         raise ValueError(f"{name}: shape (N,) of float16, float32 or float64 is needed; got {shape} of {dtype}")

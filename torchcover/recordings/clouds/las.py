@@ -25,6 +25,8 @@ REPROJECT = "reproject the file into a coordinate system in meters (pdal transla
 
 
 class _Unit(NamedTuple):
+    """Unit of length."""
+
     name: str
     meters: float
 
@@ -106,6 +108,7 @@ def _find_geo_key_units(keys: Mapping[int, int]) -> tuple[_Unit, _Unit | None] |
 
 
 def _find_epsg_unit(code: int) -> _Unit:
+    """Find a unit by its EPSG code; an unknown code raises a ValueError."""
     if code not in EPSG_UNITS:
         known = ", ".join(f"{known_code} ({name})" for known_code, (name, _) in EPSG_UNITS.items())
         raise ValueError(f"unit EPSG:{code} of its GeoKeys is unknown; known are {known}; {REPROJECT}")
@@ -150,6 +153,8 @@ def _list_units(text: str) -> Iterator[tuple[set[str], _Unit | None]]:
 
 
 class _Header(NamedTuple):
+    """Header fields that locate and scale the points."""
+
     first_byte: int
     record_bytes: int
     points: int
@@ -178,6 +183,7 @@ def read_las_scale(path: Path) -> NDArray[np.float64]:
 
 
 def _read_meters_per_unit(file: BinaryIO, header: _Header) -> NDArray[np.float64]:
+    """Read the (3,) meters per unit from the records before and after the points."""
     contents = _read_projection(file, *header.records, struct.Struct("<H16sHH32s"))
     contents |= _read_projection(file, *header.extended_records, struct.Struct("<H16sHQ32s"))
     return _choose_scale(contents)
@@ -234,6 +240,7 @@ def _to_meters(
 
 
 def _parse_header(data: bytes, size_bytes: int) -> _Header:
+    """Parse and check the header of a file of `size_bytes`."""
     if not data.startswith(b"LASF"):
         raise ValueError(f"not a LAS file: it starts with {data[:4]!r}, not with b'LASF'")
     if len(data) < HEADER_BYTES:

@@ -32,10 +32,12 @@ class _Header:
 
     @property
     def field_bytes(self) -> tuple[int, ...]:
+        """Bytes of each field in a record."""
         return tuple(size * count for size, count in zip(self.sizes, self.counts, strict=True))
 
     @property
     def record_bytes(self) -> int:
+        """Bytes of a record."""
         return sum(self.field_bytes)
 
 
@@ -64,6 +66,7 @@ def read_pcd(path: Path) -> Points:
 
 
 def _parse_header(data: bytes) -> tuple[_Header, bytes]:
+    """Parse and check the header; return it with the bytes that follow it."""
     entries, end = _read_entries(data)
     if "COLUMNS" in entries:  # early versions of the format
         entries.setdefault("FIELDS", entries["COLUMNS"])
@@ -117,6 +120,7 @@ def _read_entries(data: bytes) -> tuple[dict[str, list[str]], int]:
 
 
 def _parse_ascii(header: _Header, axes: Sequence[int], body: bytes) -> Points:
+    """Parse as many rows as the header claims."""
     rows = sum(1 for _ in read_lines(body))
     if rows != header.points:
         raise ValueError(f"the header claims {header.points} points; {rows} rows follow it")
@@ -137,6 +141,7 @@ def _warn_of_viewpoint(words: Sequence[str]) -> None:
 
 
 def _parse_integer(word: str, key: str) -> int:
+    """Parse a number without sign, decimal point or excessive length."""
     max_digits = 18  # fits into int64
     if not (word.isascii() and word.isdigit() and len(word) <= max_digits):
         raise ValueError(f"{key} of the PCD header has to be a whole number; got {word[:40]!r}")
@@ -144,6 +149,7 @@ def _parse_integer(word: str, key: str) -> int:
 
 
 def _parse_positive(words: Sequence[str], key: str) -> tuple[int, ...]:
+    """Parse several integers, none of them 0."""
     numbers = tuple(_parse_integer(word, key) for word in words)
     if 0 in numbers:
         raise ValueError(f"{key} of the PCD header has to be positive; got {' '.join(words)[:80]}")
@@ -151,6 +157,7 @@ def _parse_positive(words: Sequence[str], key: str) -> tuple[int, ...]:
 
 
 def _find_axis_fields(header: _Header) -> list[int]:
+    """Find the indices of the fields x, y and z, which have to be single floats."""
     missing = [axis for axis in AXES if axis not in header.fields]
     if missing:
         raise ValueError(f"no field {', '.join(missing)} among the fields {' '.join(header.fields)[:80]}")
@@ -168,6 +175,7 @@ def _find_axis_fields(header: _Header) -> list[int]:
 
 
 def _check_size(header: _Header, body: bytes) -> None:
+    """Check the size of binary data before memory is allocated."""
     max_lzf_ratio = 88  # an LZF back reference turns 3 bytes into at most 264
     claimed_bytes = header.points * header.record_bytes
     if header.encoding == "binary":

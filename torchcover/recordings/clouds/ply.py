@@ -77,6 +77,7 @@ def read_ply(path: Path) -> Points:
 
 
 def _parse_ascii(elements: list[_Element], before: list[_Element], vertex: _Element, body: bytes) -> Points:
+    """Parse the rows of vertices after those of the elements before them."""
     rows, claimed = sum(1 for _ in read_lines(body)), sum(element.rows for element in elements)
     _check_size(elements, claimed, rows, "rows")
     if rows > claimed:
@@ -90,6 +91,7 @@ def _parse_ascii(elements: list[_Element], before: list[_Element], vertex: _Elem
 
 
 def _parse_header(data: bytes) -> tuple[str, list[_Element], bytes]:
+    """Parse encoding and elements; return them with the bytes that follow the header."""
     if data[:5].split()[:1] != [b"ply"]:
         raise ValueError(f"not a PLY file: it starts with {data[:12]!r}, not with a line ply")
     encoding = ""
@@ -121,6 +123,7 @@ def _parse_header(data: bytes) -> tuple[str, list[_Element], bytes]:
 
 
 def _add_property(element: _Element, declaration: list[str]) -> None:
+    """Add a property line of the header to an element."""
     match declaration:
         case ["list", length_type, item_type, name] if length_type in TYPES and item_type in TYPES:
             element.types[name] = TYPES[length_type]
@@ -135,6 +138,7 @@ def _add_property(element: _Element, declaration: list[str]) -> None:
 
 
 def _check_vertex(vertex: _Element) -> None:
+    """Check that vertices have floating-point coordinates and no lists."""
     missing = [axis for axis in AXES if axis not in vertex.types]
     if missing:
         raise ValueError(f"the vertices have no {', '.join(missing)}; got {', '.join(vertex.types) or 'nothing'}")
@@ -146,6 +150,7 @@ def _check_vertex(vertex: _Element) -> None:
 
 
 def _check_size(elements: list[_Element], claimed: int, available: int, unit: str) -> None:
+    """Check that at least the claimed rows or bytes are available."""
     if claimed > available:
         counts = ", ".join(f"{element.rows} of {element.name}" for element in elements)
         raise ValueError(

@@ -99,6 +99,7 @@ def read_lines(data: bytes) -> Iterator[str]:
 
 
 def _iterate_lines(data: bytes) -> Iterator[str]:
+    """Iterate over decoded lines; a very long line or an invalid byte raises a ValueError."""
     max_chars = 1_000_000  # a split line takes up to 50 times its size before its columns are counted
     stream = io.TextIOWrapper(io.BytesIO(data), encoding="utf-8-sig")
     try:
@@ -113,6 +114,7 @@ def _iterate_lines(data: bytes) -> Iterator[str]:
 
 
 def _check_num_columns(rows: Iterable[str], num_columns: int, delimiter: str | None) -> Iterator[str]:
+    """Pass rows through and raise a ValueError at the first one with another number of columns."""
     for number, row in enumerate(rows, 1):
         count = row.count(delimiter) + 1 if delimiter else len(row.split())
         if count != num_columns:
@@ -121,10 +123,12 @@ def _check_num_columns(rows: Iterable[str], num_columns: int, delimiter: str | N
 
 
 def _split(line: str) -> list[str]:
+    """Split at commas if there are any, else at white space."""
     return line.split(",") if "," in line else line.split()
 
 
 def _is_numeric(words: Sequence[str]) -> bool:
+    """Test whether all words that are not blank are numbers."""
     try:
         for word in words:
             if word.strip():

@@ -80,6 +80,7 @@ def open_recording(
 
 
 def _open_with_settings(path: Path, settings: RecordingSettings) -> Recording:
+    """Open a recording in the format of its settings, or the first one that can read it."""
     if settings.format is not None and settings.format not in FORMATS:
         raise ValueError(f"format {settings.format!r}: no such format of recordings; there are {', '.join(FORMATS)}")
     manifest = _find_manifest(path)
@@ -115,6 +116,7 @@ def _suggest_subfolders(folder: Path) -> str:
 
 
 def _has_known_format(path: Path) -> bool:
+    """Test whether any format can read a path."""
     return any(recording_format.can_read(path) for recording_format in FORMATS.values())
 
 
@@ -178,6 +180,7 @@ def _is_csv(path: Path) -> bool:
 
 
 def _read_box_table(path: Path) -> RecordedObjects:
+    """Read a table of boxes, which has no ego vehicle."""
     return RecordedObjects(read_box_tracks(path))
 
 

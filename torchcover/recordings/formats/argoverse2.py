@@ -240,6 +240,7 @@ def _build_states(columns: Mapping[str, NDArray[Any]], origin_ns: int) -> list[O
 
 
 def _to_seconds(columns: Mapping[str, NDArray[Any]], origin_ns: int) -> Matrix:
+    """Convert time stamps to seconds after an origin."""
     return np.asarray((columns["timestamp_ns"].astype(np.int64) - origin_ns) * 1e-9, dtype=np.float64)
 
 
@@ -258,6 +259,7 @@ def build_poses(columns: Mapping[str, NDArray[Any]]) -> Matrix:
 
 
 def _build_camera(row: Mapping[str, Any], vehicle_T_camera: Matrix) -> Calibration:
+    """Build a Brown-Conrady camera from a row of intrinsics."""
     return Calibration(
         int(row["width_px"]),
         int(row["height_px"]),
@@ -273,6 +275,7 @@ def _build_camera(row: Mapping[str, Any], vehicle_T_camera: Matrix) -> Calibrati
 
 
 def _parse_time_ns(path: Path) -> int:
+    """Parse the time in the name of a sweep."""
     if not path.stem.isdecimal():
         raise ValueError(f"{path}: the name of a sweep is its time in nanoseconds")
     return int(path.stem)

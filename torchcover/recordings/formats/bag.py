@@ -25,9 +25,9 @@ from torchcover.recordings.recording import NO_RETURN_M
 
 # Storage of ROS 2 bags and the suffix of its files.
 SUFFIXES = {"sqlite3": ".db3", "mcap": ".mcap"}
-TF_MESSAGE = "tf2_msgs/msg/TFMessage"
+TF_TYPE = "tf2_msgs/msg/TFMessage"
 # Former names of message types.
-RENAMED_TYPES = {"tf/msg/tfMessage": TF_MESSAGE}
+RENAMED_TYPES = {"tf/msg/tfMessage": TF_TYPE}
 
 
 @dataclass(frozen=True)
@@ -118,9 +118,10 @@ class Bag:
         return self._read_stamps(topic, None)
 
     def _read_stamps(self, topic: str, times_ns: Int64 | None) -> Int64:
+        """Read the stamps of messages with some log times (None: all) and check their number."""
         with report_bad_file(self.path, f"a bag, in {topic}"):
-            stamps_ns = read_header_stamps(self.path, topic, None if times_ns is None else times_ns.tolist())
-            stamps_ns = stamps_ns["stamps_ns"]
+            requested_ns = None if times_ns is None else times_ns.tolist()
+            stamps_ns = read_header_stamps(self.path, topic, requested_ns)["stamps_ns"]
             expected = len(self.get_log_times_ns(topic) if times_ns is None else times_ns)
             if len(stamps_ns) != expected:
                 repair = find_repair_command(self.path)
@@ -189,7 +190,7 @@ def _get_deserializer(*, is_ros1: bool) -> Callable[[memoryview, str], Any]:
     types = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
     if is_ros1:
         # The standard definitions of ROS 1 lack this type.
-        types.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TF_MESSAGE))
+        types.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TF_TYPE))
     deserialize: Callable[[memoryview, str], Any] = types.deserialize_ros1 if is_ros1 else types.deserialize_cdr
     return deserialize
 
@@ -425,6 +426,7 @@ def _find_field(message: Any, names: Sequence[str]) -> Any:  # noqa: ANN401
 
 
 def _find_time_field(message: Any) -> Any:  # noqa: ANN401
+    """Find the field of point times under the names that drivers use."""
     return _find_field(message, ("t", "time", "timestamp", "time_stamp", "offset_time", "time_offset"))
 
 

@@ -18,19 +18,17 @@ from torchcover.files import guard_reader, parse_yaml, read_csv, read_short_text
 from torchcover.geometry import BoundingBox, build_transform, convert_euler_to_rotation, invert, transform_points
 from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.clouds import read_cloud
+from torchcover.recordings.formats.folder import BOX_FOLDER, POSES_FILE, REFERENCE
 from torchcover.recordings.formats.frame_files import check_same_names, find_frame_files, find_frame_rows
 from torchcover.recordings.recording import GROUND_CLEARANCE_M, RecordingBase, Scan, check_times
 
 LIDAR_TYPES = ("sensor.lidar.ray_cast", "sensor.lidar.ray_cast_semantic")
 DEPTH_TYPE = "sensor.camera.depth"
-REFERENCE = "reference"
 # Columns of tables of poses and boxes.
 POSE_COLUMNS = ("x", "y", "z", "roll", "pitch", "yaw")
 EXTENT_COLUMNS = ("extent_x", "extent_y", "extent_z")
 VELOCITY_COLUMNS = ("velocity_x", "velocity_y")
 SENSORS_FILES = ("sensors.json", "sensors.yaml")
-POSES_FILE = "poses.csv"
-BOX_FOLDER = "boxes"
 
 
 class CarlaSensor(BaseModel):
@@ -70,6 +68,7 @@ class CarlaSensor(BaseModel):
 
     @model_validator(mode="after")
     def _check_camera(self) -> Self:
+        """Check that a depth camera has a size, a field of view and no distortion."""
         if self.type == DEPTH_TYPE and None in (self.width, self.height, self.fov):
             raise ValueError("a camera needs width (or image_size_x), height (or image_size_y) and fov, in degrees")
         # Values of the lens attributes at which CARLA does not distort images.
@@ -97,6 +96,8 @@ class CarlaSensor(BaseModel):
 
 
 class _Point(BaseModel):
+    """Coordinates in meters."""
+
     model_config = ConfigDict(allow_inf_nan=False)
 
     x: float
@@ -119,6 +120,7 @@ class CarlaVehicle(BaseModel):
 
     @model_validator(mode="after")
     def _check_rotation(self) -> Self:
+        """Check that the box is aligned with the axes of the actor."""
         if any(self.rotation.values()):
             raise ValueError(f"rotation: a box aligned with the vehicle's axes is needed; got {self.rotation}")
         return self
@@ -244,6 +246,7 @@ def to_right_handed(pose: list[float] | list[NDArray[np.float64]]) -> Matrix:
 
 
 def _format_errors(error: ValidationError) -> str:
+    """Format the errors of pydantic with their keys."""
     messages = []
     for detail in error.errors():
         key = ".".join(str(part) for part in detail["loc"])
@@ -395,9 +398,11 @@ class Carla(RecordingBase):
         return np.where(is_inside.all(axis=1, keepdims=True), points_m, moved_m)
 
     def _get_pose(self, number: int) -> Matrix | None:
+        """Get the vehicle pose of a file; None without `poses.csv`."""
         return None if self._poses is None else self._poses[number] @ invert(self._vehicle_T_actor)
 
     def _find_files(self, sensor: str) -> dict[str, Path]:
+        """Find the clouds or depth images of a sensor."""
         return find_frame_files(self.path / sensor, ignored_files=(POSES_FILE,), is_depth=sensor in self._cameras)
 
     def _warn_about_sectors(self, sensors: list[CarlaSensor]) -> None:
@@ -427,6 +432,7 @@ class Carla(RecordingBase):
 
 
 def _list_sensor_files(folder: Path) -> list[Path]:
+    """List the possible files of the sensor list, the preferred one first."""
     return [folder / name for name in SENSORS_FILES]
 
 

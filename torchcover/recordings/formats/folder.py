@@ -28,16 +28,22 @@ BOX_FOLDER = "boxes"
 
 
 class _StrictModel(BaseModel):
+    """Section of `frames.yaml` without unknown keys."""
+
     model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
 
 
 class _SensorEntry(_StrictModel):
+    """Entry of a sensor or rig."""
+
     vehicle_T_sensor: list[list[float]] | None = None
     flip_y: bool = False
     min_range_m: Annotated[float, Field(ge=0)] = 0.0
 
 
 class _ReferenceEntry(_SensorEntry):
+    """Entry of the reference."""
+
     area_weights: bool = False
 
 
@@ -45,11 +51,15 @@ Corner = Annotated[list[float], Field(min_length=3, max_length=3)]
 
 
 class _VehicleEntry(_StrictModel):
+    """Entry of the bounding box of the ego vehicle."""
+
     lower_m: Corner
     upper_m: Corner
 
 
 class _SettingsFile(_StrictModel):
+    """Top level of `frames.yaml`."""
+
     sensor: _SensorEntry | None = None
     sensors: dict[str, _SensorEntry] = Field(default_factory=dict)
     rigs: dict[str, _SensorEntry] = Field(default_factory=dict)
@@ -102,6 +112,7 @@ def read_folder_settings(path: Path) -> FolderSettings:
 
 @guard_reader("a file of poses")
 def _read_settings_file(path: Path) -> FolderSettings:
+    """Read an existing `frames.yaml`."""
     allowed = (
         "allowed are sensor, or sensors or rigs by name, and reference, each with a 4x4 vehicle_T_sensor, flip_y and "
         "min_range_m, for the reference also area_weights (true or false); and vehicle with lower_m and upper_m"
@@ -129,12 +140,14 @@ def _read_settings_file(path: Path) -> FolderSettings:
 
 
 def _build_cloud_settings(key: str, entry: _SensorEntry) -> CloudSettings:
+    """Convert an entry and check that its extrinsics are rigid."""
     pose = entry.vehicle_T_sensor
     matrix = None if pose is None else check_rigid(pose, f"{key}.vehicle_T_sensor")
     return CloudSettings(matrix, entry.flip_y, entry.min_range_m)
 
 
 def _build_ego_box(vehicle: _VehicleEntry) -> BoundingBox:
+    """Convert the entry of the vehicle and check that its corners are ordered."""
     (x0, y0, z0), (x1, y1, z1) = vehicle.lower_m, vehicle.upper_m
     try:
         return BoundingBox((x0, y0, z0), (x1, y1, z1))
@@ -262,10 +275,12 @@ class FolderRecording(RecordingBase):
         return read_boxes(self.path / BOX_FOLDER / f"{self.frame_names[index]}.csv") if self._has_boxes else None
 
     def _read_poses(self, folder: Path, *, has_times: bool) -> PoseTable | None:
+        """Read the table of poses in a folder; None if there is none."""
         path = folder / POSES_FILE
         return PoseTable(path, self.frame_names, has_times=has_times) if path.exists() else None
 
     def _check_settings(self) -> None:
+        """Check that entries have folders, and that extrinsics are given once."""
         file = self.path / SETTINGS_FILE
         for folder, settings in self._settings.cloud_settings.items():
             key = folder.replace("/", ".")

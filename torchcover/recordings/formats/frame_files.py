@@ -130,6 +130,7 @@ def make_natural_sort_key(name: str) -> tuple[list[str | int], str]:
 
 
 def _parse_number(name: str) -> tuple[int, str]:
+    """Make a sort key of a frame number; the name breaks ties such as 7 and 007."""
     return int(name), name
 
 
@@ -178,6 +179,7 @@ class PoseTable:
         return build_transform(convert_quaternion_to_rotation(self._wxyz[index]), self._positions_m[index])
 
     def _check_norms(self, names: Sequence[str]) -> None:
+        """Check that all quaternions have norm 1."""
         norms = np.linalg.norm(self._wxyz, axis=1)
         bad = np.flatnonzero(~(np.abs(norms - 1) <= RIGID_TOLERANCE))
         if len(bad):
@@ -240,6 +242,7 @@ def write_boxes(path: Path, boxes: Boxes) -> None:
 
 
 def _to_integers(name: str, values: NDArray[np.float64]) -> list[int]:
+    """Convert a column to integers; a fraction raises a ValueError."""
     if not np.array_equal(values, np.round(values)):
         raise ValueError(f"{name}: whole numbers are needed; got {values[values != np.round(values)][0]:g}")
     integers: list[int] = values.astype(np.int64).tolist()

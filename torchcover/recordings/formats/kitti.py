@@ -388,4 +388,5 @@ class KittiObject(RecordingBase):
 
 
 def _find_split(path: Path) -> Path:
+    """Find the folder `training` below a path, else the path itself."""
     return path / "training" if (path / "training" / "velodyne").is_dir() else path

@@ -123,6 +123,7 @@ class KittiRaw(RecordingBase):
         return read_distorted_cameras(self.path.parent / "calib_cam_to_cam.txt", self._read_vehicle_T_camera0())
 
     def _read_vehicle_T_camera0(self) -> Matrix:
+        """Read the extrinsics of camera 0 from the calibration of the LiDAR."""
         camera_T_velodyne = read_transform(self.path.parent / "calib_velo_to_cam.txt")
         return np.asarray(vehicle_T_velodyne @ invert(camera_T_velodyne))
 
@@ -155,10 +156,12 @@ class KittiRaw(RecordingBase):
 
     @cached_property
     def _latitude_deg(self) -> float:
+        """Latitude of the first record, which sets the scale of the projection."""
         return float(self._read_oxts(0)[0])
 
     @cached_property
     def _boxes_by_frame(self) -> dict[int, Boxes]:
+        """Tracklets in the vehicle frame by frame number."""
         return read_tracklets(self._tracklets, vehicle_T_velodyne)
 
 
@@ -226,6 +229,7 @@ def _build_boxes(entries: list[tuple[list[float], str, str]], vehicle_T_velodyne
 
 
 def _parse_number(element: ElementTree.Element, name: str) -> float:
+    """Parse a child element of a tracklet."""
     text = element.findtext(name)
     if text is None:
         raise ValueError(f"a tracklet without <{name}>")

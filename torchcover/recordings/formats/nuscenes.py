@@ -116,6 +116,7 @@ class NuScenes:
         return SensorCalibrations(source, {CHANNEL: vehicle_T_ego @ self._mounts[self.key_frames[0]]}, tuple(cameras))
 
     def _read_tables(self, tables: Path, scenes: Sequence[str] | None) -> None:
+        """Read names, times, poses and extrinsics of all sweeps."""
         samples = self._read_sample_times(tables, scenes)
         poses = read_json_table(tables / "ego_pose.json")
         calibrations = read_json_table(tables / "calibrated_sensor.json")
@@ -142,6 +143,7 @@ class NuScenes:
 
     @cached_property
     def _interpolator(self) -> ObjectInterpolator:
+        """Annotations of all key frames, read on first use."""
         with report_bad_file(self._tables, "annotations of nuScenes"):
             return ObjectInterpolator(_read_states(self._tables, self._sample_times))
 
@@ -234,7 +236,8 @@ def _find_scene_token(samples: list[dict[str, Any]], path: Path, scene: str | No
 
 def _find_class(category: str) -> str | None:
     """Find SUMO's vehicle class by the first matching prefix of a category."""
-    for prefix, vehicle_class in load_road_user_classes()["nuscenes"].items():
+    classes: dict[str, str] = load_road_user_classes()["nuscenes"]
+    for prefix, vehicle_class in classes.items():
         if category.lower().startswith(prefix):
             return vehicle_class
     return None
@@ -274,6 +277,7 @@ def _check_poses(rotations: NDArray[np.float64], positions_m: NDArray[np.float64
 
 
 def _find_tables(path: Path) -> Path:
+    """Find the only folder of tables with sample data."""
     folders = _find_folders_with_table("sample_data", path)
     if len(folders) != 1:
         names = ", ".join(folder.name for folder in folders) or "none"

@@ -265,6 +265,7 @@ class RosBag(RecordingBase):
             self._stamps_ns[sensor] = stamps_ns[sensor][rows]
 
     def _read_stamps(self, sensor: str, log_times_ns: Int64) -> Int64:
+        """Read the stamps of a sensor, or use log times if all stamps are 0."""
         stamps_ns = self._bag.read_stamps_ns(self._get_topic(sensor))
         if stamps_ns.any():
             return stamps_ns
@@ -305,9 +306,11 @@ class RosBag(RecordingBase):
         warnings.warn(f"{self.path}: {message}", stacklevel=5)
 
     def _get_topic(self, sensor: str) -> str:
+        """Get the topic of a sensor name, with a leading slash if the bag has one."""
         return sensor if sensor in self._bag.type_by_topic else f"/{sensor}"
 
     def _interpolate_pose(self, poses: VehiclePoses, index: int) -> Matrix:
+        """Interpolate the vehicle pose at the time of a frame."""
         log_time_ns = int(self._log_times_ns[self.sensors[0]][index])
         return np.asarray(poses.interpolate(np.array([self._get_frame_stamp_ns(index)]), log_time_ns)[0])
 
@@ -353,6 +356,7 @@ def find_nearest_times(times_ns: Int64, query_ns: Int64) -> NDArray[np.intp]:
 
 
 def _choose_vehicle_frame(frames: Collection[str], mounts: Collection[str]) -> str:
+    """Choose base_footprint, else base_link, which user mounts may also define."""
     for frame in VEHICLE_FRAMES:
         if frame in frames:
             return frame

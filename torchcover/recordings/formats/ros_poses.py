@@ -17,13 +17,12 @@ from torchcover.geometry import (
 )
 from torchcover.geometry.arrays import Bools, Int64
 from torchcover.geometry.rigid import Matrix
-from torchcover.recordings.formats.bag import Bag, get_stamp_ns
+from torchcover.recordings.formats.bag import TF_TYPE, Bag, get_stamp_ns
 
 Edge = tuple[str, str]  # parent frame, child frame
 # Entries of two equal 4x4 transforms differ by rounding only.
 MOUNT_TOLERANCE = 1e-3
 ODOMETRY_TYPE = "nav_msgs/msg/Odometry"
-TF_TYPE = "tf2_msgs/msg/TFMessage"
 POSE_TYPE = "geometry_msgs/msg/PoseStamped"
 # Messages are logged at most this long after they were stamped.
 WINDOW_NS = 1_000_000_000
@@ -216,6 +215,7 @@ def parse_pose(translation: Any, rotation: Any, name: str) -> Matrix:  # noqa: A
 
 
 def _format_difference(first: Matrix, second: Matrix) -> str:
+    """Format distance and angle between two transforms."""
     first_T_second = invert(first) @ second
     angle_deg = np.rad2deg(np.arccos(np.clip((np.trace(first_T_second[:3, :3]) - 1) / 2, -1, 1)))
     return f"{np.linalg.norm(first_T_second[:3, 3]):.3g} m and {angle_deg:.3g} degrees"
@@ -409,6 +409,7 @@ def build_pose_series(
 
 
 def _parse_topic_edge(transform: Any, name: str) -> tuple[Edge, Matrix]:  # noqa: ANN401
+    """Parse a transform; errors name its topic."""
     try:
         return parse_edge(transform)
     except ValueError as error:
@@ -461,6 +462,7 @@ def _sample_transforms(bag: Bag, topic: str) -> dict[Edge, list[Any]]:
 
 
 def _are_constant(transforms: Sequence[Any]) -> bool:
+    """Test whether all transforms of an edge are equal up to rounding."""
     matrices = np.array([parse_edge(transform)[1] for transform in transforms])
     tolerance = 1e-6  # repeated static transforms differ by rounding only
     return bool(np.abs(matrices - matrices[0]).max() < tolerance)

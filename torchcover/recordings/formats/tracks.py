@@ -85,6 +85,7 @@ def read_box_tracks(path: Path) -> tuple[Track, ...]:
 
 
 def _read_csv_trajectory(path: Path) -> Trajectory:
+    """Read a trajectory from a table."""
     numbers = _stack_columns(read_csv(path, TRAJECTORY_COLUMNS, optional_columns=None).numbers, TRAJECTORY_COLUMNS)
     times_s, positions_m, (roll, pitch, yaw) = numbers[:, 0], numbers[:, 1:4], numbers[:, 4:].T
     _check_degrees([(positions_m[:, :2], yaw)])
@@ -134,11 +135,13 @@ def _stack_columns(numbers: Mapping[str, Float64], names: Sequence[str]) -> Floa
 
 
 def _check_header(header: NpyHeader) -> None:
+    """Check that an array holds real numbers."""
     if header.dtype.kind not in "fiu":
         raise ValueError(f"times and poses are integers or floats; got {header.dtype}")
 
 
 def _choose_arrays(names: Collection[str]) -> Collection[str]:
+    """Choose times and poses, which both have to exist."""
     required = ("times_s", "world_T_body")
     if not set(required).issubset(names):
         raise ValueError(f"needs the arrays {' and '.join(required)}; got {', '.join(names) or 'none'}")
@@ -146,6 +149,7 @@ def _choose_arrays(names: Collection[str]) -> Collection[str]:
 
 
 def _read_npz_trajectory(path: Path) -> Trajectory:
+    """Read a trajectory from arrays of times and rigid poses."""
     times_s, poses = read_npz(path, _check_header, _choose_arrays).values()
     if times_s.ndim != 1 or poses.shape != (len(times_s), 4, 4):
         raise ValueError(f"times_s (K,) and world_T_body (K, 4, 4) are needed; got {times_s.shape} and {poses.shape}")
@@ -203,6 +207,7 @@ def read_commonroad(path: Path) -> RecordedObjects:
 
 
 def _list_obstacles(root: Element) -> list[Element]:
+    """List the obstacles of all format versions."""
     obstacles: list[Element] = []
     for tag in OBSTACLE_TAGS:
         obstacles.extend(root.iter(tag))
@@ -210,6 +215,7 @@ def _list_obstacles(root: Element) -> list[Element]:
 
 
 def _parse_ego(problem: Element, frame_interval_s: float) -> Ego:
+    """Parse a planning problem, which has the initial state of an ego vehicle only."""
     name = problem.get("id", "")
     start = problem.find("initialState")
     if start is None:
@@ -220,6 +226,7 @@ def _parse_ego(problem: Element, frame_interval_s: float) -> Ego:
 
 
 def _parse_track(obstacle: Element, frame_interval_s: float) -> Track:
+    """Parse an obstacle; static ones get a single pose."""
     name = obstacle.get("id", "")
     category = (obstacle.findtext("type") or "unknown").strip().lower()
     size_m, center_m, turn_rad = _parse_shape(obstacle, name)
@@ -307,6 +314,7 @@ def _parse_state(state: Element, frame_interval_s: float, owner: str) -> tuple[f
 
 
 def _parse_number(element: Element, tag: str, owner: str) -> float:
+    """Parse the number in a child element; errors name the owner."""
     text = element.findtext(tag)
     try:
         return float(text)  # type: ignore[arg-type]  # the message below reports None, too
