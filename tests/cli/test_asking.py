@@ -41,7 +41,7 @@ def test_what_is_asked_on_the_command_line_in_a_file_and_in_python_is_the_same(e
     assert code == 0
     assert "dog -0.1 to 0.5 m above ground, child -0.1 to 1.1 m above ground" in " ".join(printed.split())
     rows = rows_of(worlds / "out")
-    assert [(row["region"], row["height"]) for row in rows] == [
+    assert [(row["region"], row["band"]) for row in rows] == [
         (region, height) for region in ("behind", "ahead") for height in ("dog", "child")
     ]
     assert float(rows[0]["observed_share"]) == 1.0  # the reference is aimed at it
@@ -54,7 +54,7 @@ def test_what_is_asked_on_the_command_line_in_a_file_and_in_python_is_the_same(e
         heights={"dog": (-0.1, 0.5), "child": (-0.1, 1.1)},
         grid={"x_m": (-10.0, 10.0), "y_m": (-10.0, 10.0)},
     )
-    settings = {"steps": 9, "cell_m": 0.5, "thresholds_m": 2.0, "rays": 1024}
+    settings = {"num_frames": 9, "cell_m": 0.5, "thresholds_m": 2.0, "rays": 1024}
     result = package.evaluate(worlds / "both.yaml", worlds / "yard.yaml", ask=ask, **settings)
     loaded = Coverage.load(worlds / "out" / "coverage.npz")
     np.testing.assert_array_equal(result.coverage.radius, loaded.radius)
@@ -68,7 +68,7 @@ def test_the_sensor_behind_is_what_the_place_behind_depends_on(evaluate, torchco
     code, printed, _ = evaluate(*write_regions(worlds), "--redundancy")
     assert code == 0
     assert "Single point of failure: " in printed
-    by_place = {(row["region"], row["height"]): row for row in rows_of(worlds / "out")}
+    by_place = {(row["region"], row["band"]): row for row in rows_of(worlds / "out")}
     for region, sensor, other in (("behind", "rear", "front"), ("ahead", "front", "rear")):
         row = by_place[region, "dog"]
         assert row["most_important_sensor"] == sensor
@@ -78,7 +78,7 @@ def test_the_sensor_behind_is_what_the_place_behind_depends_on(evaluate, torchco
     # Without the sensor behind it is the rig without it, in the same frames.
     assert evaluate(*write_regions(worlds), rig="low", out="alone")[0] == 0
     for row in rows_of(worlds / "alone"):
-        found = by_place[row["region"], row["height"]]
+        found = by_place[row["region"], row["band"]]
         for key in ("radius_m", "detection_2m"):
             assert float(found[f"{key}_without_rear"]) == pytest.approx(float(row[key]), rel=1e-12)
     files = [worlds / name / "coverage.npz" for name in ("out", "alone")]

@@ -25,7 +25,7 @@ def test_the_exit_code_is_the_verdict_on_all(torchcover, worlds, requirements, c
     assert all(state in printed for state in states)
     out = worlds / "out" / "check"
     record = json.loads((out / "summary.json").read_text())
-    assert (record["met"], list(record["files"])) == (not code, ["junit.xml"])
+    assert (record["encounters"], list(record["files"])) == (not code, ["junit.xml"])
     assert [one["state"] for one in record["rigs"]["low"]] == states
     assert record["rigs"]["low"][0]["margin"] == record["rigs"]["low"][0]["value"] - 5
     (suite,) = ElementTree.parse(out / "junit.xml").getroot()
@@ -36,7 +36,7 @@ def test_the_exit_code_is_the_verdict_on_all(torchcover, worlds, requirements, c
     unknown = "worst: -; margin: -; not kept: 0; not checked: 1; of: 1; no room: 0; the worst is: {}"
     where = "x = 0.00, y = 0.00 m, no room"
     assert (told.get(unknown.format(where)) == where) == ("not checked" in states)
-    assert record["worlds"] == {"target": str(worlds / "yard.yaml")}
+    assert record["scenarios"] == {"target": str(worlds / "yard.yaml")}
     assert suite.get("failures") == str(states.count("not kept"))
     assert "no homologation" in " ".join(printed.split())
 

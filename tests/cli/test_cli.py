@@ -50,7 +50,7 @@ def test_a_recording_is_evaluated_and_the_files_agree(drawn_maps, torchcover, re
     assert coverage.counts["num_frames"] == 4
     summary = json.loads((out / "summary.json").read_text())
     assert summary["complete"] is True
-    assert summary["counts"]["steps"] == 4
+    assert summary["counts"]["num_frames"] == 4
     first = coverage.summary()[0]
     assert summary["rows"][0]["radius_m"] == pytest.approx(first.numbers["radius_m"].value)
     assert summary["rows"][0]["observed_cells"] == 40
@@ -92,7 +92,7 @@ def test_bad_frames_can_be_skipped_and_are_counted(torchcover, recording, tmp_pa
     assert code == 0
     assert "skipped: f10" in printed
     summary = json.loads((out / "summary.json").read_text())
-    assert summary["counts"]["steps"] == 3
+    assert summary["counts"]["num_frames"] == 3
     assert len(summary["skipped_frames"]) == 1
     assert "f10" in summary["skipped_frames"][0]
 
@@ -152,7 +152,7 @@ def test_the_weights_of_the_surface_reference_reach_the_metric(torchcover, world
         return sums_of(self, sensor, reference, **more)
 
     sums_of = CoverageSums.compute_sums
-    monkeypatch.setattr(CoverageSums, "sums_of", noted)
+    monkeypatch.setattr(CoverageSums, "compute_sums", noted)
     options = [
         "--scenario",
         worlds / "yard.yaml",
@@ -191,8 +191,8 @@ def test_every_reference_sensor_has_its_measure_and_is_named_in_the_help(torchco
     assert torchcover("evaluate", worlds / "low.yaml", *options, "--reference", name)[0] == 0
     summary = json.loads((worlds / "out" / "summary.json").read_text())
     by_area = REFERENCE_SENSORS[name].has_area_weights
-    assert (summary["reference"]["sensor"], summary["measure"]) == (name, "area" if by_area else "known")
-    assert Coverage.load(worlds / "out" / "coverage.npz").average == summary["measure"]
+    assert (summary["reference"]["sensor"], summary["average"]) == (name, "area" if by_area else "known")
+    assert Coverage.load(worlds / "out" / "coverage.npz").average == summary["average"]
     assert name in torchcover("evaluate", "--help")[1]
 
 
@@ -205,7 +205,7 @@ def test_the_mean_over_known_cells_is_the_same_whether_it_heads_the_result_or_no
             == 0
         )
         summary = json.loads((worlds / measure / "summary.json").read_text())
-        assert summary["measure"] == measure
+        assert summary["average"] == measure
         rows[measure] = summary["rows"]
     for area, known in zip(rows["area"], rows["known"], strict=True):
         assert area["cells_radius_m"] == known["radius_m"]
@@ -311,7 +311,7 @@ def test_too_few_steps_for_errors_are_told_and_a_recording_has_no_reference_sens
             ["compare", "--frames", "recording", "--set", "recording.pose_convention=wrong"],
             "recording.pose_convention: 'world_T_vehicle', 'vehicle_T_world' or 'swapped_xy' is needed; got 'wrong'",
         ),
-        (["measure"], "No such command 'measure'"),
+        (["average"], "No such command 'measure'"),
     ],
 )
 def test_a_mistake_ends_in_one_line_and_exit_code_2(torchcover, recording, monkeypatch, arguments, message):
@@ -352,7 +352,7 @@ def test_a_folder_may_be_called_what_rich_takes_for_markup(torchcover, recording
 def test_an_output_without_the_signs_of_the_tables_gets_question_marks_not_an_error(torchcover, monkeypatch):
     buffer = io.BytesIO()
     monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(buffer, encoding="ascii"))
-    monkeypatch.setattr("torchcover.cli.listing.run_program", lambda word: Console().print("0.3 – 0.1"))
+    monkeypatch.setattr("torchcover.cli.listing.run", lambda word: Console().print("0.3 – 0.1"))
     assert torchcover("list")[0] == 0
     assert buffer.getvalue() == b"0.3 ? 0.1\n"
 
@@ -429,7 +429,7 @@ def test_out_of_memory_on_a_gpu_ends_in_one_line_and_keeps_what_was_measured(
         return nearest(*arguments, **options)
 
     calls = count()
-    monkeypatch.setattr("torchcover.coverage.sums.suggest_names", search)
+    monkeypatch.setattr("torchcover.coverage.sums.nearest", search)
     code, _, complaints = torchcover("evaluate", "--frames", recording, "--set", "cell_m=4", "--out", tmp_path / "out")
     assert code == 2
     assert complaints.splitlines()[-1].startswith("torchcover: there is not enough memory (")

@@ -16,7 +16,7 @@ from torchcover.simulation import REFERENCE_SENSORS
 QUICK = ("--set", "cell_m=4", "--set", "probe=none")
 
 
-def compare(torchcover, worlds, *rigs, steps=1, out="out", options=()):
+def compare(torchcover, worlds, *rigs, num_frames=1, out="out", options=()):
     """Run it on the tiny yard; returns exit code, stdout, stderr, and the folder."""
     paths = [worlds / f"{rig}.yaml" for rig in rigs]
     folder = worlds / out
@@ -37,7 +37,7 @@ def compare(torchcover, worlds, *rigs, steps=1, out="out", options=()):
 
 
 def test_files_agree_with_each_other_and_with_evaluate(torchcover, worlds):
-    code, printed, _, out = compare(torchcover, worlds, "low", "both", steps=2)
+    code, printed, _, out = compare(torchcover, worlds, "low", "both", num_frames=2)
     assert code == 0
     assert str(out) in printed.replace("\n", "")
     coverages = {name: Coverage.load(out / "coverage" / f"{name}.npz") for name in ("low", "both")}
@@ -45,7 +45,7 @@ def test_files_agree_with_each_other_and_with_evaluate(torchcover, worlds):
     summary = json.loads((out / "summary.json").read_text())
     assert summary["rigs"] == {"low": str(worlds / "low.yaml"), "both": str(worlds / "both.yaml")}
     assert summary["complete"] is True
-    assert summary["counts"]["both"]["steps"] == 2
+    assert summary["counts"]["both"]["num_frames"] == 2
     with (out / "summary.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == len(summary["rows"]) == 18
@@ -75,8 +75,8 @@ def test_fog_never_makes_a_rig_better(torchcover, worlds):
     path.write_text(path.read_text().replace("max_range_m: 60", "max_range_m: 60, range_at_10_percent_m: 30"))
     *_, out = compare(torchcover, worlds, "both", options=["--weather", "clear", "--weather", "fog_50m"])
     rows = json.loads((out / "summary.json").read_text())["rows"]
-    in_fog = {(row["region"], row["height"]): row for row in rows if row["rig"] == "both, fog_50m"}
-    pairs = [(row, in_fog[row["region"], row["height"]]) for row in rows if row["rig"] == "both, clear"]
+    in_fog = {(row["region"], row["band"]): row for row in rows if row["rig"] == "both, fog_50m"}
+    pairs = [(row, in_fog[row["region"], row["band"]]) for row in rows if row["rig"] == "both, clear"]
     known = [(clear, fog) for clear, fog in pairs if clear["observed_cells"]]
     assert known
     assert all(fog["radius_m"] >= clear["radius_m"] for clear, fog in known)
@@ -125,21 +125,21 @@ def test_maps_are_side_by_side_and_as_differences(torchcover, worlds):
 
 
 def test_differences_come_with_their_errors(torchcover, worlds):
-    *_, out = compare(torchcover, worlds, "low", "both", steps=9)
+    *_, out = compare(torchcover, worlds, "low", "both", num_frames=9)
     summary = json.loads((out / "summary.json").read_text())
     assert (summary["blocks"], summary["frames_per_block"]) == (9, 1)
-    known = [row for row in summary["rows"] if row["rig"] == "both" and row["height"] == "ground"][:3]
+    known = [row for row in summary["rows"] if row["rig"] == "both" and row["band"] == "ground"][:3]
     assert len(known) == 3
     for row in known:
         assert row["radius_m_error"] > 0
         assert row["radius_m_difference_error"] >= 0
         assert isinstance(row["radius_m_difference_significant"], bool)
-    first = [row for row in summary["rows"] if row["rig"] == "low" and row["height"] == "ground"][:3]
+    first = [row for row in summary["rows"] if row["rig"] == "low" and row["band"] == "ground"][:3]
     assert [row["radius_m_difference_error"] for row in first] == [0.0, 0.0, 0.0]
 
 
 def test_the_reference_sensor_is_the_one_that_was_asked_for_and_is_named(torchcover, worlds):
-    _, printed, _, out = compare(torchcover, worlds, "low", "both", steps=2, options=["--reference", "paper"])
+    _, printed, _, out = compare(torchcover, worlds, "low", "both", num_frames=2, options=["--reference", "paper"])
     summary = json.loads((out / "summary.json").read_text())
     (ground,) = summary["reference"].pop("notes")
     assert ground.startswith("Ground: level faces under the ego")

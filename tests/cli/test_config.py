@@ -28,15 +28,15 @@ def test_the_written_defaults_are_all_settings_with_a_comment_each(tmp_path):
 
 def test_an_option_wins_over_set_which_wins_over_the_file_and_both_are_recorded(tmp_path):
     path = tmp_path / "run.yaml"
-    path.write_text("rays: 1\ncell_m: 1.0\nseed: 1\nrecording: {units: mm, time_offset_s: 0.2}\n")
-    config, record = load_config(path, ["rays=2", "cell_m=2", "recording.units=cm"], {"rays": 3})
+    path.write_text("num_rays: 1\ncell_m: 1.0\nseed: 1\nrecording: {units: mm, time_offset_s: 0.2}\n")
+    config, record = load_config(path, ["num_rays=2", "cell_m=2", "recording.units=cm"], {"rays": 3})
     assert (config.num_rays, config.cell_m, config.seed) == (3, 2.0, 1)
     assert (config.recording.units, config.recording.time_offset_s) == ("cm", 0.2)
     assert record["file"] == str(path)
     assert record["settings"]["rays"] == 1
     assert record["replaced"]["rays"] == {"file": 1, "option": 3}
     assert "seed" not in record["replaced"]
-    assert load_config(None, ["rays=2"]).record == {}
+    assert load_config(None, ["num_rays=2"]).record == {}
     lists = load_config(
         None, ["aggregations=[maximum, 'quantiles:0.5,0.9']", "probe=child,pole", "thresholds_m=1,2"]
     ).config
@@ -48,9 +48,9 @@ def test_an_option_wins_over_set_which_wins_over_the_file_and_both_are_recorded(
     ("text", "message"),
     [
         ("rayz: 3", "rayz: unknown key"),
-        ("rays: 3\nrays: 4", "rays"),
-        ("rays: many", "rays: a valid integer is needed; got 'many'"),
-        ("rays: 1.5", "rays: a valid integer is needed; got 1.5"),
+        ("num_rays: 3\nnum_rays: 4", "rays"),
+        ("num_rays: many", "num_rays: a valid integer is needed; got 'many'"),
+        ("num_rays: 1.5", "num_rays: a valid integer is needed; got 1.5"),
         ("cell_m: 25cm", "cell_m: a valid number is needed; got '25cm'"),
         ("thresholds_cm: [40]", "thresholds_cm: unknown key"),
         ("redundancy: 1", "redundancy: a valid boolean is needed; got 1"),
@@ -70,7 +70,7 @@ def test_a_file_with_a_mistake_is_refused_with_key_and_value(tmp_path, text, mes
     assert message in str(refused.value)
 
 
-@pytest.mark.parametrize("text", ["rays", "=", "rayz=3", "recording=1", "recording.unit=mm", "rays=x", "cell_m=25cm"])
+@pytest.mark.parametrize("text", ["rays", "=", "rayz=3", "recording=1", "recording.unit=mm", "num_rays=x", "cell_m=25cm"])
 def test_an_assignment_that_is_no_setting_is_refused(text):
     with pytest.raises(ValueError, match=r"^--set "):
         load_config(None, [text])
@@ -78,14 +78,14 @@ def test_an_assignment_that_is_no_setting_is_refused(text):
 
 def test_a_run_reads_a_file_and_its_result_has_it(torchcover, worlds):
     path = worlds / "run.yaml"
-    path.write_text(f"scenario: {worlds / 'yard.yaml'}\ncell_m: 4\nrays: 64\nsteps: 3\nprobe: [none]\n")
+    path.write_text(f"scenario: {worlds / 'yard.yaml'}\ncell_m: 4\nnum_rays: 64\nnum_frames: 3\nprobe: [none]\n")
     options = ("--config", path, "--num-frames", 2, "--files", "numbers", "--out", worlds / "out")
     code, _, complaints = torchcover("evaluate", worlds / "both.yaml", *options)
     assert code == 0, complaints
     summary = json.loads((worlds / "out" / "summary.json").read_text())
-    assert summary["rows"][0]["steps"] == 2
+    assert summary["rows"][0]["num_frames"] == 2
     assert summary["config"]["settings"]["cell_m"] == 4
-    assert summary["config"]["replaced"]["steps"] == {"file": 3, "option": 2}
+    assert summary["config"]["replaced"]["num_frames"] == {"file": 3, "option": 2}
     code, printed, _ = torchcover("config")
     assert (code, printed) == (0, format_defaults())
 

@@ -6,7 +6,7 @@ RAYS = ["--num-rays", "256", "--set", "cell_m=1"]
 
 
 def whats(folder):
-    return {row["what"]: row for row in json.loads((folder / "summary.json").read_text())["left_out"]}
+    return {row["what"]: row for row in json.loads((folder / "summary.json").read_text())["omissions"]}
 
 
 def test_a_scene_in_which_nothing_moves_reuses_its_scan(torchcover, worlds):

@@ -11,7 +11,7 @@ from torchcover import Coverage
 from torchcover.evaluation import evaluate
 
 
-def run(torchcover, worlds, *rigs, command="compare", options=(), out="out", steps=2):
+def run(torchcover, worlds, *rigs, command="compare", options=(), out="out", num_frames=2):
     arguments = [
         "--scenario",
         worlds / "yard.yaml",
@@ -82,9 +82,9 @@ def test_a_name_that_is_none_is_told_with_those_that_are(torchcover, worlds):
 
 def test_a_run_goes_on_from_its_checkpoint_with_its_metrics(torchcover, worlds):
     options = ["--set", "metrics=all"]
-    run(torchcover, worlds, "low", "both", options=options, steps=1)
-    code, *_, out = run(torchcover, worlds, "low", "both", options=[*options, "--resume"], steps=3)
-    *_, whole = run(torchcover, worlds, "low", "both", options=options, steps=3, out="whole")
+    run(torchcover, worlds, "low", "both", options=options, num_frames=1)
+    code, *_, out = run(torchcover, worlds, "low", "both", options=[*options, "--resume"], num_frames=3)
+    *_, whole = run(torchcover, worlds, "low", "both", options=options, num_frames=3, out="whole")
     assert code == 0
     assert (out / "metrics.csv").read_text() == (whole / "metrics.csv").read_text()
 
@@ -116,10 +116,10 @@ def test_taus_have_intervals_over_worlds_that_are_drawn_the_same_again(worlds):
         result = evaluate(
             [worlds / f"{rig}.yaml" for rig in ("low", "both", "other/low")],
             worlds / "yard.yaml",
-            steps=9,
+            num_frames=9,
             cell_m=4.0,
             thresholds_m=2.0,
-            rays=2048,
+            num_rays=2048,
             metrics="k_cover",
         )
         return [tau for tau in result.metrics.taus() if tau.first == "k_cover_1_2m"]
@@ -137,9 +137,9 @@ def test_nothing_is_asked_for_with_nothing(worlds, metrics):
     result = evaluate(
         [worlds / "low.yaml", worlds / "both.yaml"],
         worlds / "yard.yaml",
-        steps=1,
+        num_frames=1,
         cell_m=4.0,
-        rays=1024,
+        num_rays=1024,
         metrics=metrics,
     )
     assert result.metrics is None

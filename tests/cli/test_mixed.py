@@ -28,7 +28,7 @@ def test_several_scenarios_are_measured_apart_and_mixed(torchcover, worlds):
     assert titles == ["yard", "plain", "mixture"]
     summary = json.loads((worlds / "out" / "summary.json").read_text())
     assert summary["complete"] is True
-    assert [world["weight"] for world in summary["worlds"].values()] == [0.75, 0.25]
+    assert [world["weight"] for world in summary["scenarios"].values()] == [0.75, 0.25]
     assert (worlds / "out" / "plain" / "checkpoint.npz").is_file()
     # What is complete and not to be gone on with takes its checkpoints away.
     assert torchcover("compare", *rigs, *options, "--files", "numbers")[0] == 0

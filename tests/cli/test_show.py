@@ -217,7 +217,7 @@ def test_the_depth_images_of_a_rig_are_those_of_its_cameras_in_the_frame(torchco
 def test_a_world_is_built_once(torchcover, worlds, monkeypatch, arguments):
     built = []
     build = Scenario.build_scene
-    monkeypatch.setattr(Scenario, "world", lambda *args: built.append(args) or build(*args))
+    monkeypatch.setattr(Scenario, "build_scene", lambda *args: built.append(args) or build(*args))
     assert torchcover("show", *arguments, worlds / "yard.yaml", "--out", worlds)[0] == 0
     assert len(built) == 1
 
@@ -365,7 +365,7 @@ def test_what_stands_on_a_slope_is_as_high_as_it_is_above_the_slope(at_m, torchc
     )
     code, _, _ = torchcover("show", worlds / "slope.yaml", "--rig", worlds / "low.yaml", "--out", worlds)
     assert code == 0
-    standing = drawn["standing"]
+    standing = drawn["static"]
     assert np.abs(standing.triangles_m[..., 0] - at_m).max() < 5.0  # the slope itself is no scenery
     # The last two faces of a box are its top, the two before them its bottom, which lies on the slope.
     np.testing.assert_allclose(standing.height_m[-4:], [0, 0, 1.0024, 1.0024], atol=1e-3)

@@ -20,7 +20,7 @@ from torchcover.report.maps import plot_side_by_side
 DRAW = "torchcover.report.maps.plot_side_by_side"
 
 
-def arguments(worlds, *, steps=3):
+def arguments(worlds, *, num_frames=3):
     """Two rigs in the tiny yard."""
     rigs = [worlds / "low.yaml", worlds / "both.yaml"]
     settings = [
@@ -60,7 +60,7 @@ def at_update(monkeypatch):
                 act()
             add(self, sums)
 
-        monkeypatch.setattr(CoverageSums, "add", acting)
+        monkeypatch.setattr(CoverageSums, "add_sums", acting)
 
     return have
 
@@ -74,7 +74,7 @@ def steps_of(out):
     """The steps of each rig, whether the run is complete, and how many maps there are."""
     summary = json.loads((out / "summary.json").read_text())
     counts = [Coverage.load(out / "coverage" / f"{name}.npz").counts["num_frames"] for name in ("low", "both")]
-    assert counts == [of_rig["steps"] for of_rig in summary["counts"].values()]
+    assert counts == [of_rig["num_frames"] for of_rig in summary["counts"].values()]
     return counts, summary["complete"], sum(name.startswith("maps/") for name in summary["files"])
 
 

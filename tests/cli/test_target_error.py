@@ -30,7 +30,7 @@ def test_evaluate_stops_when_it_is_good_enough(torchcover, long_recording, tmp_p
     code, printed, _ = torchcover("evaluate", *arguments, "--target-error", "0.05m", "--target-error", "20%")
     assert code == 0
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
-    steps = summary["counts"]["steps"]
+    steps = summary["counts"]["num_frames"]
     assert 32 <= steps < 150
     assert f"Target error reached after {steps} steps." in printed
     assert (summary["complete"], summary["target_error"]["reached"]) == (True, True)

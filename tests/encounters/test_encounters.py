@@ -194,7 +194,7 @@ def test_the_first_run_is_that_of_all_looks_with_few_of_them(looks):
 
 
 CAMERA = {
-    "type": "camera", "name": "cam", "mount": {"x_m": 2.05, "z_m": 0.9}, "width": 240, "height": 160, "fov_deg": 90,
+    "type": "camera", "name": "cam", "mount": {"x_m": 2.05, "z_m": 0.9}, "width": 240, "band": 160, "fov_deg": 90,
     "stride": 2, "max_range_m": 60, "rate_hz": 20,
 }  # fmt: skip
 RADAR = {

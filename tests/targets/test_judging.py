@@ -18,7 +18,7 @@ CAR = BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5))
 OUTLINE = np.array([[-2.0, -1.0], [2.0, -1.0], [2.0, 1.0], [-2.0, 1.0]])
 
 
-def seen_where(points, *, raster=None, state=None, share=None, hits=5, least=None):
+def seen_where(points, *, raster=None, state=None, share=None, detection_points=5, least=None):
     """A map with a number of points that is a function of x and y, of two sensors that share them evenly."""
     raster = raster or Raster((-6.0, 6.0), (-5.0, 5.0), 0.5)
     x, y = raster.positions_m.T
@@ -96,7 +96,7 @@ def test_sides_part_the_places_at_corners_of_45_degrees():
     closed = replace(seen, state=np.ones_like(seen.state))
     assert all(row.free_cells == 0 and np.isnan(row.detected_share) for row in closed.summarize_sides())
     assert np.isnan(list(closed.find_max_undetected_ranges_m().values())).all()
-    half = replace(seen, seen=np.where(seen.free_mask, 0.5, np.nan))
+    half = replace(seen, detected_share=np.where(seen.free_mask, 0.5, np.nan))
     assert {row.detected_share for row in half.summarize_sides()} == {
         0.5
     }  # in every other step, however many points the others have
@@ -132,7 +132,7 @@ def test_the_files_hold_what_the_map_holds(tmp_path):
     assert (rows[0]["x_m"], rows[0]["points"], rows[0]["points_a"], rows[0]["state"]) == ("-2.5", "3", "1.5", "free")
     assert (rows[8]["state"], rows[8]["points"], rows[8]["side"]) == ("occupied", "", "")
     record = json.loads((tmp_path / "summary.json").read_text())
-    assert record["cells"] == {"free": 16, "occupied": 8, "outside": 0, "share_unknown": 0}
+    assert record["cells"] == {"free": 16, "occupied": 8, "outside": 0, "surface_share_unobserved": 0}
     assert build_target_record(replace(seen, state=np.ones_like(seen.state)))["sides"][0]["seen"] is None
 
 
@@ -172,12 +172,12 @@ def test_names_become_bodies(tmp_path):
     ("options", "message"),
     [
         ({"raster": Raster((3.0, 3.2), (0.0, 0.2), 0.2)}, "larger than the raster of 0.2 x 0.2 m"),
-        ({"steps": 0}, "steps"),
+        ({"num_frames": 0}, "steps"),
         ({"hits": 0}, "hits"),
         ({"threshold_m": -1.0}, "threshold"),
         ({"heading": "up"}, "narrow, wide or degrees"),
         ({"target": "moon"}, "'moon' is neither"),
-        ({"steps": 10**9}, "use fewer steps"),
+        ({"num_frames": 10**9}, "use fewer steps"),
     ],
 )
 def test_an_option_that_cannot_be_is_an_error(options, message):

@@ -21,7 +21,7 @@ def scenario(*bodies, **pose):
 
 
 def instant(made):
-    return SceneGeometry(made.world()).get_snapshot(0)
+    return SceneGeometry(made.build_scene()).get_snapshot(0)
 
 
 @pytest.mark.parametrize(("pitch_deg", "roll_deg"), [(0, 0), (4, 0), (-4, 3), (0, -3)])

@@ -24,7 +24,7 @@ TOP = rig(lidar(mount={"z_m": 1.4}, vertical_fov_deg=[-30, 5], columns=90, chann
 BLOCK = {"name": "block", "shape": {"type": "box", "size_m": [40, 4, 2]}, "poses": [{"y_m": 3.2}]}
 
 
-def simulated(scenario, steps=8, rigs=TOP, seed=0):
+def simulated(scenario, num_frames=8, rigs=TOP, seed=0):
     return SimulatedFrames(
         scenario, rigs, num_frames=steps, seed=seed, reference_sensor=PaperReference(rows=2, columns=2)
     )
@@ -50,7 +50,7 @@ def test_the_numbers_are_those_of_targets_over_the_same_cells(name, bodies, monk
             module, "sample_reference_pose", lambda *_: build_transform(np.eye(3), np.array([0.3, 0.2, 1.3]))
         )
     found = measure_target_visibility(TOP, scenario, target, Raster.from_vehicle(scenario.compute_ego_box(), 3.0))
-    probes = probed(simulated(scenario, steps=1), body=name, places=ALL)
+    probes = probed(simulated(scenario, num_frames=1), body=name, places=ALL)
     x, y = (torch.from_numpy(each) for each in found.raster.positions_m.T)
     for number, region in enumerate(probes.regions):
         cells = region.mask_points(x, y).numpy().reshape(found.raster.shape)
@@ -82,7 +82,7 @@ def test_every_place_of_a_region_is_as_likely_as_any_other_and_so_the_budget_mov
 
 
 def test_a_mirror_symmetric_rig_is_symmetric_exactly_in_all_places_and_within_errors_in_some():
-    frames = simulated(world(), steps=32)
+    frames = simulated(world(), num_frames=32)
     every = probed(frames, [0], places=ALL)
     assert numbers(every, LEFT)[0].value == numbers(every, RIGHT)[0].value
     assert 0.1 < numbers(every, LEFT)[0].value < 0.9
@@ -95,7 +95,7 @@ def test_a_mirror_symmetric_rig_is_symmetric_exactly_in_all_places_and_within_er
 
 def test_parts_and_other_processes_add_up_to_the_whole(tmp_path):
     path = drive(tmp_path, (0, 0, 0, 0), (2, 20, 0, 0))
-    frames = simulated(world(ego={"shape": {"type": "box", "size_m": [4, 2, 1]}, "trajectory": str(path)}), steps=20)
+    frames = simulated(world(ego={"shape": {"type": "box", "size_m": [4, 2, 1]}, "trajectory": str(path)}), num_frames=20)
     whole, parts = (
         probed(frames, every=4, places=2),
         [probed(frames, part, every=4, places=2) for part in (range(10), range(10, 20))],
@@ -113,7 +113,7 @@ def test_parts_and_other_processes_add_up_to_the_whole(tmp_path):
 
 
 def test_where_nothing_is_free_the_number_is_unknown_with_a_count():
-    probes = probed(simulated(world(BLOCK), steps=8), body="child", places=3)
+    probes = probed(simulated(world(BLOCK), num_frames=8), body="child", places=3)
     left, right = probes.get_target_sums("small").summarize()[LEFT:]
     assert (left.num_cells, left.observed_cells, left.visible_m2) == (24, 0, pytest.approx(np.nan, nan_ok=True))
     assert all(np.isnan([one.value, one.error]).all() and one.count == 0 for one in left.numbers.values())

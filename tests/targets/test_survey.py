@@ -18,7 +18,7 @@ from .worlds import EGO, RASTER, WALL, drive, lidar, on_target, rig, world
 FREE, OCCUPIED, OUTSIDE = range(len(STATES))
 REFERENCE = PaperReference(rows=2, columns=2)
 CAMERA = {
-    "type": "camera", "name": "cam", "mount": {"x_m": 2.1, "z_m": 0.8}, "width": 180, "height": 100, "fov_deg": 100,
+    "type": "camera", "name": "cam", "mount": {"x_m": 2.1, "z_m": 0.8}, "width": 180, "band": 100, "fov_deg": 100,
     "stride": 2, "max_range_m": 3.5, "min_range_m": 1.0,
 }  # fmt: skip
 
@@ -185,7 +185,7 @@ def test_what_hides_a_target_hides_its_points_and_what_stands_there_takes_its_ro
     assert (names[:4] == "free").all()
     for array in (seen.points, seen.detecting_sensors, seen.detected_share, seen.surface_share, seen.visible_m2):
         np.testing.assert_array_equal(np.isnan(array), seen.state != FREE)
-    assert seen.counts == {"free": 116, "occupied": 8, "outside": 16, "share_unknown": 0}
+    assert seen.counts == {"free": 116, "occupied": 8, "outside": 16, "surface_share_unobserved": 0}
     assert (seen.free_frames == (seen.state == FREE)).all()
 
 
@@ -202,7 +202,7 @@ def test_a_target_that_no_random_place_sees_has_an_unknown_share():
     assert 0 < seen.surface_share[0, 0] <= 1
     assert np.isnan(seen.surface_share[0, 2])
     assert (seen.points[0, 2], seen.visible_m2[0, 2]) == (0.0, 0.0)
-    assert seen.counts["share_unknown"] == 1
+    assert seen.counts["surface_share_unobserved"] == 1
 
 
 def test_the_share_is_that_of_the_surface_which_is_near_a_measured_point():

@@ -175,24 +175,24 @@ class EncounterResults:
         """What it is of, for JSON."""
         rigs = {name: list(sensors) for name, sensors in self.sensor_names.items()}
         what = (
-            {"traffic": self.name, "hours": sum(self.scene_durations_h.values())}
+            {"traffic": self.name, "duration_h": sum(self.scene_durations_h.values())}
             if self.scene_durations_h
             else {"set": self.name}
         )
-        return {**what, **asdict(self.criterion), "phases": self.num_start_offsets, "seed": self.seed, "rigs": rigs}
+        return {**what, **asdict(self.criterion), "num_start_offsets": self.num_start_offsets, "seed": self.seed, "rigs": rigs}
 
     def to_record(self) -> dict[str, Any]:
         """All of it, for JSON."""
         up_to = [
-            {"encounter": name, "rig": rig, "in_time_up_to_kmh": v}
+            {"encounter": name, "rig": rig, "max_speed_kmh": v}
             for (name, rig), v in self.find_max_speeds_kmh().items()
         ]
         rows = [row._asdict() for row in self.rows]
-        met = [{"rig": one.rig, "world": one.scene_id, "who": one.encounter.name, "name": one.encounter.track.name,
-                "step": one.encounter.frame_index, "least_s": float(one.encounter.ttc_s.min()),
+        met = [{"rig": one.rig, "scene_id": one.scene_id, "encounter": one.encounter.name, "name": one.encounter.track.name,
+                "frame_index": one.encounter.frame_index, "min_ttc_s": float(one.encounter.ttc_s.min()),
                 "ttc_s": float(one.ttc_s[0]), "in_time": None if np.isnan(one.in_time[0]) else bool(one.in_time[0])}
                for one in self.detections if isinstance(one.encounter, Approach)]  # fmt: skip
-        listed = {"rows": rows, "speeds": up_to, "met": met}
+        listed = {"rows": rows, "speeds": up_to, "encounters": met}
         return self.get_settings() | {name: list(map(to_json_record, each)) for name, each in listed.items()}
 
     def build_tables(self) -> list[PageTable]:
@@ -219,8 +219,8 @@ class EncounterResults:
             *(["> was seen as soon as the encounter began, and may have been before."] if unsure else []),
             self.criterion.description,
         ]
-        headings = ("encounter", "km/h", "needed\n(s)", *(f"{rig}\n(s)" for rig in rigs))
-        return PageTable("Time to collision at detection", headings, cells, notes=notes)
+        headings = ("encounter", "km/h", "braking time\n(s)", *(f"{rig}\n(s)" for rig in rigs))
+        return PageTable("Time to collision at first detection", headings, cells, notes=notes)
 
     def _met(self, rows: Sequence[EncounterRow], rigs: Sequence[str]) -> PageTable:
         within_s, cells = self.criterion.max_ttc_s, []
@@ -237,7 +237,7 @@ class EncounterResults:
             f"{self.criterion.description} Braking was needed for {rows[-1].braking_count} of them; too late: before detection.",
             *([] if self.detections else ["Nobody was met: drive longer (--num-scenes), or elsewhere."]),
         ]
-        return PageTable("Met, and detected before", ("who", "met", "an hour", *rigs), cells, notes=notes)
+        return PageTable("Met, and detected before", ("road users", "encounters", "per hour", *rigs), cells, notes=notes)
 
     def __repr__(self) -> str:
         return f"Sightings of {', '.join(self.sensor_names)} in {self.name}: {len(self.detections)} encounters"
@@ -347,7 +347,7 @@ def _speeds(up_to_kmh: dict[tuple[str, str], float], rigs: Sequence[str]) -> Pag
     speeds = {key: "none" if math.isnan(kmh) else f"{kmh:g}" for key, kmh in up_to_kmh.items()}
     rows = [tuple(map(TextCell, (name, *(speeds[name, rig] for rig in rigs)))) for name in names]
     headings = ("encounter", *(f"{rig}\n(km/h)" for rig in rigs))
-    return PageTable("In time up to, of the speeds that were swept", headings, rows)
+    return PageTable("Highest tested speed with timely detection", headings, rows)
 
 
 def _sensors(rows: Sequence[EncounterRow]) -> PageTable:
@@ -356,5 +356,5 @@ def _sensors(rows: Sequence[EncounterRow]) -> PageTable:
                           f"{row.ttc_without_most_critical_s:.2f}" if row.ttc_without_most_critical_s else "-", f"{row.braking_time_s:.2f}")))
         for row in rows
     ]  # fmt: skip
-    headings = ("rig", "encounter", "km/h", "first", "worst to lose", "without\n(s)", "needed\n(s)")
+    headings = ("rig", "encounter", "km/h", "first sensor\nto detect", "most critical\nsensor", "without\n(s)", "braking time\n(s)")
     return PageTable("Sensors: which alone is first, and what is left without one", headings, cells, num_text_columns=2)

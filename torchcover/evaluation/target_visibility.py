@@ -156,8 +156,8 @@ def build_target_record(target_map: TargetMap) -> dict[str, Any]:
         **target_map.get_settings(),
         "cells": target_map.counts,
         "sides": [to_json_record(side._asdict()) for side in target_map.summarize_sides()],
-        "unseen_to_m": to_json_record(target_map.find_max_undetected_ranges_m()),
-        "worst": [to_json_record(place._asdict()) for place in target_map.find_worst_positions()],
+        "max_undetected_ranges_m": to_json_record(target_map.find_max_undetected_ranges_m()),
+        "worst_positions": [to_json_record(place._asdict()) for place in target_map.find_worst_positions()],
     }
 
 

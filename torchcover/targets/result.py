@@ -28,7 +28,7 @@ from torchcover.files import format_csv, write_npz
 STATES = ("free", "occupied", "outside")
 FREE, OCCUPIED, OUTSIDE = range(3)
 WITHIN_M = (1.0, 2.0, 3.0)
-MAPS = ("distance_m", "side", "state", "steps", "points", "sensors", "seen", "min_points", "min_sensors", "share",
+MAPS = ("distance_m", "side", "state", "free_frames", "points", "detecting_sensors", "detected_share", "min_points", "min_sensors", "surface_share",
         "visible_m2")  # fmt: skip
 
 
@@ -287,7 +287,7 @@ class TargetMap(PositionVisibility):
     def counts(self) -> dict[str, int]:
         """How many cells there are of each state, and how many are free and have an unknown share."""
         states = {name: int((self.state == number).sum()) for number, name in enumerate(STATES)}
-        return {**states, "share_unknown": int((self.free_mask & np.isnan(self.surface_share)).sum())}
+        return {**states, "surface_share_unobserved": int((self.free_mask & np.isnan(self.surface_share)).sum())}
 
     def get_settings(self) -> dict[str, Any]:
         """What it is of, for JSON."""
@@ -299,24 +299,24 @@ class TargetMap(PositionVisibility):
             "target_bottom_m": self.target_bottom_m,
             "heading": self.heading,
             "raster": {
-                "x": list(self.raster.x_bounds_m),
-                "y": list(self.raster.y_bounds_m),
-                "step_m": self.raster.cell_m,
+                "x_bounds_m": list(self.raster.x_bounds_m),
+                "y_bounds_m": list(self.raster.y_bounds_m),
+                "cell_m": self.raster.cell_m,
             },
             "sensor_model": self.sensor_model,
             "sensors": list(self.sensor_names),
-            "hits": self.detection_points,
+            "detection_points": self.detection_points,
             "threshold_m": self.threshold_m,
             "seed": self.seed,
-            "steps": self.num_frames,
+            "num_frames": self.num_frames,
         }
 
 
-COLUMNS = ("x_m", "y_m", "distance_m", "side", "state", "steps", "points", "sensors", "seen", "min_points",
-           "min_sensors", "share", "visible_m2")  # fmt: skip
+COLUMNS = ("x_m", "y_m", "distance_m", "side", "state", "free_frames", "points", "detecting_sensors", "detected_share", "min_points",
+           "min_sensors", "surface_share", "visible_m2")  # fmt: skip
 
-ARRAYS = ("x_m", "y_m", "state", "steps", "points", "sensor_points", "sensors", "seen", "min_points",
-          "min_sensors", "share", "visible_m2",
+ARRAYS = ("x_m", "y_m", "state", "free_frames", "points", "sensor_points", "detecting_sensors", "detected_share", "min_points",
+          "min_sensors", "surface_share", "visible_m2",
           "distance_m", "side", "vehicle_outline_m")  # fmt: skip
 
 
@@ -354,7 +354,7 @@ def write_arrays(target_map: TargetMap, path: Path) -> None:
         path,
         {
             **arrays,
-            "compute_detection_border_m": target_map.compute_detection_border_m(),
+            "detection_border_m": target_map.compute_detection_border_m(),
             "settings": np.array(json.dumps(target_map.get_settings())),
         },
     )

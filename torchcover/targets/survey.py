@@ -166,8 +166,8 @@ def _outline_m(scenario: Scenario) -> Float64:
     return np.array(MultiPoint(scenario.build_ego_mesh().vertices_m[:, :2]).convex_hull.exterior.coords)[:-1]
 
 
-def _check(steps: int, seed: int, hits: int, threshold_m: float) -> None:
-    for name, value, least in (("steps", steps, 1), ("seed", seed, 0), ("hits", hits, 1)):
+def _check(num_frames: int, seed: int, detection_points: int, threshold_m: float) -> None:
+    for name, value, least in (("num_frames", num_frames, 1), ("seed", seed, 0), ("detection_points", detection_points, 1)):
         if value < least:
             raise ValueError(f"{name}: a number >= {least} is needed; got {value}")
     if not 0 < threshold_m < math.inf:
