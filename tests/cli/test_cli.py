@@ -352,7 +352,7 @@ def test_a_folder_may_be_called_what_rich_takes_for_markup(torchcover, recording
 def test_an_output_without_the_signs_of_the_tables_gets_question_marks_not_an_error(torchcover, monkeypatch):
     buffer = io.BytesIO()
     monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(buffer, encoding="ascii"))
-    monkeypatch.setattr("torchcover.cli.listing.run", lambda word: Console().print("0.3 – 0.1"))
+    monkeypatch.setattr("torchcover.cli.listing.print_builtin", lambda word: Console().print("0.3 – 0.1"))
     assert torchcover("list")[0] == 0
     assert buffer.getvalue() == b"0.3 ? 0.1\n"
 

@@ -24,7 +24,7 @@ def compare(torchcover, worlds, *rigs, num_frames=1, out="out", options=()):
         "--scenario",
         worlds / "yard.yaml",
         "--num-frames",
-        steps,
+        num_frames,
         "--set",
         "cell_m=4",
         "--thresholds-m",

@@ -16,7 +16,7 @@ def run(torchcover, worlds, *rigs, command="compare", options=(), out="out", num
         "--scenario",
         worlds / "yard.yaml",
         "--num-frames",
-        steps,
+        num_frames,
         "--set",
         "cell_m=4",
         "--thresholds-m",

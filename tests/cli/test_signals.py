@@ -33,7 +33,7 @@ def arguments(worlds, *, num_frames=3):
         "--num-rays",
         4096,
         "--num-frames",
-        steps,
+        num_frames,
     ]
     return ["compare", *rigs, *settings, "--out", worlds / "out"]
 

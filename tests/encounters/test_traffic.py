@@ -252,7 +252,7 @@ def test_the_nearest_time_until_detection_counts_though_it_grew_again(seen_from,
     )
     assert found.ttc_without_sensor_s[0, 0] == 0
     # Whoever needs more than was asked about may have been too late before.
-    early = one._replace(braking_time_s=np.full(4, 4.1))
+    early = one._replace(braking_times_s=np.full(4, 4.1))
     found = detect_approach("r", there, early, eyes, Criterion(points=1, consecutive_scans=1))
     assert math.isnan(found.in_time[0]) if seen_from == 0 else found.in_time[0] == 0
 
@@ -316,7 +316,7 @@ class Closing(SyntheticDrive):
 
 @pytest.mark.parametrize("layout", ["kitti_raw", "nuscenes", "argoverse2"])
 def test_real_road_users_are_first_hit_as_their_layout_says(layout, tmp_path):
-    recording = open_recording(LAYOUTS[layout](Closing(num_frames=15), tmp_path))
+    recording = open_recording(LAYOUTS[layout](Closing(steps=15), tmp_path))
     (one,) = evaluate_recorded_encounters(recording).detections
     gap_m = 50.0 - CAR_SIZE_M[0] / 2 - recording.ego_box.upper_m[0]
     assert one.encounter.name == "cars and vans"
@@ -335,7 +335,7 @@ def test_parked_vehicles_are_not_met_and_people_who_stand_are(category, met):
             box = super().read_boxes(index)
             return Boxes.from_rows(box.rows, ids=box.ids, categories=(category,))
 
-    found = evaluate_recorded_encounters(Standing(num_frames=15, body=BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5))))
+    found = evaluate_recorded_encounters(Standing(steps=15, ego_box=BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5))))
     assert len(found.detections) == met
 
 
@@ -345,9 +345,9 @@ def test_what_cannot_be_asked_is_told(tmp_path):
     with pytest.raises(ValueError, match="worlds: a number >= 1"):
         evaluate_traffic_encounters([rig()], num_scenes=0)
     with pytest.raises(ValueError, match="how large its vehicle is"):
-        evaluate_recorded_encounters(Closing(num_frames=5))
+        evaluate_recorded_encounters(Closing(steps=5))
     with pytest.raises(ValueError, match="none of its 1 objects is a road user, by their categories"):
-        evaluate_recorded_encounters(open_recording(LAYOUTS["folder"](Closing(num_frames=5), tmp_path)))
+        evaluate_recorded_encounters(open_recording(LAYOUTS["folder"](Closing(steps=5), tmp_path)))
     way = drive(tmp_path, (0, 0, 0, 0), (1, 9, 0, 0))
     alone = world(ego={"shape": CAR, "trajectory": str(way)}, duration_s=1.0)
     far = evaluate_traffic_encounters([rig(TOP)], alone)

@@ -26,7 +26,7 @@ BLOCK = {"name": "block", "shape": {"type": "box", "size_m": [40, 4, 2]}, "poses
 
 def simulated(scenario, num_frames=8, rigs=TOP, seed=0):
     return SimulatedFrames(
-        scenario, rigs, num_frames=steps, seed=seed, reference_sensor=PaperReference(rows=2, columns=2)
+        scenario, rigs, num_frames=num_frames, seed=seed, reference_sensor=PaperReference(rows=2, columns=2)
     )
 
 
