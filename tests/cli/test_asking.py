@@ -54,7 +54,7 @@ def test_what_is_asked_on_the_command_line_in_a_file_and_in_python_is_the_same(e
         heights={"dog": (-0.1, 0.5), "child": (-0.1, 1.1)},
         grid={"x_m": (-10.0, 10.0), "y_m": (-10.0, 10.0)},
     )
-    settings = {"num_frames": 9, "cell_m": 0.5, "thresholds_m": 2.0, "rays": 1024}
+    settings = {"num_frames": 9, "cell_m": 0.5, "thresholds_m": 2.0, "num_rays": 1024}
     result = package.evaluate(worlds / "both.yaml", worlds / "yard.yaml", ask=ask, **settings)
     loaded = Coverage.load(worlds / "out" / "coverage.npz")
     np.testing.assert_array_equal(result.coverage.radius, loaded.radius)

@@ -191,7 +191,7 @@ def test_every_reference_sensor_has_its_measure_and_is_named_in_the_help(torchco
     assert torchcover("evaluate", worlds / "low.yaml", *options, "--reference", name)[0] == 0
     summary = json.loads((worlds / "out" / "summary.json").read_text())
     by_area = REFERENCE_SENSORS[name].has_area_weights
-    assert (summary["reference"]["sensor"], summary["average"]) == (name, "area" if by_area else "known")
+    assert (summary["reference"]["sensor"], summary["average"]) == (name, "area" if by_area else "cells")
     assert Coverage.load(worlds / "out" / "coverage.npz").average == summary["average"]
     assert name in torchcover("evaluate", "--help")[1]
 
@@ -199,7 +199,7 @@ def test_every_reference_sensor_has_its_measure_and_is_named_in_the_help(torchco
 def test_the_mean_over_known_cells_is_the_same_whether_it_heads_the_result_or_not(torchcover, worlds):
     options = ["--scenario", worlds / "yard.yaml", "--num-frames", 2, "--set", "cell_m=4", "--num-rays", 1024, "--out"]
     rows = {}
-    for measure in ("area", "known"):
+    for measure in ("area", "cells"):
         assert (
             torchcover("evaluate", worlds / "low.yaml", *options, worlds / measure, "--set", f"estimate={measure}")[0]
             == 0
@@ -207,10 +207,10 @@ def test_the_mean_over_known_cells_is_the_same_whether_it_heads_the_result_or_no
         summary = json.loads((worlds / measure / "summary.json").read_text())
         assert summary["average"] == measure
         rows[measure] = summary["rows"]
-    for area, known in zip(rows["area"], rows["known"], strict=True):
+    for area, known in zip(rows["area"], rows["cells"], strict=True):
         assert area["cells_radius_m"] == known["radius_m"]
         assert area["observed_share"] == known["observed_share"]
-    assert any(area["radius_m"] != known["radius_m"] for area, known in zip(rows["area"], rows["known"], strict=True))
+    assert any(area["radius_m"] != known["radius_m"] for area, known in zip(rows["area"], rows["cells"], strict=True))
 
 
 def test_frames_that_are_skipped_leave_their_place_in_time(torchcover, recording, tmp_path, monkeypatch):
@@ -250,7 +250,7 @@ def test_too_few_steps_for_errors_are_told_and_a_recording_has_no_reference_sens
             ["evaluate", "front_roof_128", "--set", "cell_m=20"],
             "region '20m' holds no cell centre; use smaller cells than 20 m",
         ),
-        (["evaluate", "front_roof_128", "--set", "cell_m=1e-310"], "x: inf cells of 1e-310 m, over 100,000,000"),
+        (["evaluate", "front_roof_128", "--set", "cell_m=1e-310"], "x_m: inf cells of 1e-310 m, over 100,000,000"),
         (["evaluate", "front_roof_128", "--thresholds-m", "inf"], "thresholds"),
         (
             ["evaluate", "front_roof_128", "--num-rays", "99999999999"],
@@ -262,7 +262,7 @@ def test_too_few_steps_for_errors_are_told_and_a_recording_has_no_reference_sens
             "1,000,000 workers: 3e+05 GB of memory are needed",
         ),
         (["evaluate", "front_roof_128", "--device", "meta"], "device meta: cannot be used here"),
-        (["evaluate", "front_roof_128", "--set", "cell_m=-1"], "cell: a positive length"),
+        (["evaluate", "front_roof_128", "--set", "cell_m=-1"], "cell_m: a positive length"),
         (["evaluate", "front_roof_128", "--thresholds-m", "-1"], "thresholds: finite distances >= 0"),
         (["evaluate", "front_roof_128", "--num-frames", "0"], "--num-frames"),
         (["evaluate", "front_roof_128", "--num-frames", "many"], "--num-frames"),
@@ -279,8 +279,8 @@ def test_too_few_steps_for_errors_are_told_and_a_recording_has_no_reference_sens
             f"reference best: {' or '.join(f'`{name}`' for name in REFERENCE_SENSORS)} is needed",
         ),
         (
-            ["evaluate", "front_roof_128", "--set", "estimate=best"],
-            "--set estimate: 'area' or 'known' is needed; got 'best'",
+            ["evaluate", "front_roof_128", "--set", "average=best"],
+            "--set average: 'area' or 'cells' is needed; got 'best'",
         ),
         (
             ["evaluate", "front_roof_128", "--reference", "paper", "--set", "average=area"],

@@ -13,7 +13,7 @@ from torchcover.evaluation import compare as compare_saved
 from torchcover.evaluation.settings import FILES
 from torchcover.simulation import REFERENCE_SENSORS
 
-QUICK = ("--set", "cell_m=4", "--set", "probe=none")
+QUICK = ("--set", "cell_m=4", "--set", "test_targets=none")
 
 
 def compare(torchcover, worlds, *rigs, num_frames=1, out="out", options=()):
@@ -32,7 +32,7 @@ def compare(torchcover, worlds, *rigs, num_frames=1, out="out", options=()):
         "--out",
         folder,
     ]
-    arguments += ["--num-rays", 4096, "--set", "probe=none", *options]
+    arguments += ["--num-rays", 4096, "--set", "test_targets=none", *options]
     return *torchcover("compare", *paths, *arguments), folder
 
 

@@ -18,7 +18,7 @@ def saved(worlds, measured):
     """Evaluate a rig of the yard, and give its coverage file."""
 
     def run(rig, **changes):
-        settings = {"num_frames": 16, "cell_m": 4.0, "thresholds_m": (2.0,), "rays": 1024, **changes}
+        settings = {"num_frames": 16, "cell_m": 4.0, "thresholds_m": (2.0,), "num_rays": 1024, **changes}
         key = rig, *settings.items()
         if key not in measured:
             measured[key] = evaluate(worlds / f"{rig}.yaml", worlds / "yard.yaml", **settings).coverage
@@ -38,7 +38,7 @@ def test_two_evaluations_of_the_same_frames_are_a_comparison(torchcover, worlds,
     summary = json.loads((worlds / "out" / "summary.json").read_text())
     unknown = ("complete", "seconds", "device", "frame_counts", "skipped_frames", "left_out", "reference", "scenario")
     assert [summary[name] for name in unknown] == [None] * len(unknown)
-    rigs, settings = [worlds / "low.yaml", worlds / "both.yaml"], {"cell_m": 4.0, "thresholds_m": (2.0,), "rays": 1024}
+    rigs, settings = [worlds / "low.yaml", worlds / "both.yaml"], {"cell_m": 4.0, "thresholds_m": (2.0,), "num_rays": 1024}
     together = evaluate(rigs, worlds / "yard.yaml", num_frames=16, **settings)
     rows = json.loads((worlds / "out" / "summary.json").read_text())["rows"]
     # Of a file of coverage nobody knows what carried the rig, and how its sensors measured.

@@ -29,16 +29,16 @@ def test_the_written_defaults_are_all_settings_with_a_comment_each(tmp_path):
 def test_an_option_wins_over_set_which_wins_over_the_file_and_both_are_recorded(tmp_path):
     path = tmp_path / "run.yaml"
     path.write_text("num_rays: 1\ncell_m: 1.0\nseed: 1\nrecording: {units: mm, time_offset_s: 0.2}\n")
-    config, record = load_config(path, ["num_rays=2", "cell_m=2", "recording.units=cm"], {"rays": 3})
+    config, record = load_config(path, ["num_rays=2", "cell_m=2", "recording.units=cm"], {"num_rays": 3})
     assert (config.num_rays, config.cell_m, config.seed) == (3, 2.0, 1)
     assert (config.recording.units, config.recording.time_offset_s) == ("cm", 0.2)
     assert record["file"] == str(path)
-    assert record["settings"]["rays"] == 1
-    assert record["replaced"]["rays"] == {"file": 1, "option": 3}
+    assert record["settings"]["num_rays"] == 1
+    assert record["replaced"]["num_rays"] == {"file": 1, "option": 3}
     assert "seed" not in record["replaced"]
     assert load_config(None, ["num_rays=2"]).record == {}
     lists = load_config(
-        None, ["aggregations=[maximum, 'quantiles:0.5,0.9']", "probe=child,pole", "thresholds_m=1,2"]
+        None, ["aggregations=[maximum, 'quantiles:0.5,0.9']", "test_targets=child,pole", "thresholds_m=1,2"]
     ).config
     assert lists.aggregations == ("maximum", "quantiles:0.5,0.9")
     assert (lists.test_targets, lists.thresholds_m) == (("child", "pole"), (1.0, 2.0))
@@ -78,7 +78,7 @@ def test_an_assignment_that_is_no_setting_is_refused(text):
 
 def test_a_run_reads_a_file_and_its_result_has_it(torchcover, worlds):
     path = worlds / "run.yaml"
-    path.write_text(f"scenario: {worlds / 'yard.yaml'}\ncell_m: 4\nnum_rays: 64\nnum_frames: 3\nprobe: [none]\n")
+    path.write_text(f"scenario: {worlds / 'yard.yaml'}\ncell_m: 4\nnum_rays: 64\nnum_frames: 3\ntest_targets: [none]\n")
     options = ("--config", path, "--num-frames", 2, "--files", "numbers", "--out", worlds / "out")
     code, _, complaints = torchcover("evaluate", worlds / "both.yaml", *options)
     assert code == 0, complaints

@@ -6,7 +6,7 @@ RAYS = ["--num-rays", "256", "--set", "cell_m=1"]
 
 
 def whats(folder):
-    return {row["what"]: row for row in json.loads((folder / "summary.json").read_text())["omissions"]}
+    return {row["description"]: row for row in json.loads((folder / "summary.json").read_text())["omissions"]}
 
 
 def test_a_scene_in_which_nothing_moves_reuses_its_scan(torchcover, worlds):
@@ -15,7 +15,7 @@ def test_a_scene_in_which_nothing_moves_reuses_its_scan(torchcover, worlds):
     assert code == 0, complaints
     assert "Left out, for this run did not need it" in text
     reused = whats(worlds / "out")["rays of sensors where nothing moves: cast once, for all steps"]
-    assert (reused["count"], reused["of"]) == (2 * 8 * 30, 3 * 8 * 30)  # the first step casts them
+    assert (reused["count"], reused["total"]) == (2 * 8 * 30, 3 * 8 * 30)  # the first step casts them
     once = [*options[:3], "1", *options[4:]]
     assert torchcover("evaluate", worlds / "low.yaml", *once)[0] == 0
     assert not any("cast once" in what or "first scan" in what for what in whats(worlds / "out"))

@@ -26,7 +26,7 @@ def test_what_is_left_without_a_radar_is_the_other_alone(torchcover, rigs):
     code, printed, _ = torchcover("evaluate", rigs / "radars.yaml", "--scenario", rigs / "yard.yaml", *SMALL)
     assert code == 0
     assert "when one sensor fails" in printed
-    given = {"num_frames": 3, "cell_m": 0.5, "rays": 2048}
+    given = {"num_frames": 3, "cell_m": 0.5, "num_rays": 2048}
     both = evaluate(rigs / "radars.yaml", rigs / "yard.yaml", redundancy=True, **given)
     alone = evaluate(rigs / "alone.yaml", rigs / "yard.yaml", **given)
     for row, rest in zip(both.coverage.summary(), alone.coverage.summary(), strict=True):

@@ -19,13 +19,13 @@ def test_a_recording_has_the_numbers_of_the_simulation(torchcover, worlds, tmp_p
     assert printed.startswith(f"Wrote 3 frames to {recording}; ")
     cell = ("--set", "cell_m=1", "--thresholds-m", 0.4, "--thresholds-m", 1)
     assert (
-        torchcover("evaluate", worlds / "both.yaml", *options, *cell, "--set", "probe=none", "--out", measured)[0] == 0
+        torchcover("evaluate", worlds / "both.yaml", *options, *cell, "--set", "test_targets=none", "--out", measured)[0] == 0
     )
     code, printed, _ = torchcover("evaluate", "--frames", recording, *cell, "--out", read)
     assert code == 0
     assert "Bodies beside the vehicle: not for recordings" in " ".join(printed.split())
-    code, _, told = torchcover("evaluate", "--frames", recording, "--set", "probe=child", "--out", read)
-    assert (code, "probe: not for recordings" in told) == (2, True)
+    code, _, told = torchcover("evaluate", "--frames", recording, "--set", "test_targets=child", "--out", read)
+    assert (code, "test_targets: not for recordings" in told) == (2, True)
     first, second = (Coverage.load(folder / "coverage.npz") for folder in (measured, read))
     assert first.average == second.average == "area"
     for name in ("radius", "detection", "observed_frames", "points"):

@@ -5,7 +5,7 @@ import warnings
 
 import pytest
 
-from torchcover.evaluation import scene_pictures
+from torchcover.evaluation import scene_figures
 
 FREE = "name: free\nego: {pose: {}}\nbodies: [{name: ground, shape: {type: plane, size_m: [400, 400]}}]\n"
 

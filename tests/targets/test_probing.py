@@ -31,7 +31,7 @@ def simulated(scenario, num_frames=8, rigs=TOP, seed=0):
 
 
 def probed(frames, indices=None, body="pole", **budget):
-    probes = NearFieldObserver(frames.simulator, [Target.load(body)], num_blocks=8, **({"every": 1} | budget))
+    probes = NearFieldObserver(frames.simulator, [Target.load(body)], num_blocks=8, **({"frame_stride": 1} | budget))
     for index in range(len(frames)) if indices is None else indices:
         probes.update(frames[index])
     return probes
@@ -97,8 +97,8 @@ def test_parts_and_other_processes_add_up_to_the_whole(tmp_path):
     path = drive(tmp_path, (0, 0, 0, 0), (2, 20, 0, 0))
     frames = simulated(world(ego={"shape": {"type": "box", "size_m": [4, 2, 1]}, "trajectory": str(path)}), num_frames=20)
     whole, parts = (
-        probed(frames, every=4, places=2),
-        [probed(frames, part, every=4, places=2) for part in (range(10), range(10, 20))],
+        probed(frames, frame_stride=4, positions_per_region=2),
+        [probed(frames, part, frame_stride=4, positions_per_region=2) for part in (range(10), range(10, 20))],
     )
     first = pickle.loads(pickle.dumps(parts[0]))  # as ranks send them
     first.merge_state(pickle.loads(pickle.dumps(parts[1])))
