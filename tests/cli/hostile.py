@@ -119,7 +119,7 @@ def documents() -> Iterator[Case]:
     trajectory = "\n".join(["t,x,y,z,roll,pitch,yaw", "0,20,0,0,0,0,0", "1,0,0,0,0,0,0"])
     meets = YARD.replace("pose: {x_m: 20}", "trajectory: a.csv")
     write = lambda folder: (folder / "a.csv").write_text(trajectory)  # noqa: E731
-    yield _case("an actor that gets into the ego", {"yard": meets}, prepare=write, num_frames=11)
+    yield _case("an actor that gets into the ego", {"yard": meets}, prepare=write, steps=11)
 
 
 def values() -> Iterator[Case]:

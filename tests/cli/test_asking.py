@@ -45,7 +45,7 @@ def test_what_is_asked_on_the_command_line_in_a_file_and_in_python_is_the_same(e
         (region, height) for region in ("behind", "ahead") for height in ("dog", "child")
     ]
     assert float(rows[0]["observed_share"]) == 1.0  # the reference is aimed at it
-    asked = write_regions(worlds, regions="{other: {x_m: [2, 6], y_m: [-2, 2]}}")
+    asked = write_regions(worlds, regions="{road_user: {x_m: [2, 6], y_m: [-2, 2]}}")
     options = ("--region", "behind:-6,-2,-2,2", "--region", "ahead:2,6,-2,2")
     assert evaluate(*asked, *options, out="file")[0] == 0
     assert (worlds / "file" / "summary.csv").read_text() == (worlds / "out" / "summary.csv").read_text()

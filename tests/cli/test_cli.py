@@ -201,7 +201,7 @@ def test_the_mean_over_known_cells_is_the_same_whether_it_heads_the_result_or_no
     rows = {}
     for measure in ("area", "cells"):
         assert (
-            torchcover("evaluate", worlds / "low.yaml", *options, worlds / measure, "--set", f"estimate={measure}")[0]
+            torchcover("evaluate", worlds / "low.yaml", *options, worlds / measure, "--set", f"average={measure}")[0]
             == 0
         )
         summary = json.loads((worlds / measure / "summary.json").read_text())
@@ -218,7 +218,7 @@ def test_frames_that_are_skipped_leave_their_place_in_time(torchcover, recording
     sums_of, given = CoverageSums.compute_sums, []
     monkeypatch.setattr(
         CoverageSums,
-        "sums_of",
+        "compute_sums",
         lambda self, *clouds, **more: given.append(more["block_index"]) or sums_of(self, *clouds, **more),
     )
     assert torchcover("evaluate", "--frames", recording, *SKIPPING, "--out", tmp_path / "out")[0] == 0
@@ -284,7 +284,7 @@ def test_too_few_steps_for_errors_are_told_and_a_recording_has_no_reference_sens
         ),
         (
             ["evaluate", "front_roof_128", "--reference", "paper", "--set", "average=area"],
-            "estimate area: it needs the",
+            "average area: it needs the",
         ),
         (["evaluate", "front_roof_128", "--num-rays", "0"], "--num-rays"),
         (

@@ -36,7 +36,7 @@ def test_two_evaluations_of_the_same_frames_are_a_comparison(torchcover, worlds,
     assert code == 0
     assert "Difference to low" in printed
     summary = json.loads((worlds / "out" / "summary.json").read_text())
-    unknown = ("complete", "seconds", "device", "frame_counts", "skipped_frames", "left_out", "reference", "scenario")
+    unknown = ("complete", "duration_s", "device", "frame_counts", "skipped_frames", "omissions", "reference", "scenario")
     assert [summary[name] for name in unknown] == [None] * len(unknown)
     rigs, settings = [worlds / "low.yaml", worlds / "both.yaml"], {"cell_m": 4.0, "thresholds_m": (2.0,), "num_rays": 1024}
     together = evaluate(rigs, worlds / "yard.yaml", num_frames=16, **settings)

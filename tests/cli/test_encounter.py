@@ -8,7 +8,7 @@ SET = """name: two
 encounters:
   - name: child
     ego: {speed_kmh: [10, 60]}
-    other: {body: child_120cm, speed_kmh: 5, from_m: 2.0, yaw_deg: [90, -90]}
+    road_user: {body: child_120cm, speed_kmh: 5, approach_distance_m: 2.0, yaw_deg: [90, -90]}
 """
 
 
@@ -52,8 +52,8 @@ def test_rigs_side_by_side_in_words_and_files(torchcover, worlds, monkeypatch):
 @pytest.mark.parametrize(
     ("text", "arguments", "message"),
     [
-        (SET.replace("child_120cm", "chidl"), [], "encounters.0: other.body: "),
-        (SET.replace("from_m: 2.0", "form_m: 2.0"), [], "encounters.0: other.form_m"),
+        (SET.replace("child_120cm", "chidl"), [], "encounters.0: road_user.body: "),
+        (SET.replace("approach_distance_m: 2.0", "form_m: 2.0"), [], "encounters.0: road_user.form_m"),
         (SET.replace("yaw_deg: [90, -90]", "yaw_deg: 0, impact_location: 4"), [], "the two never touch"),
         (SET.replace("name: two", "name: [two]"), [], "name: "),
         (SET, ["--points", "0"], "points: a number >= 1"),

@@ -10,7 +10,7 @@ SMALL = ("--set", "cell_m=8", "--num-rays", 256)
 def files_of(folder):
     """What was measured, by file; the time that it took aside."""
     summary = json.loads((folder / "summary.json").read_text())
-    assert summary.pop("seconds") >= 0
+    assert summary.pop("duration_s") >= 0
     summary["files"] = list(summary["files"])
     arrays = {path.name: path.read_bytes() for path in folder.rglob("coverage/*.npz")}
     arrays |= {path.name: path.read_bytes() for path in folder.glob("coverage.npz")}

@@ -9,7 +9,7 @@ from matplotlib.image import imread
 from PIL import Image
 
 from torchcover.cli import show
-from torchcover.evaluation import build_sensor_views, scene_pictures
+from torchcover.evaluation import build_sensor_views, scene_figures
 from torchcover.evaluation.task import load_named_rig, make_rig_names
 from torchcover.simulation import Rig, Scenario, list_builtin_names
 
@@ -19,9 +19,9 @@ def drawn(monkeypatch):
     """What was drawn: the arguments of the last call."""
     calls: dict = {}
     for name in ("plot_rig", "plot_vehicle", "plot_scene", "plot_depth_images"):
-        draw = getattr(scene_pictures, name)
+        draw = getattr(scene_figures, name)
         monkeypatch.setattr(
-            scene_pictures,
+            scene_figures,
             name,
             lambda *args, draw=draw, **kwargs: calls.update(kwargs, args=args) or draw(*args, **kwargs),
         )

@@ -57,7 +57,7 @@ def test_rigs_of_different_vehicles_are_compared_on_one_that_is_named(torchcover
 
 def test_pictures_and_recordings_are_of_the_vehicle_too(torchcover, free, monkeypatch):
     titles = []
-    monkeypatch.setattr(scene_pictures, "plot_rig", lambda *_, **told: titles.append(told) or Blank())
+    monkeypatch.setattr(scene_figures, "plot_rig", lambda *_, **told: titles.append(told) or Blank())
     shown = ("show", free / "low.yaml", "--scenario", free / "free.yaml", "--vehicle", "suv", "--out", free)
     assert torchcover(*shown)[0] == 0
     assert titles[0]["subtitle"] == "on suv in free, 4.90 x 1.94 x 1.63 m"

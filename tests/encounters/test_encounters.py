@@ -35,8 +35,8 @@ SOLID = BodyGeometry(Scenario.model_validate({"name": "s", "ego": EGO, "bodies":
 
 
 def crossing(speed_kmh=36.0, other=None, **keys):
-    other = {"body": "child_120cm", "speed_kmh": 5.4, "from_m": 1.5} | (other or {})
-    return Encounter.model_validate({"name": "e", "ego": {"speed_kmh": speed_kmh}, "other": other, **keys})
+    other = {"body": "child_120cm", "speed_kmh": 5.4, "approach_distance_m": 1.5} | (other or {})
+    return Encounter.model_validate({"name": "e", "ego": {"speed_kmh": speed_kmh}, "road_user": other, **keys})
 
 
 def rig(*sensors):
@@ -68,8 +68,8 @@ def test_the_sight_opens_when_the_line_past_the_corner_of_a_wall_meets_the_walke
         "name": "front", "mount": {"x_m": 1.5, "z_m": 1.5}, "channels": 1, "vertical_fov_deg": [-6, -6],
         "horizontal_fov_deg": 40, "columns": 4000, "max_range_m": 90, "rate_hz": 500,
     }  # fmt: skip
-    walls = [{"body": WALL, "beside_m": 0.6, "gap_m": 1.0}]
-    walker = {"body": WALKER, "from_m": 2.1}
+    walls = [{"body": WALL, "lateral_gap_m": 0.6, "longitudinal_gap_m": 1.0}]
+    walker = {"body": WALKER, "approach_distance_m": 2.1}
     one = sighted(
         mounted(scanner),
         crossing(speed_kmh, walker, obstacles=walls),
@@ -103,20 +103,20 @@ def test_outlines_touch_when_the_front_has_come_to_the_side():
     assert StagedEncounter(crossing(36.0, {"body": BOX}), SOLID).contact_time_s == pytest.approx(
         1.0 - 0.5 / 10, abs=2e-6
     )
-    oncoming = {"body": BOX, "yaw_deg": 180, "speed_kmh": 18, "from_m": 5}
+    oncoming = {"body": BOX, "yaw_deg": 180, "speed_kmh": 18, "approach_distance_m": 5}
     assert StagedEncounter(crossing(36.0, oncoming), SOLID).contact_time_s == pytest.approx(1.0 - 1.0 / 15, abs=2e-6)
     behind = StagedEncounter(crossing(-36.0, {"body": BOX}), SOLID)
     assert behind.contact_time_s == pytest.approx(1.0 - 0.5 / 10, abs=2e-6)
     assert behind.compute_vehicle_T_road_user(np.array([1.0]))[0, :2, 3] == pytest.approx([-2.0, 0.0])
-    standing = crossing(0.0, {"body": BOX, "from_m": 3})
+    standing = crossing(0.0, {"body": BOX, "approach_distance_m": 3})
     assert StagedEncounter(standing, SOLID).contact_time_s == pytest.approx(2.0 - (1.0 + 1.0) / 1.5, abs=2e-6)
 
 
 def grazing(overlap_m, **ego):
     """The end of the other passes the ego's corner, which goes straight, so far inside."""
     box = {"type": "box", "size_m": [2.0, 1.009, 0.5]}
-    other = {"body": box, "speed_kmh": 36, "from_m": 15, "impact_location": (1 - overlap_m + 0.5045 + 1 + 1) / 2}
-    return Encounter.model_validate({"name": "g", "ego": {"speed_kmh": 36} | ego, "other": other})
+    other = {"body": box, "speed_kmh": 36, "approach_distance_m": 15, "impact_location": (1 - overlap_m + 0.5045 + 1 + 1) / 2}
+    return Encounter.model_validate({"name": "g", "ego": {"speed_kmh": 36} | ego, "road_user": other})
 
 
 def test_a_touch_of_less_than_a_millisecond_is_one():
@@ -136,8 +136,8 @@ def test_a_touch_of_less_than_a_millisecond_is_one():
 
 @pytest.mark.parametrize("speed_kmh", [36.0, -36.0])
 def test_rows_of_obstacles_lie_where_the_ego_comes_from_or_beyond(speed_kmh):
-    rows = [{"body": BOX, "gap_m": 0.5}, {"body": WALL, "beside_m": 2.0, "gap_m": 0.4}]
-    beyond = {"body": BOX, "side": "left", "where": "beyond", "yaw_deg": 90, "gap_m": 0.3, "beside_m": 0.7}
+    rows = [{"body": BOX, "longitudinal_gap_m": 0.5}, {"body": WALL, "lateral_gap_m": 2.0, "longitudinal_gap_m": 0.4}]
+    beyond = {"body": BOX, "side": "left", "position": "beyond", "yaw_deg": 90, "longitudinal_gap_m": 0.3, "lateral_gap_m": 0.7}
     staged = StagedEncounter(crossing(speed_kmh, {"body": BOX}, obstacles=[*rows, beyond]), SOLID)
     back = -math.copysign(1.0, speed_kmh)
     placed = {
@@ -152,14 +152,14 @@ def test_rows_of_obstacles_lie_where_the_ego_comes_from_or_beyond(speed_kmh):
 @pytest.mark.parametrize("speed_kmh", [36.0, -31.7])
 @pytest.mark.parametrize("yaw_deg", [0.0, 17.0])
 def test_bodies_may_touch(speed_kmh, yaw_deg):
-    row = [{"body": body, "gap_m": 0.0, "beside_m": 0.0, "yaw_deg": yaw_deg} for body in ("van", "suv", WALL, BOX)]
-    assert len(StagedEncounter(crossing(speed_kmh, {"from_m": 0.7}, obstacles=row), SOLID).obstacles) == 4
+    row = [{"body": body, "longitudinal_gap_m": 0.0, "lateral_gap_m": 0.0, "yaw_deg": yaw_deg} for body in ("van", "suv", WALL, BOX)]
+    assert len(StagedEncounter(crossing(speed_kmh, {"approach_distance_m": 0.7}, obstacles=row), SOLID).obstacles) == 4
 
 
 def test_a_bend_ends_at_the_meeting_and_is_as_long_as_its_angle():
     turning = Encounter.model_validate(
-        {"name": "t", "ego": {"speed_kmh": 18, "radius_m": 8, "turn_deg": 90}, "seconds": 4,
-         "other": {"body": "child_120cm", "speed_kmh": 5, "from_m": 4}}
+        {"name": "t", "ego": {"speed_kmh": 18, "radius_m": 8, "turn_deg": 90}, "max_lead_time_s": 4,
+         "road_user": {"body": "child_120cm", "speed_kmh": 5, "approach_distance_m": 4}}
     )  # fmt: skip
     staged = StagedEncounter(turning, SOLID)
     bend_s = 8 * math.pi / 2 / 5
@@ -194,14 +194,14 @@ def test_the_first_run_is_that_of_all_looks_with_few_of_them(looks):
 
 
 CAMERA = {
-    "type": "camera", "name": "cam", "mount": {"x_m": 2.05, "z_m": 0.9}, "width": 240, "band": 160, "fov_deg": 90,
+    "type": "camera", "name": "cam", "mount": {"x_m": 2.05, "z_m": 0.9}, "width": 240, "height": 160, "fov_deg": 90,
     "stride": 2, "max_range_m": 60, "rate_hz": 20,
 }  # fmt: skip
 RADAR = {
     "type": "radar", "name": "radar", "mount": {"x_m": 2.05, "z_m": 0.5}, "horizontal_fov_deg": 90,
     "vertical_fov_deg": [-8, 8], "azimuth_cell_deg": 6, "range_cell_m": 0.4, "max_range_m": 40,
 }  # fmt: skip
-HIDDEN = [{"body": WALL, "beside_m": 0.4, "gap_m": 0.5}, {"body": BOX, "side": "left", "where": "beyond"}]
+HIDDEN = [{"body": WALL, "lateral_gap_m": 0.4, "longitudinal_gap_m": 0.5}, {"body": BOX, "side": "left", "position": "beyond"}]
 
 
 def test_points_are_those_of_a_simulation_with_the_other_in_the_world():
@@ -277,7 +277,7 @@ def test_a_sensor_that_is_slower_than_the_encounter_is_too_late():
         found = sighted(mounted(lidar(rate_hz=1)), crossing(), Criterion(), phases=2)
     assert not found.ttc_s.any()
     assert found.ttc_s.max() < found.censoring_ttc_s
-    unseen = crossing(20.0, {"from_m": None, "speed_kmh": 0}, seconds=2)
+    unseen = crossing(20.0, {"approach_distance_m": None, "speed_kmh": 0}, seconds=2)
     with pytest.warns(UserWarning, match="too late, whatever it sees"):
         found = sighted(mounted(lidar(rate_hz=1)), unseen, Criterion(), phases=2)
     assert not found.ttc_s.any()
@@ -285,7 +285,7 @@ def test_a_sensor_that_is_slower_than_the_encounter_is_too_late():
 
 
 def test_fog_hides_what_is_beyond_and_it_is_said_what_was_there_from_the_beginning():
-    far = crossing(72.0, {"from_m": None, "speed_kmh": 0}, seconds=3)
+    far = crossing(72.0, {"approach_distance_m": None, "speed_kmh": 0}, seconds=3)
     sensor = lidar(channels=60, vertical_fov_deg=[-4, 0], columns=7200, max_range_m=80)
     found = [sighted(mounted(sensor), case, Criterion(points=1), phases=2) for case in (
         far, far.model_copy(update={"weather": crossing(weather="fog_50m").weather}))]  # fmt: skip
@@ -296,13 +296,13 @@ def test_fog_hides_what_is_beyond_and_it_is_said_what_was_there_from_the_beginni
 
 
 FAMILY = {
-    "name": "f", "ego": {"speed_kmh": [20, 40]}, "other": {"body": "child_120cm", "speed_kmh": {"from": 3, "to": 7},
-    "impact_location": {"from": 0.2, "to": 0.8}, "from_m": 1.5}, "obstacles": [{"body": ["hatchback", "van"]}],
+    "name": "f", "ego": {"speed_kmh": [20, 40]}, "road_user": {"body": "child_120cm", "speed_kmh": {"from": 3, "to": 7},
+    "impact_location": {"from": 0.2, "to": 0.8}, "approach_distance_m": 1.5}, "obstacles": [{"body": ["hatchback", "van"]}],
 }  # fmt: skip
 
 
 def test_lists_are_combined_and_ranges_drawn_evenly_for_each_combination():
-    these = EncounterSet.model_validate({"name": "s", "draws": 8, "encounters": [FAMILY]}).encounters
+    these = EncounterSet.model_validate({"name": "s", "num_samples": 8, "encounters": [FAMILY]}).encounters
     assert len(these) == 2 * 2 * 8
     assert [one.name for one in these[::8]] == ["f: hatchback", "f: van"] * 2
     assert [one.ego.speed_kmh for one in these[::8]] == [20, 20, 40, 40]
@@ -313,7 +313,7 @@ def test_lists_are_combined_and_ranges_drawn_evenly_for_each_combination():
 
 
 def test_rows_are_of_speeds_with_intervals_over_draws():
-    these = EncounterSet.model_validate({"name": "s", "draws": 8, "encounters": [FAMILY | {"obstacles": []}]})
+    these = EncounterSet.model_validate({"name": "s", "num_samples": 8, "encounters": [FAMILY | {"obstacles": []}]})
     two = rig(high("ahead"), high("top", columns=40))
     found = evaluate_encounters([two], these, Criterion(points=3), num_start_offsets=3, vehicle="suv")
     rows = found.rows
@@ -339,7 +339,7 @@ def test_rows_are_of_speeds_with_intervals_over_draws():
 def test_in_time_up_to_a_speed_is_in_time_at_all_that_are_slower():
     these = EncounterSet.model_validate(
         {"name": "s", "encounters": [FAMILY | {"ego": {"speed_kmh": [50, 10, 30]}, "obstacles": [], "other":
-         {"body": "child_120cm", "speed_kmh": 5, "from_m": 1.5}}]}
+         {"body": "child_120cm", "speed_kmh": 5, "approach_distance_m": 1.5}}]}
     )  # fmt: skip
     partly = evaluate_encounters(rig(high("ahead")), these, num_start_offsets=5)
     ttc_s = np.sort(partly.detections[0].ttc_s)
@@ -353,7 +353,7 @@ def test_in_time_up_to_a_speed_is_in_time_at_all_that_are_slower():
         )
         assert list(found.find_max_speeds_kmh().values()) == pytest.approx([expected], nan_ok=True)
         assert found.build_tables()[0].rows[0][1].text == words
-    standing = [crossing(float(kmh), {"from_m": 3}) for kmh in (-50, 0, -20)]
+    standing = [crossing(float(kmh), {"approach_distance_m": 3}) for kmh in (-50, 0, -20)]
     both = EncounterSet(name="s", encounters=tuple(standing))
     found = evaluate_encounters(rig(high("ahead")), both, Criterion(deceleration_mps2=1.0), num_start_offsets=2)
     assert (list(found.find_max_speeds_kmh().values()), found.build_tables()[0].rows[0][1].text) == ([0.0], "0")
@@ -361,9 +361,9 @@ def test_in_time_up_to_a_speed_is_in_time_at_all_that_are_slower():
 
 
 def test_a_film_shows_where_everybody_is_and_what_is_on_the_other():
-    other = {"body": "child_120cm", "speed_kmh": 5, "from_m": 2.0}
+    other = {"body": "child_120cm", "speed_kmh": 5, "approach_distance_m": 2.0}
     these = EncounterSet.model_validate(
-        {"name": "s", "encounters": [FAMILY | {"ego": {"speed_kmh": [20, 90]}, "other": other}]}
+        {"name": "s", "encounters": [FAMILY | {"ego": {"speed_kmh": [20, 90]}, "road_user": other}]}
     )
     two = rig(high("ahead"), high("top", columns=40))
     pictures = list(
@@ -395,15 +395,15 @@ def test_a_film_shows_where_everybody_is_and_what_is_on_the_other():
 
 
 MISTAKES = [
-    ({"ego": {"speed_kmh": 0}, "other": {"body": "child_120cm", "speed_kmh": 0}}, "nobody moves"),
-    ({"other": {"body": "child_12cm", "speed_kmh": 5}}, "is 'child_120cm' or 'child_110cm' meant"),
-    ({"other": {"body": "child_120cm", "speed_kmh": 5, "from_m": -1}}, "from_m"),
+    ({"ego": {"speed_kmh": 0}, "road_user": {"body": "child_120cm", "speed_kmh": 0}}, "nobody moves"),
+    ({"road_user": {"body": "child_12cm", "speed_kmh": 5}}, "is 'child_120cm' or 'child_110cm' meant"),
+    ({"road_user": {"body": "child_120cm", "speed_kmh": 5, "approach_distance_m": -1}}, "approach_distance_m"),
     ({"ego": {"speed_kmh": []}}, "encounters.0: ego.speed_kmh: a list of values is empty"),
     ({"ego": {"speed_kmh": {"from": 5, "to": 5}}}, "encounters.0: ego.speed_kmh: from 5 must be below to 5"),
     ({"ego": {"speed_kmh": {"from": 5, "to": "x"}}}, "two numbers from and to"),
     ({"ego": {"speed_kmh": [10, 20], "radius_m": 0.1}}, "radius_m: at least 1 m"),
     ({"weather": "fog"}, "is 'fog_50m' meant|fog_100m"),
-    ({"ego": {"speed_kmh": list(range(1, 201))}, "seconds": list(range(1, 60))},
+    ({"ego": {"speed_kmh": list(range(1, 201))}, "max_lead_time_s": list(range(1, 60))},
      "encounters.0: 11,800 encounters of a family, of at most 10,000"),
     ({"obstacle": []}, "obstacle"),
     (
@@ -418,7 +418,7 @@ MISTAKES = [
 
 @pytest.mark.parametrize(("keys", "told"), MISTAKES)
 def test_a_family_that_makes_no_sense_is_told_once(keys, told, tmp_path):
-    family = {"name": "f", "ego": {"speed_kmh": 10}, "other": {"body": "child_120cm", "speed_kmh": 5}} | keys
+    family = {"name": "f", "ego": {"speed_kmh": 10}, "road_user": {"body": "child_120cm", "speed_kmh": 5}} | keys
     path = tmp_path / "set.yaml"
     path.write_text(yaml.safe_dump({"name": "s", "encounters": [family]}))
     with pytest.raises((ValueError, FileNotFoundError), match=told) as failure:
@@ -428,7 +428,7 @@ def test_a_family_that_makes_no_sense_is_told_once(keys, told, tmp_path):
 
 def test_families_of_one_name_are_told():
     families = [
-        {"name": "f", "ego": {"speed_kmh": kmh}, "other": {"body": "child_120cm", "speed_kmh": 5}} for kmh in (10, 20)
+        {"name": "f", "ego": {"speed_kmh": kmh}, "road_user": {"body": "child_120cm", "speed_kmh": 5}} for kmh in (10, 20)
     ]
     with pytest.raises(ValueError, match=r"encounters.1: encounters.0 is called 'f', too"):
         EncounterSet.model_validate({"name": "s", "encounters": families})
@@ -437,13 +437,13 @@ def test_families_of_one_name_are_told():
 @pytest.mark.parametrize(
     ("case", "told"),
     [
-        (crossing(36, {"impact_location": 3.0, "yaw_deg": 0, "from_m": 4}), "never touch"),
+        (crossing(36, {"impact_location": 3.0, "yaw_deg": 0, "approach_distance_m": 4}), "never touch"),
         (crossing(5.4, {"yaw_deg": 0}), "overlap from the beginning|never touch"),
         (crossing(36, {"body": BOX, "yaw_deg": 0, "speed_kmh": 36}), "overlap from the beginning"),
-        (crossing(36, obstacles=[{"body": WALL, "beside_m": -1.0}]), "'box' is in the way of the ego"),
-        (crossing(36, {"from_m": 3}, obstacles=[{"body": WALL, "gap_m": -1.0}]), "'box' is in the way of the other"),
+        (crossing(36, obstacles=[{"body": WALL, "lateral_gap_m": -1.0}]), "'box' is in the way of the ego"),
+        (crossing(36, {"approach_distance_m": 3}, obstacles=[{"body": WALL, "longitudinal_gap_m": -1.0}]), "'box' is in the way of the other"),
         (
-            crossing(36, obstacles=[{"body": WALL}, {"body": "van", "gap_m": -0.1}]),
+            crossing(36, obstacles=[{"body": WALL}, {"body": "van", "longitudinal_gap_m": -0.1}]),
             "'box' and 'van' are inside one anot",
         ),
     ],
@@ -455,6 +455,6 @@ def test_ways_that_never_meet_or_are_blocked_are_mistakes(case, told):
 
 def test_mistakes_of_the_last_encounter_are_told_before_the_first_look(monkeypatch):
     monkeypatch.setattr(MountedRig, "mounted", None)
-    both = crossing(), crossing(36, {"impact_location": 3.0, "yaw_deg": 0, "from_m": 4})
+    both = crossing(), crossing(36, {"impact_location": 3.0, "yaw_deg": 0, "approach_distance_m": 4})
     with pytest.raises(ValueError, match="never touch"):
         evaluate_encounters(rig(), EncounterSet(name="s", encounters=both))

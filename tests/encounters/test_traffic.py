@@ -61,7 +61,7 @@ def scenario(tmp_path_factory):
 AHEAD = {"mount": {"x_m": 1.0, "z_m": 1.8}, "channels": 40, "columns": 240, "horizontal_fov_deg": 80,
          "vertical_fov_deg": [-12, 4], "max_range_m": 60}  # fmt: skip
 AROUND = AHEAD | {"channels": 16, "columns": 720, "horizontal_fov_deg": 360}
-CAMERA = {"type": "camera", "name": "cam", "mount": {"x_m": 2.05, "z_m": 0.9}, "width": 240, "band": 160,
+CAMERA = {"type": "camera", "name": "cam", "mount": {"x_m": 2.05, "z_m": 0.9}, "width": 240, "height": 160,
           "fov_deg": 90, "stride": 2, "max_range_m": 60, "rate_hz": 10}  # fmt: skip
 SENSORS = lidar("noisy", **AHEAD, range_noise_m=0.2), lidar("slow", **AROUND, dropout=0.4, rate_hz=5), CAMERA
 TOP = lidar(**AHEAD)
@@ -214,7 +214,7 @@ def test_a_lorry_and_its_trailer_are_one_road_user():
 
 
 @pytest.mark.parametrize(
-    ("ego_mps", "other_mps", "from_m", "needed_s"),
+    ("ego_mps", "other_mps", "approach_distance_m", "needed_s"),
     [
         (10, (-10, 0), (50, 0), 10 / 9 * 0.75 + 0.5),
         (10, (4, 0), (50, 0), 6 / 18 + 0.5),
@@ -223,11 +223,11 @@ def test_a_lorry_and_its_trailer_are_one_road_user():
         (10, (9.9, 4), (-3, -8), 0.0),
     ],
 )
-def test_braking_is_needed_where_it_helps(ego_mps, other_mps, from_m, needed_s):
+def test_braking_is_needed_where_it_helps(ego_mps, other_mps, approach_distance_m, needed_s):
     times_s = STEP_S * np.arange(60)
     ego = np.tile(np.eye(4), (60, 1, 1))
     ego[:, 0, 3] = ego_mps * times_s
-    way_m = np.pad(np.array(from_m) + np.outer(times_s, other_mps), ((0, 0), (0, 1)))
+    way_m = np.pad(np.array(approach_distance_m) + np.outer(times_s, other_mps), ((0, 0), (0, 1)))
     track = Track("t", "car", "passenger", (4.0, 2.0, 1.5), Trajectory.from_arrays(times_s, way_m, np.zeros((60, 3))))
     there = Drive("w", times_s, ego, BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5)), [track])
     (one,) = find_approaches(there, Criterion(max_ttc_s=20.0, consecutive_scans=1))
@@ -318,10 +318,10 @@ class Closing(SyntheticDrive):
 def test_real_road_users_are_first_hit_as_their_layout_says(layout, tmp_path):
     recording = open_recording(LAYOUTS[layout](Closing(steps=15), tmp_path))
     (one,) = evaluate_recorded_encounters(recording).detections
-    gap_m = 50.0 - CAR_SIZE_M[0] / 2 - recording.ego_box.upper_m[0]
+    longitudinal_gap_m = 50.0 - CAR_SIZE_M[0] / 2 - recording.ego_box.upper_m[0]
     assert one.encounter.name == "cars and vans"
-    assert one.encounter.ttc_s[0] == pytest.approx((gap_m - one.encounter.frame_index) / 10, abs=0.02)
-    assert one.ttc_s[0] == pytest.approx((gap_m - 10) / 10, abs=0.02)
+    assert one.encounter.ttc_s[0] == pytest.approx((longitudinal_gap_m - one.encounter.frame_index) / 10, abs=0.02)
+    assert one.ttc_s[0] == pytest.approx((longitudinal_gap_m - 10) / 10, abs=0.02)
     assert one.braking_time_s == pytest.approx(10 / 18 + 0.5, abs=0.01)
 
 

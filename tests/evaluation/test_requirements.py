@@ -322,7 +322,7 @@ def box(tmp_path):
 
 
 def test_times_to_collision_are_the_latest_of_all_phases(box):
-    walker = {"body": "child_120cm", "speed_kmh": 5, "from_m": 4}
+    walker = {"body": "child_120cm", "speed_kmh": 5, "approach_distance_m": 4}
     crossings = {"name": "two", "encounters": [{"name": "a", "ego": {"speed_kmh": [10, 30]}, "road_user": walker}]}
     criterion = {"points": 1, "pixels": 20}
     one = {
@@ -369,7 +369,7 @@ def test_who_is_seen_from_the_beginning_may_have_been_before(box):
     assert [cell.text for cell in table.rows[1]][2:5] == ["not decided", f"{ttc.value:.4g} or more", "-"]
     with pytest.raises(ValueError, match=r"1\.5 s are required, and encounter 'a' at 20 km/h .* lasts 1\.1\d s"):
         check(two, asked({**one, "ttc_s": 1.5}), vehicle=box)
-    way["road_user"]["from_m"] = 1.65  # comes then
+    way["road_user"]["approach_distance_m"] = 1.65  # comes then
     assert check(two, asked({**one, "ttc_s": 1.1}), vehicle=box).is_met is False
 
 

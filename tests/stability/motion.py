@@ -119,7 +119,7 @@ def contacts():
         for other_kmh in (0.0, *SPEEDS_KMH):
             other = {"body": {"type": "box", "size_m": OTHER_M}, "speed_kmh": other_kmh}
             staged = StagedEncounter(
-                Encounter.model_validate({"name": "e", "ego": {"speed_kmh": ego_kmh}, "other": other, "seconds": 2.0}),
+                Encounter.model_validate({"name": "e", "ego": {"speed_kmh": ego_kmh}, "road_user": other, "max_lead_time_s": 2.0}),
                 ego,
             )
             # The other heads along y: its width is before the ego's front, its length beside its sides.
@@ -148,9 +148,9 @@ def sights():
         "horizontal_fov_deg": 10, "columns": 5000, "max_range_m": 200, "rate_hz": 1000,
     }  # fmt: skip
     one_rig = MountedRig(Rig.model_validate({"name": "r", "sensors": [lidar(**scanner)]}), scenario)
-    walls = [{"body": {"type": "box", "size_m": [3.0, 0.5, 3.0]}, "beside_m": 0.6, "gap_m": 1.0}]
-    other = {"body": {"type": "box", "size_m": [0.02, 0.02, 2.0]}, "speed_kmh": 5.4, "from_m": 2.1}
-    one = {"name": "e", "ego": {"speed_kmh": FASTEST_KMH}, "other": other, "obstacles": walls}
+    walls = [{"body": {"type": "box", "size_m": [3.0, 0.5, 3.0]}, "lateral_gap_m": 0.6, "longitudinal_gap_m": 1.0}]
+    other = {"body": {"type": "box", "size_m": [0.02, 0.02, 2.0]}, "speed_kmh": 5.4, "approach_distance_m": 2.1}
+    one = {"name": "e", "ego": {"speed_kmh": FASTEST_KMH}, "road_user": other, "obstacles": walls}
     sighting = detect_encounter(
         one_rig,
         StagedEncounter(Encounter.model_validate(one), one_rig.ego_solid),
@@ -184,10 +184,10 @@ def run_into(step):
         place_m, speed_mps = -np.cumsum(10.0 ** generator.uniform(-3, 2, 200)), generator.uniform(0.0, 70.0, 200)
         for _ in range(200):
             ahead_m, ahead_mps = np.append(0.0, place_m[:-1]), np.append(0.0, speed_mps[:-1])
-            gap_m = ahead_m - place_m
-            tight = compute_gap_ratio(driver, speed_mps, gap_m, speed_mps - ahead_mps)
+            longitudinal_gap_m = ahead_m - place_m
+            tight = compute_gap_ratio(driver, speed_mps, longitudinal_gap_m, speed_mps - ahead_mps)
             wanted_mps2 = compute_acceleration_mps2(driver, speed_mps, tight, driver.desired_speed_mps)
-            way_m, speed_mps = step(speed_mps, wanted_mps2, gap_m, step_s)
+            way_m, speed_mps = step(speed_mps, wanted_mps2, longitudinal_gap_m, step_s)
             place_m = place_m + way_m
         hit += int((np.append(0.0, place_m[:-1]) < place_m - 1e-9).sum())
     return hit

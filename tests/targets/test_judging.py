@@ -124,7 +124,7 @@ def test_the_files_hold_what_the_map_holds(tmp_path):
     assert names == ["targets.csv", "targets.npz", "report.html", "targets.png", "summary.json"]
     with np.load(tmp_path / "targets.npz") as arrays:
         np.testing.assert_array_equal(arrays["points"], seen.points)
-        np.testing.assert_array_equal(arrays["compute_detection_border_m"], seen.compute_detection_border_m())
+        np.testing.assert_array_equal(arrays["detection_border_m"], seen.compute_detection_border_m())
         assert json.loads(str(arrays["settings"]))["raster"] == {"x": [-3, 3], "y": [-2, 2], "step_m": 1}
         assert arrays["x_m"].tolist() == [-2.5, -1.5, -0.5, 0.5, 1.5, 2.5]
     rows = list(csv.DictReader((tmp_path / "targets.csv").read_text().splitlines()))
@@ -172,8 +172,8 @@ def test_names_become_bodies(tmp_path):
     ("options", "message"),
     [
         ({"raster": Raster((3.0, 3.2), (0.0, 0.2), 0.2)}, "larger than the raster of 0.2 x 0.2 m"),
-        ({"num_frames": 0}, "steps"),
-        ({"hits": 0}, "hits"),
+        ({"num_frames": 0}, "num_frames"),
+        ({"detection_points": 0}, "detection_points"),
         ({"threshold_m": -1.0}, "threshold"),
         ({"heading": "up"}, "narrow, wide or degrees"),
         ({"target": "moon"}, "'moon' is neither"),

@@ -50,7 +50,7 @@ def test_the_numbers_are_those_of_targets_over_the_same_cells(name, bodies, monk
             module, "sample_reference_pose", lambda *_: build_transform(np.eye(3), np.array([0.3, 0.2, 1.3]))
         )
     found = measure_target_visibility(TOP, scenario, target, Raster.from_vehicle(scenario.compute_ego_box(), 3.0))
-    probes = probed(simulated(scenario, num_frames=1), body=name, places=ALL)
+    probes = probed(simulated(scenario, num_frames=1), body=name, positions_per_region=ALL)
     x, y = (torch.from_numpy(each) for each in found.raster.positions_m.T)
     for number, region in enumerate(probes.regions):
         cells = region.mask_points(x, y).numpy().reshape(found.raster.shape)
@@ -83,10 +83,10 @@ def test_every_place_of_a_region_is_as_likely_as_any_other_and_so_the_budget_mov
 
 def test_a_mirror_symmetric_rig_is_symmetric_exactly_in_all_places_and_within_errors_in_some():
     frames = simulated(world(), num_frames=32)
-    every = probed(frames, [0], places=ALL)
+    every = probed(frames, [0], positions_per_region=ALL)
     assert numbers(every, LEFT)[0].value == numbers(every, RIGHT)[0].value
     assert 0.1 < numbers(every, LEFT)[0].value < 0.9
-    some = probed(frames, places=3)
+    some = probed(frames, positions_per_region=3)
     (left, *_), (right, *_) = numbers(some, LEFT), numbers(some, RIGHT)
     assert 0.01 < left.error < 0.15
     for one in (left, right):
@@ -113,7 +113,7 @@ def test_parts_and_other_processes_add_up_to_the_whole(tmp_path):
 
 
 def test_where_nothing_is_free_the_number_is_unknown_with_a_count():
-    probes = probed(simulated(world(BLOCK), num_frames=8), body="child", places=3)
+    probes = probed(simulated(world(BLOCK), num_frames=8), body="child", positions_per_region=3)
     left, right = probes.get_target_sums("small").summarize()[LEFT:]
     assert (left.num_cells, left.observed_cells, left.visible_m2) == (24, 0, pytest.approx(np.nan, nan_ok=True))
     assert all(np.isnan([one.value, one.error]).all() and one.count == 0 for one in left.numbers.values())

@@ -18,7 +18,7 @@ from .worlds import EGO, RASTER, WALL, drive, lidar, on_target, rig, world
 FREE, OCCUPIED, OUTSIDE = range(len(STATES))
 REFERENCE = PaperReference(rows=2, columns=2)
 CAMERA = {
-    "type": "camera", "name": "cam", "mount": {"x_m": 2.1, "z_m": 0.8}, "width": 180, "band": 100, "fov_deg": 100,
+    "type": "camera", "name": "cam", "mount": {"x_m": 2.1, "z_m": 0.8}, "width": 180, "height": 100, "fov_deg": 100,
     "stride": 2, "max_range_m": 3.5, "min_range_m": 1.0,
 }  # fmt: skip
 

@@ -160,7 +160,7 @@ def _compare_saved(files: list[str], given: dict[str, Any], *, only: bool) -> No
         )
     with join_run(given["out"]) as ranks:
         result = compare(files)
-        save_and_print(result, ranks=ranks, **{name: given[name] for name in SAVING})
+        save_and_print(result, given["out"], ranks, file_kinds=given["files"], explain=given["explain"])
 
 
 def open_frames(
