@@ -40,11 +40,11 @@ def test_a_rig_is_drawn_on_the_ego_of_a_scenario(torchcover, worlds, drawn):
     assert [sensor.name for sensor in sensors] == ["front", "rear"]
     assert sensors[1].vertical_fov_deg == pytest.approx((-30.0, 0.0))
     assert (sensors[1].horizontal_fov_deg, sensors[1].range_m) == (90.0, 60.0)
-    assert sensors[1].sees(np.array([[-1.0, 0.0, -0.1], [1.0, 0.0, -0.1]])).tolist() == [True, False]
+    assert sensors[1].contains(np.array([[-1.0, 0.0, -0.1], [1.0, 0.0, -0.1]])).tolist() == [True, False]
 
 
 def test_a_scenario_is_drawn_in_the_frame_of_the_ego(torchcover, worlds, drawn):
-    code, _, _ = torchcover("show", worlds / "yard.yaml", "--rig", worlds / "low.yaml", "--step", 3, "--out", worlds)
+    code, _, _ = torchcover("show", worlds / "yard.yaml", "--rig", worlds / "low.yaml", "--frame-index", 3, "--out", worlds)
     assert code == 0
     assert min(imread(worlds / "yard.png").shape[:2]) > 500
     ahead, far = drawn["actors"]
@@ -152,8 +152,8 @@ def test_a_vehicle_is_drawn_with_its_mount_regions_on_its_skin(torchcover, tmp_p
         description: A box on wheels that are left out.
         parts: [{name: body, shape: {type: box, size_m: [3.0, 1.0, 0.8]}}]
         mount_regions:
-          lid: {seen_from: above, x_m: [-1.0, 1.0], y_m: [-0.4, 0.4]}
-          tail: {seen_from: rear, y_m: [-0.3, 0.3], z_m: [0.2, 0.6]}
+          lid: {side: above, x_m: [-1.0, 1.0], y_m: [-0.4, 0.4]}
+          tail: {side: rear, y_m: [-0.3, 0.3], z_m: [0.2, 0.6]}
         """
     )
     code, printed, _ = torchcover("show", tmp_path / "cart.yaml", "--out", tmp_path)
@@ -173,7 +173,7 @@ def test_a_vehicle_is_drawn_with_its_mount_regions_on_its_skin(torchcover, tmp_p
 def test_a_region_beside_the_body_is_named(torchcover, tmp_path):
     (tmp_path / "cart.yaml").write_text(
         "name: cart\nparts: [{name: body, shape: {type: box, size_m: [3.0, 1.0, 0.8]}}]\n"
-        "mount_regions: {lid: {seen_from: above, x_m: [1.0, 2.0], y_m: [-0.4, 0.4]}}\n"
+        "mount_regions: {lid: {side: above, x_m: [1.0, 2.0], y_m: [-0.4, 0.4]}}\n"
     )
     code, _, error = torchcover("show", tmp_path / "cart.yaml", "--out", tmp_path)
     assert code == 2
@@ -198,7 +198,7 @@ def test_the_depth_images_of_a_rig_are_those_of_its_cameras_in_the_frame(torchco
     )
     (worlds / "drive.csv").write_text("t,x,y,z,roll,pitch,yaw\n0,0,0,0,0,0,0\n0.5,2.5,0,0,0,0,0\n1,5,0,0,0,0,0\n")
     code, printed, _ = torchcover(
-        "show", worlds / "cameras.yaml", "--scenario", worlds / "wall.yaml", "--step", 2, "--out", worlds
+        "show", worlds / "cameras.yaml", "--scenario", worlds / "wall.yaml", "--frame-index", 2, "--out", worlds
     )
     assert code == 0
     assert "cameras_depth.png" in printed
@@ -239,15 +239,15 @@ def test_every_built_in_rig_has_fields_of_view_within_bounds(name):
         (["none.yaml"], "none.yaml: no such file"),
         (["kitti", "--rig", "nuscenes"], "--rig: for a scenario only, and 'kitti' is a rig"),
         (
-            ["kitti", "--step", "1", "--seed", "2"],
-            "--step, --seed: for a scenario or cameras only, and 'kitti' is a rig",
+            ["kitti", "--frame-index", "1", "--seed", "2"],
+            "--frame-index, --seed: for a scenario or cameras only, and 'kitti' is a rig",
         ),
         (["courtyard", "--scenario", "urban"], "--scenario: for a rig only, and 'courtyard' is a scenario"),
-        (["suv", "--step", "1"], "--step: for rigs and scenarios only, and 'suv' is a vehicle"),
+        (["suv", "--frame-index", "1"], "--frame-index: for rigs and scenarios only, and 'suv' is a vehicle"),
         (["suv", "--animation", "x.gif"], "--animation: for a scenario only, and 'suv' is a vehicle"),
         (["courtyard", "--rig", "moon"], "built-in rigs; is "),
         (["kitti", "--scenario", "moon"], "built-in scenarios; is "),
-        (["courtyard", "--step", "-1"], "--step"),
+        (["courtyard", "--frame-index", "-1"], "--frame-index"),
         ([], "Missing argument"),
     ],
 )
@@ -319,7 +319,7 @@ def test_it_prints_where_the_numbers_of_a_rig_come_from(torchcover, tmp_path):
 def test_a_film_shows_what_follows(torchcover, worlds, monkeypatch):
     monkeypatch.setattr(show, "FILM_S", 0.3)
     code, printed, _ = torchcover(
-        "show", worlds / "yard.yaml", "--rig", worlds / "low.yaml", "--animation", worlds / "new" / "a.gif", "--step", 1
+        "show", worlds / "yard.yaml", "--rig", worlds / "low.yaml", "--animation", worlds / "new" / "a.gif", "--frame-index", 1
     )
     assert (code, "a.gif" in printed) == (0, True)
     with Image.open(worlds / "new" / "a.gif") as film:

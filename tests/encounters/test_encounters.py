@@ -50,7 +50,7 @@ def mounted(*sensors):
 
 
 def sighted(mounted_rig, case, criterion, **keys):
-    return detect_encounter(mounted_rig, StagedEncounter(case, mounted_rig.ego), criterion, **keys)
+    return detect_encounter(mounted_rig, StagedEncounter(case, mounted_rig.ego_solid), criterion, **keys)
 
 
 def ahead(name="ahead", **keys):
@@ -454,7 +454,7 @@ def test_ways_that_never_meet_or_are_blocked_are_mistakes(case, told):
 
 
 def test_mistakes_of_the_last_encounter_are_told_before_the_first_look(monkeypatch):
-    monkeypatch.setattr(MountedRig, "mounted", None)
+    monkeypatch.setattr(MountedRig, "get_mounted_sensors", None)
     both = crossing(), crossing(36, {"impact_location": 3.0, "yaw_deg": 0, "approach_distance_m": 4})
     with pytest.raises(ValueError, match="never touch"):
         evaluate_encounters(rig(), EncounterSet(name="s", encounters=both))

@@ -119,7 +119,7 @@ def test_lidars_count_together_by_steps_and_who_looks_more_often_loses_nothing(d
     assert (eyes.scan_periods, eyes.frame_strides) == ([1, 2, None], [1, 2, 1])
     child, _ = find_approaches(there, Criterion())
     middle_m = [
-        there.tracks[0].trajectory.at(STEP_S * step)[:3, 3] - [10 * STEP_S * step, 0, -0.5] for step in range(31)
+        there.tracks[0].trajectory.interpolate(STEP_S * step)[:3, 3] - [10 * STEP_S * step, 0, -0.5] for step in range(31)
     ]
 
     def detected_s(*steps):

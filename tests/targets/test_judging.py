@@ -125,7 +125,7 @@ def test_the_files_hold_what_the_map_holds(tmp_path):
     with np.load(tmp_path / "targets.npz") as arrays:
         np.testing.assert_array_equal(arrays["points"], seen.points)
         np.testing.assert_array_equal(arrays["detection_border_m"], seen.compute_detection_border_m())
-        assert json.loads(str(arrays["settings"]))["raster"] == {"x": [-3, 3], "y": [-2, 2], "step_m": 1}
+        assert json.loads(str(arrays["settings"]))["raster"] == {"x_bounds_m": [-3, 3], "y_bounds_m": [-2, 2], "cell_m": 1}
         assert arrays["x_m"].tolist() == [-2.5, -1.5, -0.5, 0.5, 1.5, 2.5]
     rows = list(csv.DictReader((tmp_path / "targets.csv").read_text().splitlines()))
     assert len(rows) == 24

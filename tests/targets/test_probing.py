@@ -38,7 +38,7 @@ def probed(frames, indices=None, body="pole", **budget):
 
 
 def numbers(probes, region, rig="small"):
-    bodies = probes.seen_by(rig)
+    bodies = probes.get_target_sums(rig)
     return list(bodies.estimate(bodies.regions[region], bodies.bodies[0]).numbers().values())
 
 

@@ -205,7 +205,7 @@ class EncounterSet(BuiltInDocument):
     @classmethod
     def _expand(cls, content: Any, info: ValidationInfo) -> Any:  # noqa: ANN401  (whatever stood in the file)
         families = content.get("encounters") if isinstance(content, dict) else None
-        draws, seed = (content.get(key, usual) for key, usual in (("draws", 16), ("seed", 0))) if families else (16, 0)
+        draws, seed = (content.get(key, usual) for key, usual in (("num_samples", 16), ("seed", 0))) if families else (16, 0)
         sound = isinstance(draws, int) and isinstance(seed, int) and 1 <= draws <= MOST and seed >= 0
         if not isinstance(families, list | tuple) or not sound:
             return content  # which is told field by field
