@@ -43,7 +43,7 @@ def both():
 
 
 def of_bodies(result, **wanted):
-    rows = [row for row in result.summary if row["average"] == "places"]
+    rows = [row for row in result.summary if row["average"] == "target_positions"]
     return [row for row in rows if all(row[name] == value for name, value in wanted.items())]
 
 

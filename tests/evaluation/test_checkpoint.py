@@ -167,7 +167,7 @@ def test_a_complete_run_goes_on_when_more_steps_are_wanted(frame_of, path):
     assert len(seen.names) == 12
     again = measured(Drive(frame_of, range(STEPS)), path, num_frames=12)  # not a frame is made
     assert bits(again) == bits(measured(Drive(frame_of), num_frames=12))
-    with pytest.raises(ValueError, match="steps: 12 are done in the checkpoint; got 11, which is less"):
+    with pytest.raises(ValueError, match="num_frames: 12 are done in the checkpoint; got 11, which is less"):
         measured(Drive(frame_of), path, num_frames=11)
 
 

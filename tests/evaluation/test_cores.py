@@ -159,4 +159,4 @@ def test_a_simulation_has_the_usual_workers_and_frames_of_others_none(monkeypatc
         with pytest.raises(KnownError) as found:
             evaluate("front_roof_32", **given)
         assert found.value.args == (expected,)
-    assert asked == [(64, 11, False), (measurement.ENOUGH_FRAMES, 43, True)]
+    assert asked == [(64, 11, False), (measurement.MeasurementParams().max_inspected_frames, 43, True)]

@@ -102,7 +102,7 @@ def test_one_rig(tmp_path):
         "frame_interval_s": 0.1,
         "notes": ["Rays that end on the own vehicle: roof 3,380 of 57,600 (5.9%)."],
     }
-    assert 0.5 * SMALL["rays"] < summary["reference"]["rays_per_frame"] < 1.5 * SMALL["rays"]
+    assert 0.5 * SMALL["num_rays"] < summary["reference"]["rays_per_frame"] < 1.5 * SMALL["num_rays"]
     loaded = Coverage.load(tmp_path / "new" / "out" / "coverage.npz")
     np.testing.assert_array_equal(loaded.radius, result.coverage.radius)
 
@@ -147,7 +147,7 @@ def test_any_source_of_frames_will_do():
 def test_a_target_error_is_an_object_here():
     result = torchcover.evaluate(frames=Single(), cell_m=4.0, target_error=TargetError(radius_m=10.0))
     assert result.run.num_frames == math.ceil(StoppingParams().min_growth * MIN_FRAMES)  # the second look
-    assert result.target_error_lines[0] == f"Target error reached after {result.run.num_frames} steps."
+    assert result.target_error_lines[0] == f"Target error reached after {result.run.num_frames} frames."
 
 
 class Single(Source):

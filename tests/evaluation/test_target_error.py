@@ -123,8 +123,8 @@ def test_a_run_stops_once_every_error_is_small_enough_at_two_looks_in_a_row():
     assert record["frames_needed"] == steps
     assert record["unobserved"] == ["near above", "far above"]
     assert lines == [
-        f"Target error reached after {steps} steps.",
-        "Not part of the target, as no cell of it is known: near above, far above.",
+        f"Target error reached after {steps} frames.",
+        "Not part of the target, as none of its cells is observed: near above, far above.",
     ]
 
 
@@ -133,7 +133,7 @@ def test_small_enough_once_is_not_reached():
     record, lines = summarize_target_error(TargetError(radius_m=1.0), coverages, REGIONS, is_confirmed=False)
     assert all(number["is_reached"] for number in record["numbers"])
     assert record["reached"] is False
-    assert lines[0].startswith("Target error not reached in 64 steps: every error is small enough now, but was not at")
+    assert lines[0].startswith("Target error not reached in 64 frames: every error is small enough, but not yet at two")
 
 
 @pytest.mark.parametrize("steps", [5, 63])
@@ -177,7 +177,7 @@ def test_what_all_steps_say_alike_is_not_waited_for_and_named():
     _, lines = summarize_target_error(
         TargetError(detection=0.5), {"a": filled(64).compute()}, REGIONS, is_confirmed=True
     )
-    assert [line for line in lines if "say the same" in line] == [
+    assert [line for line in lines if "the same value" in line] == [
         "Not part of the target, as all frames have the same value: far all, detection_0.4m of a; "
         "far all, detection_0.8m of a."
     ]

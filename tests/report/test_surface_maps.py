@@ -100,7 +100,9 @@ def test_what_is_drawn_weighs_as_much_as_the_region_has(coverage, sides):
     m2 = sum_over_squares(coverage.area_sums.totals()[0], sides)
     each = m2 / sum_over_squares(torch.ones_like(m2), sides)
     for band, height in enumerate(GRID.heights):
-        weighted = (compute_ratios(coverage.area_sums, sides)[:, band] * each[band]).nansum(dim=(1, 2)) / each[band].sum()
+        weighted = (compute_ratios(coverage.area_sums, sides)[:, band] * each[band]).nansum(dim=(1, 2)) / each[
+            band
+        ].sum()
         torch.testing.assert_close(weighted, coverage.estimate(ALL, height).value, rtol=1e-12, atol=0)
 
 
@@ -137,7 +139,9 @@ def test_open_ground_is_opaque_in_squares_that_the_grid_cuts_off_too():
         opacity = compute_opacity(sums_of(ground), 10, torch.full((1, 5, 5), side), CELL_M)
         torch.testing.assert_close(opacity, torch.ones_like(opacity), rtol=1e-12, atol=0)
         quarter = compute_opacity(sums_of(ground / 4), 10, torch.full((1, 5, 5), side), CELL_M)
-        torch.testing.assert_close(quarter, torch.full_like(quarter, (1 + MapParams.min_opacity) / 2), rtol=1e-12, atol=0)
+        torch.testing.assert_close(
+            quarter, torch.full_like(quarter, (1 + MapParams.min_opacity) / 2), rtol=1e-12, atol=0
+        )
 
 
 def test_infinity_stays_in_its_square():

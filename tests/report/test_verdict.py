@@ -68,7 +68,9 @@ def test_the_advised_number_of_frames_gives_intervals(points, frames):
     """Blocks of three frames, in which the reference sees more or less: 8 of them count as fewer."""
 
     def table_of(count):
-        metric = CoverageMetric(BevGrid(x_m=(-8.0, 12.0), y_m=(-5.0, 5.0), cell_m=1.0), num_blocks=16, has_area_weights=True)
+        metric = CoverageMetric(
+            BevGrid(x_m=(-8.0, 12.0), y_m=(-5.0, 5.0), cell_m=1.0), num_blocks=16, has_area_weights=True
+        )
         for index in range(count):
             m2 = torch.full((100,), 0.2 + 0.8 * (index % 5 > 1))
             metric.update(points(40, index), points(100, 1000 + index), weights=m2, block_index=index // 3)
@@ -120,7 +122,9 @@ def test_few_places_that_all_say_the_same_are_no_answer(trio):
 def test_a_single_point_of_failure_costs_a_tenth_or_more_beyond_chance(alone, blocks, sentence):
     """So many of 100 points does the roof see alone; sixty others are seen by both sensors."""
     grid = BevGrid(x_m=(-8.0, 12.0), y_m=(-5.0, 5.0), cell_m=1.0)
-    metric = CoverageMetric(grid, (0.01,), num_blocks=16, regions=AHEAD[:1], has_area_weights=True, sensor_names=("roof", "rear"))
+    metric = CoverageMetric(
+        grid, (0.01,), num_blocks=16, regions=AHEAD[:1], has_area_weights=True, sensor_names=("roof", "rear")
+    )
     for index in range(blocks):
         reference = torch.rand(100, 3, generator=torch.Generator().manual_seed(index)) * torch.tensor([4.0, 4.0, 0.2])
         seen = {"roof": reference[: 60 + alone(index)], "rear": reference[:60]}

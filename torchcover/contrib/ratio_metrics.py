@@ -83,7 +83,9 @@ class ObjectCoverage(SceneRatios):
             for stratum in strata.name_suffixes
         ]
         super().__init__(
-            ratios, {"threshold_m": float(threshold_m), "min_point_counts": tuple(min_point_counts), **strata.definition}, **kwargs
+            ratios,
+            {"threshold_m": float(threshold_m), "min_point_counts": tuple(min_point_counts), **strata.definition},
+            **kwargs,
         )
         self.strata = strata
         self.threshold_m = float(threshold_m)

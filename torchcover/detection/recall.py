@@ -152,7 +152,9 @@ class RecallByVisibility(MergeableMetric):
         }
         scores = tuple(float(score) for score in score_thresholds)
         _check_parameters(match_by, threshold, borders, scores)
-        super().__init__({"match_by": match_by, "threshold": threshold, **borders, "score_thresholds": scores}, **kwargs)
+        super().__init__(
+            {"match_by": match_by, "threshold": threshold, **borders, "score_thresholds": scores}, **kwargs
+        )
         self._box_counts: tuple[int, int] | None = (0, 0)  # low and all; None once it has been warned of
         self.match_by = match_by
         self.threshold = threshold

@@ -1,11 +1,17 @@
-"""One measurement: a task and its settings in, a result out; from a checkpoint, and over ranks."""
+"""Measurement of the coverage of rigs: frames in, a result out.
+
+Every frame has the points of each rig and the reference points. `measure_coverage` passes the frames to one coverage
+metric per rig, to the near-field test targets, to published metrics and to the observers of the user, and collects
+their results.
+"""
 
 import warnings
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, nullcontext, suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 from torchcover.coverage import CoverageSums
 from torchcover.evaluation.checkpoint import Checkpoint, CheckpointManager
@@ -25,61 +31,108 @@ from torchcover.simulation.memory import check_memory_fits
 from torchcover.targets import NearFieldObserver, Target
 
 Observers = Mapping[str, AnyObserver]
-# For standard errors: at least half as many are in use at the end of a long run.
-BLOCKS = 16
-# The sums are over what was touched, but maps are made of all cells, several of which are there at a time.
-BYTES_A_CELL = 64
-# Beside the vehicle, unless others are asked for; and what a run calls who puts them there.
-PROBES = ("child", "adult", "cyclist", "pole")
-BODIES = "bodies beside the vehicle"
-# To see of how many worlds they are.
-ENOUGH_FRAMES = 256
+
+# Blocks of the block jackknife; at least half of them are in use at the end of a long run.
+NUM_BLOCKS = 16
+# Name of the observer of the test targets in checkpoints.
+NEAR_FIELD_TARGETS = "near-field test targets"
 
 
-def measure_coverage(task: Task[FrameSource], settings: Settings, stopping_rule: StoppingRule | None = None) -> Result:
-    """Measure it, or less if a rule says so. ValueError: as `evaluate`."""
+@dataclass(frozen=True)
+class MeasurementParams:
+    """Defaults of a measurement.
+
+    Args:
+        test_targets: Test targets in the near field, unless the settings name others.
+        bytes_per_cell: Memory for maps of a cell: sums only contain observed cells, but maps contain all cells, and
+            several maps exist at a time.
+        max_inspected_frames: Frames whose scenes are counted for the number of workers.
+    """
+
+    test_targets: tuple[str, ...] = ("child", "adult", "cyclist", "pole")
+    bytes_per_cell: int = 64
+    max_inspected_frames: int = 256
+
+
+@dataclass(frozen=True)
+class _ObservedRun:
+    """Observers after a run.
+
+    Args:
+        coverage: Name of each rig -> its coverage observer.
+        others: Name -> further observer.
+        run: Outcome of the run.
+    """
+
+    coverage: Observers
+    others: Observers
+    run: Run
+
+
+def measure_coverage(
+    task: Task[FrameSource],
+    settings: Settings,
+    stopping_rule: StoppingRule | None = None,
+    params: MeasurementParams = MeasurementParams(),
+) -> Result:
+    """Measure the coverage of all rigs of a task in the same frames.
+
+    Args:
+        task: Frames, rigs and regions.
+        settings: Settings of `evaluate`.
+        stopping_rule: Rule that may end the run early; a target error of the settings takes precedence.
+        params: Defaults.
+
+    Returns:
+        The result. If an error ended the run early, the result has the frames until then, with a warning.
+
+    Raises:
+        ValueError: As in `evaluate`.
+    """
     ranks = settings.ranks
-    frames = task.frames
-    sensors = [sensor for of_rig in task.sensors.values() for sensor in of_rig]
+    sensors = [sensor for rig_sensors in task.sensors.values() for sensor in rig_sensors]
     check_drawable(sensors)
-    settings = replace(settings, num_workers=_workers(task, settings))
+    settings = replace(settings, num_workers=_choose_num_workers(task, settings, params))
     metrics = load_contrib().build_metrics(task, settings) if settings.metrics else None
-    others = {**settings.observers, **(metrics.observers if metrics else {}), **_probes(task, settings)}
+    metric_observers = metrics.observers if metrics else {}
+    others = {**settings.observers, **metric_observers, **_build_target_observers(task, settings, params)}
     with ranks.abort_on_error() if ranks else nullcontext():
-        coverage, seen, run = _observed(task, settings, others, stopping_rule)
-    coverages = {name: observer.compute() for name, observer in coverage.items()}
-    if isinstance(probes := seen.get(BODIES), NearFieldObserver):
-        for name, one in coverages.items():
-            one.target_sums = probes.get_target_sums(name)
+        observed = _observe_frames(task, settings, others, stopping_rule)
+    coverages = {name: observer.compute() for name, observer in observed.coverage.items()}
+    target_observer = observed.others.get(NEAR_FIELD_TARGETS)
+    if isinstance(target_observer, NearFieldObserver):
+        for name, coverage in coverages.items():
+            coverage.target_sums = target_observer.get_target_sums(name)
     if len({coverage.counts["num_frames"] for coverage in coverages.values()}) > 1:
-        run.raise_failure()  # within a step: the rigs have not seen the same
-    report = None
+        observed.run.raise_failure()  # an observer failed within a frame, so that rigs differ in their frames
+    metric_report = None
     if metrics is not None:
-        after = metrics.update_from(seen)
-        report = load_contrib().compare_metrics(after, coverages, task.query_plan.target_regions, settings.seed)
+        metric_report = load_contrib().compare_metrics(
+            metrics.update_from(observed.others), coverages, task.query_plan.target_regions, settings.seed
+        )
     result = Result(
         coverages=coverages,
         regions=task.query_plan.regions,
-        run=run,
+        run=observed.run,
         rigs=task.rig_sources,
         source=task.description,
-        reference_record=frames.reference_record,
+        reference_record=task.frames.reference_record,
         device=settings.device,
         target_error=settings.target_error,
         target_regions=task.query_plan.target_regions,
         sensors=task.sensors,
-        ego_outline_m=frames.ego_outline_m,
-        observer_results={name: seen[name].compute() for name in settings.observers},
-        metrics=report,
+        ego_outline_m=task.frames.ego_outline_m,
+        observer_results={name: observed.others[name].compute() for name in settings.observers},
+        metrics=metric_report,
         omissions=list_omissions(
-            run.counts,
+            observed.run.counts,
             list(coverages.values()),
             settings.aggregations,
             sensors,
             num_workers=settings.num_workers or 0,
             num_ranks=ranks.num_ranks if ranks else 1,
         ),
-        block_ends=find_block_ends(frames),
+        block_ends=find_block_ends(task.frames),
     )
     if result.cut_short:
         warnings.warn(result.cut_short, RuntimeWarning, stacklevel=CALLER)
@@ -87,83 +140,84 @@ def measure_coverage(task: Task[FrameSource], settings: Settings, stopping_rule:
 
 
 def find_block_ends(frames: FrameSource, max_blocks: int = 80, max_frames: int = 10_000) -> list[int]:
-    """Find after how many frames of a source one block of time after the other is complete.
+    """Find the frames of a source after which the blocks of time are complete.
 
     Args:
-        frames: The source.
-        max_blocks: Blocks that are looked for: more than any advice on the number of frames names.
-        max_frames: Frames that are looked at; a scenario that repeats has no further block.
+        frames: Source of the frames.
+        max_blocks: Number of blocks to find; advice on the number of frames never names more.
+        max_frames: Number of frames to inspect; a scenario that repeats has no further block.
 
     Returns:
-        Numbers of frames, one for each block; the last may be the number of all frames.
+        Number of frames at the end of each block; the last may be the number of all frames.
     """
-    places, ends, index = set[int](), list[int](), 0
-    with suppress(IndexError):
+    block_indices, ends, index = set[int](), list[int](), 0
+    with suppress(IndexError):  # the end of the source
         while index < max_frames and len(ends) < max_blocks:
-            place = frames.get_block_index(index)
-            if place not in places and places:
+            block_index = frames.get_block_index(index)
+            if block_index not in block_indices and block_indices:
                 ends.append(index)
-            places.add(place)
+            block_indices.add(block_index)
             index += 1
     return ends if len(ends) == max_blocks else [*ends, index]
 
 
-def _workers(task: Task[FrameSource], settings: Settings) -> int:
-    """Processes that make the frames: recordings may share open files, and ranks share the cores."""
+def _choose_num_workers(task: Task[FrameSource], settings: Settings, params: MeasurementParams) -> int:
+    """Choose the number of worker processes; recordings may share open files, and ranks share the cores."""
     if settings.num_workers is not None:
         return settings.num_workers
     frames = task.frames
     if settings.ranks or not isinstance(frames, SimulatedFrames) or find_ray_device(settings):
         return 0
-    most = min(len(frames), task.num_frames or len(frames), ENOUGH_FRAMES)
-    whole = bool(settings.observers or settings.metrics) or not settings.device.startswith("cpu")
-    return compute_num_workers(most, len({frames.get_scene_id(index) for index in range(most)}), sends_frames=whole)
+    num_frames = min(len(frames), task.num_frames or len(frames), params.max_inspected_frames)
+    scene_ids = {frames.get_scene_id(index) for index in range(num_frames)}
+    sends_frames = bool(settings.observers or settings.metrics) or not settings.device.startswith("cpu")
+    return compute_num_workers(num_frames, len(scene_ids), sends_frames=sends_frames)
 
 
-def _probes(task: Task[FrameSource], settings: Settings) -> dict[str, NearFieldObserver]:
-    """Who puts bodies beside the vehicle; nobody where there is no scene to put them into."""
-    usual = () if settings.only_detection or (settings.regions and settings.regions.regions) else PROBES
-    names = usual if settings.test_targets is None else settings.test_targets
+def _build_target_observers(
+    task: Task[FrameSource], settings: Settings, params: MeasurementParams
+) -> dict[str, NearFieldObserver]:
+    """Build the observer of test targets in the near field; a recording has no scene in which to place them."""
+    has_own_regions = bool(settings.regions and settings.regions.regions)
+    names: Sequence[str | Path] = () if settings.only_detection or has_own_regions else params.test_targets
+    if settings.test_targets is not None:
+        names = settings.test_targets
     if not (names and isinstance(task.frames, SimulatedFrames)):
         return {}
-    bodies = [Target.load(name) for name in names]
-    if len({body.name for body in bodies}) < len(bodies):
-        raise ValueError(f"probe: one is given twice: {', '.join(body.name for body in bodies)}")
-    return {BODIES: NearFieldObserver(task.frames.simulator, bodies, BLOCKS)}
+    targets = [Target.load(name) for name in names]
+    target_names = [target.name for target in targets]
+    if len(set(target_names)) < len(target_names):
+        raise ValueError(f"test_targets: one is given twice: {', '.join(target_names)}")
+    return {NEAR_FIELD_TARGETS: NearFieldObserver(task.frames.simulator, targets, NUM_BLOCKS)}
 
 
-def _observed(
-    task: Task[FrameSource], settings: Settings, others: Observers, until: StoppingRule | None
-) -> tuple[Observers, Observers, Run]:
+def _observe_frames(
+    task: Task[FrameSource], settings: Settings, others: Observers, stopping_rule: StoppingRule | None
+) -> _ObservedRun:
+    """Pass all frames to the coverage metrics and the other observers, from and to a checkpoint, over all ranks."""
     ranks, checkpoint = settings.ranks, settings.checkpoint
     if ranks:
         settings = replace(settings, device=ranks.get_device(settings.device))
-    sensors = task.get_sensor_names() if settings.redundancy else {}
-    has_areas = task.frames.has_area_weights
-    coverage = {
-        name: CoverageObserver(
-            build_metric(settings, task.query_plan, sensors.get(name, ()), has_area_weights=has_areas), name
-        )
-        for name in task.rigs
-    }
-    target = settings.target_error
-    watch = TargetErrorRule(target, coverage, task.query_plan.target_regions) if target else None
+    coverage = _build_coverage_observers(task, settings)
+    target_rule = None
+    if settings.target_error:
+        target_rule = TargetErrorRule(settings.target_error, coverage, task.query_plan.target_regions)
     observers: Sequence[AnyObserver] = [*coverage.values(), *others.values()]
-    identity = (
-        build_run_identity(task, settings, others, ranks.num_ranks if ranks else 1) if ranks or checkpoint else {}
-    )
+    identity: dict[str, str] = {}
+    if ranks or checkpoint:
+        identity = build_run_identity(task, settings, others, ranks.num_ranks if ranks else 1)
     if ranks:
-        if target:
-            raise ValueError("target error: every rank sees its share only; leave it out, or run without torchrun")
+        if settings.target_error:
+            raise ValueError("target error: a rank only has its share of the frames; omit it, or run without torchrun")
         ranks.check_identity({**identity, "num_frames": str(task.num_frames or len(task.frames))})
     with ExitStack() as stack:
         journal = None
         if checkpoint is not None:
-            place = checkpoint if isinstance(checkpoint, Checkpoint) else Checkpoint(Path(checkpoint))
-            place = place.for_rank(ranks.rank if ranks else 0)
+            file = checkpoint if isinstance(checkpoint, Checkpoint) else Checkpoint(Path(checkpoint))
+            file = file.for_rank(ranks.rank if ranks else 0)
             if ranks is None or ranks.rank == 0:
-                stack.enter_context(lock_folder(place.path.parent))
-            journal = CheckpointManager(place, identity, _states(coverage, others, watch))
+                stack.enter_context(lock_folder(file.path.parent))
+            journal = CheckpointManager(file, identity, _name_states(coverage, others, target_rule))
         run = observe(
             task.frames,
             observers,
@@ -171,46 +225,67 @@ def _observed(
             num_workers=settings.num_workers or 0,
             device=settings.device,
             skip_bad_frames=settings.skip_bad_frames,
-            stopping_rule=watch or until,
+            stopping_rule=target_rule or stopping_rule,
             show_progress=settings.progress and (ranks is None or ranks.rank == 0),
             keep_partial=True,
             journal=journal,
             ranks=ranks,
         )
         if ranks:
-            run, observers = _whole(run, observers, ranks)
-    rigs = len(coverage)
-    return dict(zip(coverage, observers[:rigs], strict=True)), dict(zip(others, observers[rigs:], strict=True)), run
+            run, observers = _merge_ranks(run, observers, ranks)
+    num_rigs = len(coverage)
+    return _ObservedRun(
+        dict(zip(coverage, observers[:num_rigs], strict=True)),
+        dict(zip(others, observers[num_rigs:], strict=True)),
+        run,
+    )
 
 
-def _whole(run: Run, observers: Sequence[AnyObserver], ranks: Ranks) -> tuple[Run, Sequence[AnyObserver]]:
-    """What all ranks have seen, as if one had."""
+def _build_coverage_observers(task: Task[FrameSource], settings: Settings) -> dict[str, CoverageObserver]:
+    sensor_names = task.get_sensor_names() if settings.redundancy else {}
+    observers = {}
+    for name in task.rigs:
+        metric = build_metric(
+            settings,
+            task.query_plan,
+            sensor_names.get(name, ()),
+            has_area_weights=task.frames.has_area_weights,
+        )
+        observers[name] = CoverageObserver(metric, name)
+    return observers
+
+
+def _merge_ranks(run: Run, observers: Sequence[AnyObserver], ranks: Ranks) -> tuple[Run, Sequence[AnyObserver]]:
+    """Merge the runs and the observers of all ranks, as if one process had received all frames."""
     if isinstance(run.failure, KeyboardInterrupt):
-        raise run.failure  # whoever ends one rank ends all, and does not wait for them
+        raise run.failure  # Ctrl-C ends all ranks, so this one must not wait for the others
     if run.failure:
         ranks.report_failure(run.failure)
     parts = ranks.gather((run.num_frames, run.counts, run.skipped_frames, run.duration_s))
     observers = ranks.merge(observers)
-    words, counts = ranks.failure, Counter[str]()
-    for part in parts:
-        counts.update(part[1])  # + would forget what was never counted
-    whole = Run(
-        num_frames=sum(steps for steps, *_ in parts),
-        counts=counts,
-        skipped_frames=sorted((line for part in parts for line in part[2]), key=lambda line: BadFrameError(line).index),
-        failure=run.failure or (ChildProcessError(words) if words else None),
-        duration_s=max(seconds for *_, seconds in parts),
-    )
-    if not whole.num_frames:
-        whole.raise_failure()
+    failure = ranks.failure
+    merged = Run(failure=run.failure or (ChildProcessError(failure) if failure else None))
+    counts = Counter[str]()
+    for num_frames, part_counts, skipped_frames, duration_s in parts:
+        counts.update(part_counts)  # the operator + would drop counts of 0
+        merged.num_frames += num_frames
+        merged.skipped_frames += skipped_frames
+        merged.duration_s = max(merged.duration_s, duration_s)
+    merged.counts = counts
+    merged.skipped_frames.sort(key=lambda reason: BadFrameError(reason).index)
+    if not merged.num_frames:
+        merged.raise_failure()
         raise ValueError("no frame could be used, so there is no result")
-    return whole, observers
+    return merged, observers
 
 
-def _states(coverage: Observers, others: Observers, watch: TargetErrorRule | None) -> dict[str, object]:
-    """What a checkpoint keeps, by the names that its file and messages have."""
-    rigs = {f"coverage of {name}": one for name, one in coverage.items()}
-    return {**rigs, **{f"observer {name}": one for name, one in others.items()}, **({"watch": watch} if watch else {})}
+def _name_states(coverage: Observers, others: Observers, target_rule: TargetErrorRule | None) -> dict[str, Any]:
+    """Name the parts of a checkpoint, as its file and messages call them."""
+    states: dict[str, Any] = {f"coverage of {name}": observer for name, observer in coverage.items()}
+    states |= {f"observer {name}": observer for name, observer in others.items()}
+    if target_rule:
+        states["target error"] = target_rule
+    return states
 
 
 def build_metric(
@@ -219,17 +294,27 @@ def build_metric(
     sensors: Sequence[str] = (),
     *,
     has_area_weights: bool,
-    num_blocks: int = BLOCKS,
+    num_blocks: int = NUM_BLOCKS,
+    params: MeasurementParams = MeasurementParams(),
 ) -> CoverageSums:
-    """An empty metric of what `evaluate` is to measure, with the names of the sensors for redundancy.
+    """Build the coverage metric of one rig.
 
-    ValueError: an estimate by area is wanted, and there are no square metres; a device that cannot be used; a threshold
-    that makes no sense, or more cells than there is memory for maps of.
+    Args:
+        settings: Settings of `evaluate`.
+        query_plan: Grid and regions.
+        sensors: Names of the sensors, for redundancy.
+        has_area_weights: Whether reference points have area weights.
+        num_blocks: Blocks of the block jackknife.
+        params: Defaults.
+
+    Raises:
+        ValueError: Area average without area weights, unavailable device, invalid threshold, or more cells than
+            fit into memory.
     """
     if settings.average == "area" and not has_area_weights:
         raise ValueError(
-            "estimate area: it needs the square metres of reference points, which the surface reference of a "
-            "simulation gives; leave it out for means over the known cells"
+            "average area: it needs area weights of the reference points, which the surface reference of a simulation "
+            "provides; omit it for averages over observed cells"
         )
     device, grid = get_device(settings.device), query_plan.grid
     metric = CoverageSums(
@@ -243,7 +328,6 @@ def build_metric(
         needs_radii=not settings.only_detection,
         has_area_weights=has_area_weights and settings.average != "cells",
     )
-    check_memory_fits(
-        f"maps of {grid.num_cells:,} cells", BYTES_A_CELL * grid.num_cells, "use larger cells, or a smaller grid"
-    )
+    map_bytes = params.bytes_per_cell * grid.num_cells
+    check_memory_fits(f"maps of {grid.num_cells:,} cells", map_bytes, "use larger cells, or a smaller grid")
     return metric.to(device)

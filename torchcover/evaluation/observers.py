@@ -1,4 +1,4 @@
-"""What is fed with frames: coverage, and whatever else a user wants to know of them."""
+"""Observers of frames: coverage, and any other statistic of a run."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, Protocol, Self, TypeVar, runtime_checkable
@@ -12,25 +12,25 @@ ResultT = TypeVar("ResultT", covariant=True)
 
 @runtime_checkable
 class Stateful(Protocol):
-    """What a checkpoint can keep: an observer, or a stopping rule, that hands out all that it knows and takes it back.
+    """Object that a checkpoint can save: an observer or a stopping rule.
 
-    A state consists of tensors, numbers, texts and None, in lists and in dicts with names as keys. An object to which
-    one is given goes on as the other would have, bit for bit.
+    A state consists of tensors, numbers, texts and None, in lists and in dicts with names as keys. An object that loads
+    a state continues exactly like the object that it came from.
     """
 
     def state_dict(self) -> Mapping[str, Any]:
-        """All that the frames so far have left; it is written at once, so that it need not be a copy."""
+        """Return the complete state; it is written at once and need not be a copy."""
 
     def load_state_dict(self, state_dict: Mapping[str, Any], /) -> object:
-        """Be what the other was; the tensors are on the CPU, and nobody else's."""
+        """Take over the state of another object; its tensors are on the CPU and not shared."""
 
 
 class Observer(Protocol[ResultT]):
-    """Something that looks at frames, one after the other, and says something in the end.
+    """Statistic over frames that are passed one after the other.
 
-    Over several processes or ranks each has an observer of its own over other frames; one merges the others. A run with
-    a checkpoint needs those that are `Stateful`, too. One that has `compute_sums`, from a frame to what is to `add`, as
-    `CoverageObserver` has, measures frames where they are made.
+    Each process or rank has its own observer for its own frames; `merge_state` combines them. A run with a checkpoint
+    also needs `Stateful`. An observer with `compute_sums(frame)` and `add_sums(sums)`, such as `CoverageObserver`,
+    measures frames in the process that makes them.
 
     Example:
         >>> class PointCount:
@@ -45,26 +45,26 @@ class Observer(Protocol[ResultT]):
     """
 
     def update(self, frame: Frame) -> None:
-        """Add a frame; its tensors are on the device of the run."""
+        """Add a frame, whose tensors are on the device of the run."""
 
     def compute(self) -> ResultT:
-        """What the frames so far say."""
+        """Return the result of all frames so far."""
 
     def merge_state(self, other: Self, /) -> None:
-        """Add the frames of another observer, which is left as it was."""
+        """Add the frames of another observer, which stays unchanged."""
 
 
 class CoverageObserver:
-    """Coverage of one rig: feeds frames to a `CoverageSums`.
+    """Observer that passes the points of one rig and the reference points to a coverage metric.
 
     Args:
-        metric: Where the sums are.
-        rig: Whose clouds; those of the only rig if not given.
+        metric: Coverage metric.
+        rig: Name of the rig in the frames; not needed if the frames have one rig.
 
     Example:
         >>> import torch
         >>> from torchcover import BevGrid
-        >>> observer = CoverageObserver(CoverageSums(BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=1.0)))
+        >>> observer = CoverageObserver(CoverageSums(BevGrid(x_m=(0.0, 2.0), y_m=(0.0, 1.0), cell_m=1.0)))
         >>> observer.update(Frame({"rig": torch.zeros(1, 3)}, torch.tensor([[0.5, 0.0, 0.0]]), index=0, name="a"))
         >>> observer.compute().radius[0].tolist()
         [[0.5, nan]]
@@ -75,22 +75,32 @@ class CoverageObserver:
         self.rig = rig
 
     def update(self, frame: Frame) -> None:
-        """Add a frame: what is made of it by `compute_sums`."""
+        """Add a frame.
+
+        Args:
+            frame: Frame of the rig.
+
+        Raises:
+            ValueError: As `compute_sums`.
+        """
         self.add_sums(self.compute_sums(frame))
 
     def compute_sums(self, frame: Frame) -> list[FrameSums]:
-        """What a frame is to `add`, with the weights and the heights of its reference points and its place in time.
+        """Compute what a frame adds to the metric; the sums are small and equal in every process.
 
-        It is small, and the same in every process, so that frames are measured where they are made.
+        Args:
+            frame: Frame of the rig.
+
+        Returns:
+            Sums for `add_sums`.
 
         Raises:
-            ValueError: As `CoverageSums.update`, several rigs and none was named, or reference points without the
-                square metres or the heights that the metric wants, or it is unknown which points are of which sensor
-                and it wants that.
+            ValueError: Invalid points, several rigs without a chosen one, or reference points without the area weights,
+                heights or sensors that the metric needs.
         """
-        clouds = frame.get_clouds_by_sensor if self.metric.sensor_names else frame.get_cloud
+        get_points = frame.get_clouds_by_sensor if self.metric.sensor_names else frame.get_cloud
         return self.metric.compute_sums(
-            clouds(self.rig),
+            get_points(self.rig),
             frame.reference,
             errors_m=frame.get_errors_m(self.rig),
             weights=frame.reference_weights,
@@ -99,33 +109,43 @@ class CoverageObserver:
         )
 
     def add_sums(self, sums: Sequence[FrameSums]) -> None:
-        """Add a frame that `compute_sums` an observer of the same rig and parameters has measured."""
-        for one in sums:
-            self.metric.add_sums(one)
+        """Add the sums of a frame.
+
+        Args:
+            sums: Return value of `compute_sums` of an observer of the same rig with the same parameters.
+        """
+        for frame_sums in sums:
+            self.metric.add_sums(frame_sums)
 
     def compute(self) -> Coverage:
-        """The coverage so far."""
+        """Return the coverage of all frames so far."""
         coverage: Coverage = self.metric.compute()
         return coverage
 
     def state_dict(self) -> dict[str, Any]:
-        """The sums of the metric."""
+        """Return the sums of the metric."""
         return self.metric.metric_state
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Take the sums of another one.
+        """Replace the sums by those of another observer.
+
+        Args:
+            state_dict: Return value of its `state_dict`.
 
         Raises:
-            ValueError: Of a metric with other parameters.
+            ValueError: The metric of the other observer has other parameters.
         """
         self.metric.reset()
         self.metric.merge_state(state_dict)
 
     def merge_state(self, other: "CoverageObserver") -> None:
-        """Add the frames of another one of the same rig.
+        """Add the frames of another observer.
+
+        Args:
+            other: Observer of the same rig.
 
         Raises:
-            ValueError: Of another rig, or metrics with other parameters.
+            ValueError: The other observer has another rig, or a metric with other parameters.
         """
         if other.rig != self.rig:
             raise ValueError(f"cannot merge the coverage of rig {other.rig!r} into that of {self.rig!r}")

@@ -311,9 +311,7 @@ def _build_record(target: TargetError, statuses: Sequence[ConvergenceStatus]) ->
     return {**asdict(target), "frames_needed": max(known) if all_known else None, "numbers": numbers}
 
 
-def _describe_convergence(
-    statuses: Sequence[ConvergenceStatus], num_frames: int, *, is_confirmed: bool
-) -> list[str]:
+def _describe_convergence(statuses: Sequence[ConvergenceStatus], num_frames: int, *, is_confirmed: bool) -> list[str]:
     """Describe the success, or the worst number of each region and band with the frames that it needs."""
     if not statuses:
         return ["Target error not reached: no region has an observed cell."]

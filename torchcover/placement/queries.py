@@ -16,7 +16,7 @@ from torchcover.coverage.grid import PAPER_HEIGHTS
 from torchcover.coverage.quantity import RADIUS, make_detection_quantity, make_failure_quantity
 from torchcover.estimation import Estimate
 from torchcover.evaluation import CoverageObserver
-from torchcover.evaluation.measurement import BLOCKS
+from torchcover.evaluation.measurement import NUM_BLOCKS
 from torchcover.geometry.arrays import Float64
 from torchcover.placement.objective import DEFAULT_THRESHOLD_M, Objective
 from torchcover.simulation import Areas, RegionsOfInterest, Rig, SurfaceReference
@@ -172,7 +172,7 @@ class Queries(NamedTuple):
             self.grid,
             self.thresholds_m,
             max_radius_m=self.max_radius_m,
-            num_blocks=BLOCKS,
+            num_blocks=NUM_BLOCKS,
             regions=tuple(self.regions.values()),
             aggregations=self.aggregations,
             sensor_names=tuple(sensor.name for sensor in rig.sensors) if needs_sensors else (),
