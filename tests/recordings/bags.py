@@ -131,7 +131,7 @@ vehicle_T_roof = build_transform(np.eye(3), [0.0, 0.0, 1.4])
 
 
 def mounts(drive):
-    """The tree of a drive's frames: `left` is mounted through two others, `right` on the vehicle."""
+    """Static transforms of a drive: `left` is connected through two frames, `right` directly to the vehicle."""
     mast_T_left = invert(vehicle_T_roof @ roof_T_mast) @ drive.vehicle_T_sensor("left")
     return [
         link("base_link", "roof", vehicle_T_roof),

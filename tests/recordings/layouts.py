@@ -1,4 +1,4 @@
-"""Drives written down as the data sets do it."""
+"""Writers of drives in the layouts of the data sets."""
 
 import csv
 import json
@@ -22,13 +22,13 @@ velodyne_T_imu = build_transform(convert_euler_to_rotation(0.1, -0.2, 0.3), [-0.
 
 
 def seen(drive, index):
-    """All points of both sensors in the vehicle frame, those of `left` first."""
+    """Points of both sensors in the vehicle frame, `left` first."""
     scans = [drive.read_scan(sensor, index) for sensor in drive.sensors]
     return [transform_points(scan.vehicle_T_sensor, scan.points_m) for scan in scans]
 
 
 def quaternion(matrix):
-    """w, x, y, z of a rotation about z."""
+    """Compute the quaternion w, x, y, z of a rotation about z."""
     yaw = math.atan2(matrix[1, 0], matrix[0, 0])
     return [math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)]
 
@@ -60,7 +60,7 @@ def kitti_raw(drive, root):
         (path / "velodyne_points" / "data" / f"{name}.bin").write_bytes(records(points_m, 4))
         pose = drive.get_world_T_vehicle(index) @ vehicle_T_velodyne @ velodyne_T_imu
         first_m = pose[:3, 3] if first_m is None else first_m
-        # Mercator, the other way round; the first record is at the given place.
+        # Inverse of the Mercator projection; the first record is at the given latitude.
         scale = math.cos(math.radians(LATITUDE_DEG))
         north = math.log(math.tan(math.pi / 4 + math.radians(LATITUDE_DEG) / 2))
         east_m, north_m, up_m = pose[:3, 3] - first_m
@@ -179,7 +179,7 @@ def table(path, columns, rows):
 
 
 def plain_folder(drive, root):
-    """A drive as a plain folder; one mount is in frames.yaml, the other in a table of its own."""
+    """Write a drive as a plain folder, with extrinsics in frames.yaml for one sensor and in a table for the other."""
     for sensor in drive.sensors:
         (root / "sensors" / sensor).mkdir(parents=True)
     poses, mounts = [], []
@@ -222,7 +222,7 @@ def carla_row(matrix):
 
 
 def carla_folder(drive, root):
-    """Two ticks an instant, `left` makes half a turn in each; the origin of the actor is not under its middle."""
+    """Write two ticks per frame; `left` makes half a revolution in each, and the actor origin is off center."""
     vehicle_T_actor = build_transform(np.eye(3), [-0.1, 0.2, 0.0])
     box = {"location": {"x": 0.1, "y": 0.2, "z": 0.75}, "extent": {"x": 2.0, "y": 1.0, "z": 0.75}}
     (root / "vehicle.json").write_text(json.dumps(box))

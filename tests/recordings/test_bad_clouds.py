@@ -1,4 +1,4 @@
-"""Clouds whose rows, sizes or numbers cannot be."""
+"""Clouds with impossible rows, sizes or numbers."""
 
 import io
 import re
@@ -15,7 +15,7 @@ from torchcover.files import BadFileError
 
 CLOUD = np.random.default_rng(0).uniform([-60, -60, -2, 0], [60, 60, 5, 0.99], (100, 4)).astype("<f4")
 RINGS = np.c_[CLOUD[:, :3], 255 * CLOUD[:, 3], np.arange(100) % 32].astype("<f4")
-# With a time and what else drivers add, for which there is no suffix.
+# Rows with a time and other fields of drivers, for which there is no suffix.
 SIX, SEVEN = np.c_[RINGS, CLOUD[:, 3]], np.c_[RINGS, CLOUD[:, 3], CLOUD[:, 3]]
 EIGHT = np.c_[SEVEN, np.zeros(100, "<f4")]
 
@@ -49,7 +49,7 @@ PLY += b"end_header\n1 2 3 4\n2 5 6 7\n"
         ("g.xyz", b"", [b"1 2 3\n", b"1 2 3 4\n"]),
     ],
 )
-def test_a_row_of_another_width_shifts_nothing(tmp_path, name, good, rows):
+def test_rows_of_another_width_are_refused(tmp_path, name, good, rows):
     path = tmp_path / name
     path.write_bytes(good + rows[0] * 3)
     assert len(read_cloud(path)) == 3
@@ -58,7 +58,7 @@ def test_a_row_of_another_width_shifts_nothing(tmp_path, name, good, rows):
 
 
 @pytest.mark.parametrize(("name", "data"), [("a.pcd", PCD), ("a.ply", PLY)])
-def test_rows_of_ascii_formats_are_as_wide_as_their_header_says(tmp_path, name, data):
+def test_ascii_rows_need_the_columns_of_their_header(tmp_path, name, data):
     (tmp_path / name).write_bytes(data)
     np.testing.assert_array_equal(read_cloud(tmp_path / name), [[2, 3, 4], [5, 6, 7]])
     assert "row 2 has 3 columns where 4 are needed: '2 6 7'" in refused(tmp_path, name, data.replace(b"2 5 6", b"2 6"))
@@ -93,11 +93,11 @@ def test_names_and_decimal_commas(tmp_path, data, message):
         (b"POINTS 2", b"POINTS " + b"9" * 5000, "POINTS of the PCD header has to be a whole number; got '9999"),
     ],
 )
-def test_a_pcd_header_that_contradicts_itself(tmp_path, old, new, message):
+def test_inconsistent_pcd_headers_are_refused(tmp_path, old, new, message):
     assert message in refused(tmp_path, "a.pcd", PCD.replace(old, new))
 
 
-def test_bytes_behind_the_points_are_padding_or_an_error(tmp_path):
+def test_trailing_bytes_are_padding_or_an_error(tmp_path):
     header = PCD.replace(b"ascii", b"binary").partition(b"1 2 3 4\n")[0]
     ply = PLY.replace(b"ascii", b"binary_little_endian").partition(b"1 2 3 4\n")[0]
     packed = lzf.compress(bytes(32), 100)
@@ -112,7 +112,7 @@ def test_bytes_behind_the_points_are_padding_or_an_error(tmp_path):
         assert "17 bytes follow the points that the header claims" in refused(tmp_path, name, data + bytes(16) + b"1")
 
 
-def test_fields_of_a_billion_values_cost_nothing(tmp_path):
+def test_huge_unused_fields_allocate_no_memory(tmp_path):
     many = PCD.replace(b"COUNT 1 1 1 1", b"COUNT 1000000000 1 1 1")
     empty = many.replace(b"WIDTH 2", b"WIDTH 0").replace(b"POINTS 2", b"POINTS 0").partition(b"1 2 3 4\n")[0]
     binary = many.replace(b"ascii", b"binary")
@@ -144,7 +144,7 @@ def npz(compression, claimed_bytes=None):
 
 
 @pytest.mark.parametrize("compression", [zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED])
-def test_archives_grow_as_far_as_their_memory_is_granted(tmp_path, monkeypatch, compression):
+def test_archives_grow_up_to_the_memory_limit(tmp_path, monkeypatch, compression):
     (tmp_path / "a.npz").write_bytes(npz(compression))
     assert read_cloud(tmp_path / "a.npz").shape == (20_000, 3)
     monkeypatch.setenv("TORCHCOVER_MAX_FILE_GB", "0.0004")
@@ -153,20 +153,20 @@ def test_archives_grow_as_far_as_their_memory_is_granted(tmp_path, monkeypatch, 
 
 
 @pytest.mark.parametrize("compression", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
-def test_archives_that_python_would_inflate_at_once_are_refused(tmp_path, compression):
+def test_archives_beyond_the_memory_limit_are_refused(tmp_path, compression):
     """4.7 kB of bzip2 became 12 GB."""
     assert "otherwise than NumPy does it; use numpy.savez" in refused(tmp_path, "a.npz", npz(compression))
 
 
 @pytest.mark.parametrize("before", ["", "x,y,z\n1,2,3\n", "# x,y,z\n", "// "])
-def test_a_line_of_megabytes_is_refused_before_it_is_taken_apart(tmp_path, before):
-    """Millions of words take fifty times as much as the file."""
+def test_very_long_lines_are_refused_before_splitting(tmp_path, before):
+    """Millions of words take fifty times the memory of the file."""
     (path := tmp_path / "a.csv").write_text(before + "1," * 600_000 + "1\n")
     with pytest.raises(BadFileError, match=r"a line of 12000[0-9]{2} characters; at most 1000000 are allowed"):
         read_cloud(path)
 
 
-def test_text_takes_no_more_than_is_granted(tmp_path, monkeypatch):
+def test_text_stays_within_the_memory_limit(tmp_path, monkeypatch):
     data = b"1 2 3\n" * 10_000
     (tmp_path / "a.xyz").write_bytes(data)
     assert len(read_cloud(tmp_path / "a.xyz")) == 10_000
@@ -199,13 +199,13 @@ def test_text_takes_no_more_than_is_granted(tmp_path, monkeypatch):
         ("a.bin", b"1.0 2.0 3.0\n" * 4, "the content is text"),
     ],
 )
-def test_numbers_without_a_header_that_are_no_coordinates(tmp_path, name, data, message):
+def test_implausible_headerless_numbers_are_refused(tmp_path, name, data, message):
     assert re.search(message, refused(tmp_path, name, data))
 
 
 @pytest.mark.parametrize("columns", [4, 5])
 @pytest.mark.parametrize("seed", range(20))
-def test_clouds_as_sensors_make_them_are_plausible(tmp_path, columns, seed):
+def test_typical_sensor_clouds_are_plausible(tmp_path, columns, seed):
     """With no-returns at the origin and as NaN, far and near ones, and any number of points."""
     random = np.random.default_rng(seed)
     points = random.normal(0, random.choice([0.1, 30, 5000]), (random.integers(1, 3000), 5)).astype("<f4")

@@ -1,4 +1,4 @@
-"""A folder of CARLA: its left-handed axes are turned, in clouds, mounts and poses alike; parts of turns are joined."""
+"""CARLA recordings: conversion to right-handed axes, and joining of partial revolutions."""
 
 import json
 
@@ -59,7 +59,7 @@ def recorded(folder, *, reference=True, ids=("roof",)):
     return folder
 
 
-def test_clouds_are_where_the_world_is(tmp_path):
+def test_clouds_and_reference_match_the_scene(tmp_path):
     frames = RecordedFrames(recorded(tmp_path))
     assert isinstance(frames.recording, Carla)
     assert (frames.frame_names, frames.rigs) == (("8", "10"), ("carla",))
@@ -68,7 +68,7 @@ def test_clouds_are_where_the_world_is(tmp_path):
         assert distances_m(frame.reference, WORLD).max() < 1e-5
 
 
-def test_poses_are_turned_as_the_clouds_are(tmp_path):
+def test_poses_become_right_handed_like_clouds(tmp_path):
     recorded(tmp_path, reference=False)
     rows = [("10", 0.5, 3.0, 4.0, 0.5, 1.0, -2.0, 120.0), ("8", 0.0, 1.0, 2.0, 0.0, 0.0, 0.0, -90.0)]
     table(tmp_path / "poses.csv", ("frame", "time_s", *POSE), rows)
@@ -95,7 +95,7 @@ def turning(folder, rotation_frequency, ticks_s=(0.0, 0.05, 0.1, 0.15, 0.2)):
     return folder
 
 
-def test_parts_of_a_turn_are_joined_where_the_world_stands_still(tmp_path):
+def test_parts_of_a_revolution_are_joined_by_poses(tmp_path):
     recording = open_recording(turning(tmp_path, 10.0))
     assert (recording.frame_names, recording.times_s.tolist()) == (("1", "3"), [0.05, 0.15])  # the fifth makes no turn
     for index, last in enumerate((1, 3)):
@@ -113,16 +113,16 @@ def test_parts_of_a_turn_are_joined_where_the_world_stands_still(tmp_path):
 @pytest.mark.parametrize(
     ("turns", "names"), [(20.0, "01234"), (19.9, "01234"), (7.0, "2"), (4.0, "4"), (50.0, "01234")]
 )
-def test_an_instant_is_as_many_frames_as_make_a_turn(tmp_path, turns, names):
+def test_frame_joins_all_files_of_a_revolution(tmp_path, turns, names):
     assert "".join(open_recording(turning(tmp_path, turns)).frame_names) == names
 
 
-def test_too_few_frames_for_a_turn(tmp_path):
+def test_too_few_files_for_a_revolution(tmp_path):
     with pytest.raises(ValueError, match=r"a revolution of its LiDARs takes 20 files; there are 5"):
         open_recording(turning(tmp_path, 1.0))
 
 
-def test_without_times_a_sector_is_told_as_one(tmp_path):
+def test_sectors_without_times_warn(tmp_path):
     turning(tmp_path, 10.0)
     (tmp_path / "poses.csv").unlink()
     with pytest.warns(UserWarning, match=r"0\.npy: roof: no points in 270 degrees; if a file holds a part of a rev"):
@@ -147,7 +147,7 @@ def photographed(folder, codes, **changed):
     return folder
 
 
-def test_pixels_of_a_depth_camera_are_where_carla_has_them(tmp_path):
+def test_depth_pixels_have_the_positions_of_carla(tmp_path):
     codes = np.random.default_rng(1).integers(10_000, 2_000_000, (3, 4))
     codes[0, 1], codes[2, 2] = 2**24 - 1, 0  # sky, and nothing at all
     recording = open_recording(photographed(tmp_path, codes))
@@ -162,7 +162,7 @@ def test_pixels_of_a_depth_camera_are_where_carla_has_them(tmp_path):
     np.testing.assert_allclose(seen, mirrored(transform_points(carla_matrix(**MOUNT), np.array(expected))), atol=1e-4)
 
 
-def test_a_camera_that_does_not_fit_its_image_is_told(tmp_path):
+def test_camera_and_image_sizes_have_to_agree(tmp_path):
     photographed(tmp_path, np.ones((5, 4), int))
     with pytest.raises(BadFileError, match=r"head.000\.png: .*depth must be \(3, 4\)"):
         open_recording(tmp_path).read_scan("head", 0)
@@ -178,7 +178,7 @@ def test_a_camera_that_does_not_fit_its_image_is_told(tmp_path):
         open_recording(tmp_path / "cloud")
 
 
-def test_objects_are_where_they_are_seen_from_the_vehicle(tmp_path):
+def test_objects_are_in_the_vehicle_frame(tmp_path):
     turning(tmp_path, 20.0)
     row = ["17", "walker", 4.0, 10.0, 1.0, 0.0, 0.0, 90.0, 0.3, 0.2, 0.9]
     for tick in range(5):
@@ -192,7 +192,7 @@ def test_objects_are_where_they_are_seen_from_the_vehicle(tmp_path):
         open_recording(tmp_path)
 
 
-def test_an_object_without_a_size_costs_no_other(tmp_path):
+def test_objects_without_size_are_excluded_alone(tmp_path):
     turning(tmp_path, 20.0)
     rows = [
         [name, "bike", 4.0, 10.0, 1.0, 0.0, 0.0, 90.0, 0.3, width, 0.9] for name, width in (("17", 0.0), ("18", 0.2))
@@ -215,7 +215,7 @@ def test_an_object_without_a_size_costs_no_other(tmp_path):
         ("{location: {x: 0, y: 0, z: 0}, extent: {x: 0, y: 1, z: 1}}", "lower < upper on every axis"),
     ],
 )
-def test_a_bad_box_of_the_vehicle_is_told(tmp_path, box, message):
+def test_bad_vehicle_boxes_are_refused(tmp_path, box, message):
     (recorded(tmp_path) / "vehicle.json").write_text(box)
     with pytest.raises(BadFileError, match=rf"vehicle\.json: .*{message}"):
         open_recording(tmp_path)
@@ -232,13 +232,13 @@ def test_a_bad_box_of_the_vehicle_is_told(tmp_path, box, message):
         ('[{"id": "reference", "type": "sensor.lidar.ray_cast"}]', r"of different id are needed; got reference"),
     ],
 )
-def test_a_bad_list_of_sensors_names_file_and_field(tmp_path, content, message):
+def test_bad_sensor_list_names_file_and_field(tmp_path, content, message):
     (recorded(tmp_path) / "sensors.json").write_text(content)
     with pytest.raises(ValueError, match=rf"sensors\.json: .*{message}"):
         RecordedFrames(tmp_path)
 
 
-def test_what_is_missing_is_named(tmp_path):
+def test_missing_files_are_named(tmp_path):
     recorded(tmp_path, ids=("roof", "left"))
     (tmp_path / "reference" / "poses.csv").write_text("frame,x,y,z,roll,pitch,yaw\n8,0,0,0,0,0,0\n")
     with pytest.raises(ValueError, match=r"reference.poses\.csv: each frame needs one row; 1 are missing \(10\)"):

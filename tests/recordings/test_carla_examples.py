@@ -1,4 +1,4 @@
-"""The examples with CARLA: four depth images to a number, and the recorder, with an imitation of CARLA's package."""
+"""Examples with CARLA: coverage from four depth images, and the recorder with a stand-in for CARLA's package."""
 
 import importlib
 import sys
@@ -54,7 +54,7 @@ def photographed(tmp_path_factory):
     return paths, clouds
 
 
-def test_four_depth_images_are_the_cloud_that_their_cameras_saw(photographed):
+def test_four_depth_images_form_one_cloud(photographed):
     paths, clouds = photographed
     found = four_depth_cameras.clouds_of(paths, 90.0, [0.0, 0.0, HEIGHT_M])
     assert list(found) == list(clouds)
@@ -64,7 +64,7 @@ def test_four_depth_images_are_the_cloud_that_their_cameras_saw(photographed):
         assert cKDTree(found[name].numpy()).query(cloud)[0].max() < 1e-4
 
 
-def test_the_number_of_four_depth_images_is_that_of_a_slow_twin(photographed, capsys):
+def test_four_depth_images_match_an_independent_computation(photographed, capsys):
     paths, _ = photographed
     clouds = {
         name: cloud.numpy() for name, cloud in four_depth_cameras.clouds_of(paths, 90.0, [0.0, 0.0, HEIGHT_M]).items()
@@ -82,7 +82,7 @@ def test_the_number_of_four_depth_images_is_that_of_a_slow_twin(photographed, ca
     assert 0.1 < expected < 0.9
 
 
-# The world of the imitation, right-handed in the world; the ground is z = 0.
+# Scene of the stand-in, right-handed in the world; the ground is z = 0.
 UNDER_THE_MIDDLE_M = np.array([-0.1, 0.05, 0.0])
 WORLD = np.random.default_rng(0).uniform([-30, -30, 0.5], [30, 30, 4], (60, 3))
 BOX = SimpleNamespace(location=SimpleNamespace(x=0.1, y=0.05, z=0.75), extent=SimpleNamespace(x=2.3, y=1.0, z=0.75))
@@ -212,7 +212,7 @@ def recorder(monkeypatch):
     del sys.modules["examples.carla_recorder"]
 
 
-def test_what_the_recorder_writes_is_read_with_the_numbers_of_the_world(recorder, tmp_path, capsys):
+def test_recorder_output_is_read_with_true_coordinates(recorder, tmp_path, capsys):
     carla_recorder, world = recorder
     sensors = [
         {"id": "roof", "type": "sensor.lidar.ray_cast", "x": 0.3, "y": 0.2, "z": 1.9, "pitch": 5.0, "yaw": 20.0},
@@ -268,9 +268,7 @@ def test_what_the_recorder_writes_is_read_with_the_numbers_of_the_world(recorder
     assert ((outside > 0).any(axis=1) & (outside < 0.5).all(axis=1)).all()  # in the shell around the box
 
 
-def test_a_sensor_that_sends_nothing_ends_the_recording_and_leaves_the_server_as_it_was(
-    recorder, tmp_path, monkeypatch
-):
+def test_silent_sensor_ends_recording_and_restores_server(recorder, tmp_path, monkeypatch):
     carla_recorder, world = recorder
     monkeypatch.setattr(carla_recorder, "WAIT_S", 0.01)
     monkeypatch.setattr(Actor, "measure", lambda actor, tick: SimpleNamespace(frame=0))

@@ -107,7 +107,7 @@ WKT2 = (
         (las_in((4099, 9001), STATE_PLANE), (FTUS, FTUS, 1.0)),
     ],
 )
-def test_las_files_in_feet_are_converted_with_a_warning(tmp_path, las, meters):
+def test_las_feet_are_converted_with_a_warning(tmp_path, las, meters):
     suffix = ".laz" if las[104] & 0x80 else ".las"
     with pytest.warns(UserWarning, match=r"converted to meters, as the file says: .* leave out recording.units"):
         cloud = read_cloud(store(tmp_path, suffix, las))
@@ -115,7 +115,7 @@ def test_las_files_in_feet_are_converted_with_a_warning(tmp_path, las, meters):
 
 
 @pytest.mark.filterwarnings("ignore:LAS coordinates are converted")
-def test_las_files_that_say_feet_are_converted_once(tmp_path):
+def test_las_feet_are_converted_once(tmp_path):
     (tmp_path / "sensor").mkdir()
     (tmp_path / "reference").mkdir()
     settings = RecordingSettings(units="ft")
@@ -130,7 +130,7 @@ def test_las_files_that_say_feet_are_converted_once(tmp_path):
 
 @pytest.mark.parametrize("compressed", [False, True])
 @pytest.mark.parametrize("stored", [-(2**31), 2**31 - 1])
-def test_las_coordinates_that_were_cut_off_are_refused(tmp_path, stored, compressed):
+def test_truncated_las_coordinates_are_refused(tmp_path, stored, compressed):
     """Programs that write without an offset clamp what does not fit into 32 bits."""
     header = laspy.LasHeader(point_format=3, version="1.2")
     header.scales, header.offsets = np.full(3, 0.001), np.zeros(3)
@@ -142,7 +142,7 @@ def test_las_coordinates_that_were_cut_off_are_refused(tmp_path, stored, compres
         read_cloud(path)
 
 
-def test_las_files_in_meters_are_as_they_are_and_degrees_are_refused(tmp_path):
+def test_las_meters_are_unchanged_and_degrees_are_refused(tmp_path):
     for las in (las_in((1024, 1), (3072, 32633)), las_in(STATE_PLANE.replace(repr(FTUS), "1.0")), las_in("")):
         np.testing.assert_array_equal(read_cloud(store(tmp_path, ".las", las)), CLOUD)
     with pytest.warns(UserWarning, match=r"EPSG:2240 without a unit .* --set recording.units=ft"):
@@ -250,7 +250,7 @@ def test_a_header_without_points_is_an_empty_cloud(tmp_path, suffix, data):
 
 
 @pytest.mark.parametrize("name", ["KITTI.BIN", "a.b.Bin", "sweep.PCD.bin"])
-def test_the_suffix_may_be_capital_and_the_longest_one_counts(tmp_path, name):
+def test_suffix_ignores_case_and_longest_one_counts(tmp_path, name):
     path = tmp_path / name
     path.write_bytes(with_columns(CLOUD, 5 if "PCD" in name else 4))
     np.testing.assert_array_equal(read_cloud(path), CLOUD)
@@ -271,7 +271,7 @@ def test_the_suffix_may_be_capital_and_the_longest_one_counts(tmp_path, name):
         b"intensity x y z\n0,1,2,3\n0,4,5,6\n",
     ],
 )
-def test_text_with_commas_or_spaces_comments_and_named_columns(tmp_path, data):
+def test_text_allows_commas_spaces_comments_and_headers(tmp_path, data):
     np.testing.assert_array_equal(read_cloud(store(tmp_path, ".csv", data)), [[1, 2, 3], [4, 5, 6]])
 
 
@@ -284,7 +284,7 @@ def test_nan_may_be_spelled_as_windows_does(tmp_path, word):
         np.testing.assert_array_equal(cloud, [[4, 5, 6], [np.nan, 0, 1], [1, 2, 3]])
 
 
-def test_the_viewpoint_of_a_pcd_is_said_to_be_left_aside(tmp_path):
+def test_pcd_viewpoint_is_ignored_with_a_warning(tmp_path):
     header = pcd_header(3, "ascii").replace(b"VIEWPOINT 0 0 0", b"VIEWPOINT 1 2 0")
     with pytest.warns(UserWarning, match="VIEWPOINT 1 2 0 1 0 0 0 of PCD files is not applied"):
         np.testing.assert_array_equal(read_cloud(store(tmp_path, ".pcd", header + rows(CLOUD))), CLOUD)
@@ -310,7 +310,7 @@ MIXED_HEADER = {
         ("binary_compressed", pcd_block([MIXED[name] for name in MIXED.dtype.names])),
     ],
 )
-def test_pcd_finds_x_y_z_among_other_fields_of_any_type_and_count(tmp_path, encoding, body):
+def test_pcd_finds_coordinates_among_other_fields(tmp_path, encoding, body):
     path = store(tmp_path, ".pcd", pcd_header(2, encoding, **MIXED_HEADER) + body)
     np.testing.assert_array_equal(read_cloud(path), [[1, 2, 3], [4, 5, 6]])
 
@@ -361,7 +361,7 @@ def test_ply_finds_the_vertices_among_other_elements(tmp_path, data):
     np.testing.assert_array_equal(read_cloud(store(tmp_path, ".ply", data)), CLOUD)
 
 
-def test_a_compressed_survey_without_its_package_says_what_to_install(tmp_path, monkeypatch):
+def test_laz_without_laspy_names_the_package(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "laspy", None)
     with pytest.raises(ImportError, match=r"cloud\.laz: LAZ needs laspy: pip install 'torchcover\[las\]'"):
         unwrap(read_laz_points)(store(tmp_path, *FORMATS["laz"]), 3)
@@ -481,7 +481,7 @@ def mislabelled_member():
         (".xyz", b"nan 1 2\n1 inf 2\n", r"none of the 2 points is finite"),
     ],
 )
-def test_bad_files_are_one_line_that_names_the_file(tmp_path, suffix, data, message):
+def test_bad_clouds_raise_one_line_with_file_name(tmp_path, suffix, data, message):
     path = store(tmp_path, suffix, data)
     with pytest.raises(ValueError, match=message) as caught:
         read_cloud(path)
@@ -532,7 +532,7 @@ def npz_member(data, claimed_bytes=None):
         ),
     ],
 )
-def test_a_header_that_claims_more_than_the_file_holds_costs_no_memory(tmp_path, suffix, data, message):
+def test_false_header_sizes_allocate_no_memory(tmp_path, suffix, data, message):
     path = store(tmp_path, suffix, data)
     tracemalloc.start()
     try:
@@ -544,7 +544,7 @@ def test_a_header_that_claims_more_than_the_file_holds_costs_no_memory(tmp_path,
     assert peak_bytes < 2e6
 
 
-def test_the_reason_is_cut_where_a_library_quotes_the_file(tmp_path):
+def test_long_library_messages_are_cut(tmp_path):
     damaged = bytearray(npz_bytes(points=np.random.default_rng(0).random((200, 3))))
     damaged[26:28] = struct.pack("<H", 2000)  # the length of the member's name
     with pytest.raises(ValueError, match=r"not a readable \.npz archive \(File name in directory") as caught:
@@ -552,7 +552,7 @@ def test_the_reason_is_cut_where_a_library_quotes_the_file(tmp_path):
     assert len(str(caught.value)) < 1000
 
 
-def test_a_missing_file_a_folder_and_an_unknown_suffix(tmp_path):
+def test_missing_files_folders_and_unknown_suffixes_are_refused(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"gone\.npy: no such file; a point cloud is needed$"):
         read_cloud(tmp_path / "gone.npy")
     (tmp_path / "folder.npy").mkdir()

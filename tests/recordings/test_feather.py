@@ -1,4 +1,4 @@
-"""A feather table's lengths and places are not believed."""
+"""Feather tables with invalid lengths and offsets."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from torchcover.recordings.isolated_readers import read_feather
 pa = pytest.importorskip("pyarrow")
 
 
-def test_texts_that_would_lie_beyond_the_file_are_refused(tmp_path):
+def test_feather_texts_beyond_the_file_are_refused(tmp_path):
     from pyarrow import feather
 
     path = tmp_path / "table.feather"

@@ -1,4 +1,4 @@
-"""What a plain folder can say beside its clouds, and what is wrong with it."""
+"""Plain folders with optional files, and their faults."""
 
 import pickle
 
@@ -14,7 +14,7 @@ CLOUD = np.array([[1.0, 2.0, 3.0], [-4.0, 5.0, 0.5]])
 
 
 def clouds(folder, **places):
-    """A folder with frames f2 and f10 in each of some places (`sensors__roof` is `sensors/roof`)."""
+    """Write frames f2 and f10 into each of some folders (`sensors__roof` is `sensors/roof`)."""
     for place, cloud in places.items():
         path = folder / place.replace("__", "/")
         path.mkdir(parents=True)
@@ -29,7 +29,7 @@ def driven(folder, times=(0.0, 0.5), **others):
     return folder
 
 
-def test_a_drive_is_found_again_with_its_names_and_its_body(tmp_path):
+def test_plain_folder_preserves_names_boxes_and_ego_box(tmp_path):
     recording = pickle.loads(pickle.dumps(open_recording(plain_folder(Drive(), tmp_path))))
     assert recording.sensors == ("left", "right")
     assert recording.reference_sensors == ()
@@ -37,7 +37,7 @@ def test_a_drive_is_found_again_with_its_names_and_its_body(tmp_path):
     assert (recording.read_boxes(1).ids, recording.read_boxes(1).categories) == (("car",), ("car, red",))
 
 
-def test_what_is_nearer_than_a_sensor_sees_is_no_return(tmp_path):
+def test_points_below_minimum_range_are_no_returns(tmp_path):
     near = np.array([[0.4, 0.0, 0.0], [0.5, 0.0, 0.0], [0.0, -0.49, 0.0], [np.nan, 0.0, 0.0]])
     clouds(tmp_path, sensor=near, reference=CLOUD)
     (tmp_path / "frames.yaml").write_text(
@@ -48,7 +48,7 @@ def test_what_is_nearer_than_a_sensor_sees_is_no_return(tmp_path):
     assert (frame.counts["sensor_no_return"], frame.counts["sensor_nonfinite"]) == (2, 1)
 
 
-def test_points_of_the_reference_keep_their_weights_and_those_left_out_take_theirs_along(tmp_path):
+def test_weights_follow_their_reference_points(tmp_path):
     clouds(tmp_path, sensor=CLOUD, reference=CLOUD)
     points = np.array([[0.0, 0, 0], [9.0, 0, 0], [np.nan, 0, 0], [0.5, 0, 0.5], [7.0, 0, 0]])
     for name in ("f2", "f10"):
@@ -89,7 +89,7 @@ def test_bad_weights_are_a_bad_frame(tmp_path, arrays, message):
         RecordedFrames(tmp_path)[0]
 
 
-def test_frames_that_are_no_news_to_each_other_share_an_instant(tmp_path):
+def test_dependent_frames_share_a_block_index(tmp_path):
     driven(clouds(tmp_path, sensor=CLOUD, reference=CLOUD))
     assert [frame.block_index for frame in RecordedFrames(tmp_path)] == [0, 1]
     text = (tmp_path / "poses.csv").read_text().splitlines()
@@ -127,7 +127,7 @@ ROWS = "\nf2,0,0,0,0,1,0,0,0\nf10,1,0,0,0,1,0,0,0"
         (HEADER + '\n"f2', r"line 2: not CSV \(unexpected end of data\)"),
     ],
 )
-def test_a_bad_table_of_poses_names_file_and_field(tmp_path, text, message):
+def test_bad_pose_table_names_file_and_field(tmp_path, text, message):
     (clouds(tmp_path, sensor=CLOUD, reference=CLOUD) / "poses.csv").write_text(text)
     with pytest.raises(ValueError, match=rf"poses\.csv: .*{message}") as caught:
         RecordedFrames(tmp_path)
@@ -160,7 +160,7 @@ def test_bad_boxes_are_a_bad_frame(tmp_path, row, message):
         RecordedFrames(tmp_path)
 
 
-def test_sensors_are_chosen_by_the_names_of_their_folders(tmp_path):
+def test_sensors_are_chosen_by_folder_name(tmp_path):
     clouds(tmp_path, sensors__roof=CLOUD, sensors__left=CLOUD + 10.0, reference=CLOUD)
     assert RecordedFrames(tmp_path).rigs == ("recording",)
     assert len(RecordedFrames(tmp_path)[0].sensor) == 4
@@ -170,7 +170,7 @@ def test_sensors_are_chosen_by_the_names_of_their_folders(tmp_path):
         RecordedFrames(tmp_path)
 
 
-def test_a_mount_is_said_once(tmp_path):
+def test_extrinsics_are_given_once(tmp_path):
     clouds(tmp_path, sensors__roof=CLOUD, reference=CLOUD)
     rows = [[name, *pose_row(HALF_TURN)] for name in ("f2", "f10")]
     table(tmp_path / "reference" / "poses.csv", ("frame", *POSE), rows)
@@ -182,7 +182,7 @@ def test_a_mount_is_said_once(tmp_path):
     assert len(RecordedFrames(tmp_path)[0].reference) == 2
 
 
-def test_a_folder_without_a_reference_needs_poses_to_accumulate_one(tmp_path):
+def test_accumulated_reference_of_a_folder_needs_poses(tmp_path):
     clouds(tmp_path, sensor=CLOUD)
     with pytest.raises(ValueError, match=r"no reference can be accumulated because .* has no times of its scans"):
         RecordedFrames(tmp_path)

@@ -1,4 +1,4 @@
-"""Every reader finds in its layout the world that was written down in it."""
+"""Readers of all formats return the scene that was written."""
 
 import json
 import pickle
@@ -23,12 +23,12 @@ def layout(request):
 
 @pytest.fixture
 def written(layout, tmp_path):
-    """A drive, and the same as its reader gives it."""
+    """A drive, and the recording that its reader opens."""
     drive = Drive(steps=5, labelled=not layout.startswith("ros"))  # bags have no boxes
     return drive, open_recording(LAYOUTS[layout](drive, tmp_path))
 
 
-def test_a_layout_is_recognised(layout, written):
+def test_formats_are_recognized(layout, written):
     _, recording = written
     assert isinstance(recording, FORMATS[layout.partition(" ")[0]])
     assert len(recording.frame_names) == 5 == len(recording.times_s)
@@ -36,21 +36,21 @@ def test_a_layout_is_recognised(layout, written):
     assert all(set(of) <= set(recording.sensors) for of in recording.rigs.values())
 
 
-def test_clouds_are_where_the_world_is(layout, written):
+def test_clouds_and_reference_match_the_scene(layout, written):
     drive, recording = written
     frames = RecordedFrames(recording, reference=AccumulatedReference(10.0, voxel_m=0.05))
     for number, index in enumerate(recording.key_frames):
         frame = frames[number]
         wall_m, car_m = standing(drive, index), moving(drive, index)
         assert distances_m(frame.sensor, np.concatenate([wall_m, car_m])).max() < 1e-3
-        # Moved by poses, and by boxes; without these, by what is seen of it: within the diagonal of a cell.
+        # Moving points follow boxes, or clusters without labels, which are exact within the diagonal of a cell.
         world_m = np.concatenate([wall_m, car_m])
         assert distances_m(frame.reference, world_m).max() < (2e-3 if drive.labelled else 0.3 * 2**0.5)
         assert distances_m(world_m if drive.labelled else wall_m, frame.reference).max() < 0.05 * 3**0.5
         assert frame.name == recording.frame_names[index]
 
 
-def test_poses_and_boxes_are_those_of_the_world(layout, written):
+def test_poses_and_boxes_match_the_scene(layout, written):
     drive, recording = written
     for index in range(5):
         moved = invert(recording.get_world_T_vehicle(0)) @ recording.get_world_T_vehicle(index)
@@ -78,7 +78,7 @@ def test_a_recording_survives_pickle(written):
     assert torch.equal(copy[1].reference, RecordedFrames(recording, reference=AccumulatedReference(0.5))[1].reference)
 
 
-def test_a_reader_reads_nothing_but_what_is_asked_for(written, monkeypatch):
+def test_readers_read_scans_only_on_request(written, monkeypatch):
     _, recording = written
     monkeypatch.setattr("torchcover.recordings.clouds.read_cloud", lambda path: pytest.fail("a scan was read"))
     assert recording.get_world_T_vehicle(1).shape == (4, 4)
@@ -94,7 +94,7 @@ def test_a_reader_reads_nothing_but_what_is_asked_for(written, monkeypatch):
         ("sample_annotation", lambda row: row.pop("size"), "KeyError: 'size'"),
     ],
 )
-def test_tables_that_do_not_hold_together_are_bad_files(tmp_path, table, change, named):
+def test_inconsistent_tables_are_bad_files(tmp_path, table, change, named):
     root = LAYOUTS["nuscenes"](Drive(steps=3), tmp_path)
     path = root / "v1.0-mini" / f"{table}.json"
     rows = json.loads(path.read_text())
@@ -105,7 +105,7 @@ def test_tables_that_do_not_hold_together_are_bad_files(tmp_path, table, change,
     assert str(root) in str(told.value)
 
 
-def test_a_time_zone_is_no_time_of_kitti(tmp_path):
+def test_kitti_times_have_no_time_zone(tmp_path):
     (tmp_path / "timestamps.txt").write_text("2011-09-26 13:02:25+02\n")
     with pytest.raises(
         BadFileError, match=r"lines of date and time are needed|parsing timezone aware"
@@ -145,7 +145,7 @@ def remove_second_pose(layout, path):
 
 
 @pytest.mark.parametrize("layout", ["kitti_raw", "argoverse2"])
-def test_a_missing_pose_costs_its_sweep_only(layout, tmp_path):
+def test_missing_pose_excludes_only_its_sweep(layout, tmp_path):
     drive = Drive(steps=4)
     path = LAYOUTS[layout](drive, tmp_path)
     whole = open_recording(path)
@@ -162,7 +162,7 @@ def test_a_missing_pose_costs_its_sweep_only(layout, tmp_path):
         torch.testing.assert_close(partial.read_boxes(index).rows, whole.read_boxes(number).rows)
 
 
-def test_kitti_scans_and_poses_of_other_times_are_refused(tmp_path):
+def test_kitti_scans_need_poses_of_their_time(tmp_path):
     path = LAYOUTS["kitti_raw"](Drive(steps=3), tmp_path)
     stamps = (path / "velodyne_points" / "timestamps.txt").read_text()
     (path / "oxts" / "timestamps.txt").write_text(stamps)

@@ -1,4 +1,4 @@
-"""What a simulated rig saw, written down and read back."""
+"""Simulated frames that are written as recordings and read again."""
 
 import contextlib
 import shutil
@@ -19,7 +19,7 @@ from torchcover.recordings.recorders import NO_OBJECT_LABEL, KittiRecorder
 from torchcover.simulation import SurfaceReference, writing
 
 PATTERN = {"channels": 8, "vertical_fov_deg": (-30, 5), "horizontal_fov_deg": 360, "columns": 60, "max_range_m": 60}
-# Not in the order of their names, and with noise that depends on their order.
+# Sensors are not in alphabetical order, and their noise depends on the order.
 FRONT = {
     "name": "z front",
     "mount": {"x_m": 2.6, "z_m": 0.8, "pitch_deg": 3, "yaw_deg": 20},
@@ -45,7 +45,7 @@ def in_order(points):
     return points[np.lexsort(points.numpy().T)]
 
 
-def test_a_plain_folder_gives_the_frames_that_were_written(both, tmp_path):
+def test_plain_folder_preserves_written_frames(both, tmp_path):
     write_recording(both, tmp_path)
     again = RecordedFrames(tmp_path)
     assert again.recording.sensors == ("a rear", "z front")
@@ -80,7 +80,7 @@ def test_clouds_are_in_the_frame_of_their_sensor(both, tmp_path):
     np.testing.assert_allclose(range_m, np.linalg.norm(alone - [2.6, 0.0, 0.8], axis=1), rtol=1e-6)
 
 
-def test_poses_are_those_of_the_ego_and_cities_are_far_apart_in_time(both, tmp_path):
+def test_poses_are_of_the_ego_and_cities_separate(both, tmp_path):
     write_recording(both, tmp_path)
     recording = open_recording(tmp_path)
     for index in range(3):
@@ -95,20 +95,20 @@ def test_poses_are_those_of_the_ego_and_cities_are_far_apart_in_time(both, tmp_p
 
 
 @pytest.mark.parametrize("angles", [(0, 0, 0), (180, 0, 0), (33, -20, 170), (0, 90, 0), (-90, 0, 180), (1e-5, 0, 0)])
-def test_a_quaternion_is_that_of_its_rotation(angles):
+def test_quaternions_match_their_rotation(angles):
     rotation = convert_euler_to_rotation(*map(float, angles))
     wxyz = convert_rotation_to_quaternion(rotation)
     assert wxyz[0] >= 0
     np.testing.assert_allclose(convert_quaternion_to_rotation(wxyz), rotation, atol=1e-14)
 
 
-def test_kittis_layout_is_read_as_kittis(tmp_path):
+def test_kitti_layout_is_read_as_kitti(tmp_path):
     frames = simulated(FRONT, steps=1)
     write_recording(frames, tmp_path / "training", "kitti")
     again = RecordedFrames(tmp_path)
     assert (again.rigs, again.frame_names) == (("kitti",), ("000000",))
     written, read = frames[0], again[0]
-    # What is drawn in KITTI's own car the reader takes for that car.
+    # The reader excludes points inside KITTI's vehicle.
     points = written.get_measured_points().numpy().astype(np.float64)
     own = ((points > BODY.lower_m) & (points < BODY.upper_m)).all(axis=1)
     assert read.counts["sensor_ego_vehicle"] == own.sum()
@@ -131,7 +131,7 @@ def test_kittis_layout_is_read_as_kittis(tmp_path):
     assert {"P2", "R0_rect", "Tr_velo_to_cam", "Tr_imu_to_velo"} <= calibration.keys()
 
 
-def test_labels_of_kitti_are_seen_from_its_camera(tmp_path):
+def test_kitti_labels_are_in_the_camera_frame(tmp_path):
     frames = simulated(FRONT, steps=1)
     write_recording(frames, tmp_path, "kitti")
     labels = read_labels(tmp_path / "label_2" / "000000.txt")
@@ -146,7 +146,7 @@ def test_labels_of_kitti_are_seen_from_its_camera(tmp_path):
         assert abs(alpha) <= np.pi
 
 
-def test_a_step_without_objects_has_an_empty_list_of_them(tmp_path):
+def test_frame_without_objects_has_an_empty_list(tmp_path):
     frames = simulated(FRONT, steps=1)
     frames.simulator.compute_labels = lambda index: []
     for layout in ("folder", "kitti"):
@@ -162,7 +162,7 @@ def test_without_boxes_none_are_written(tmp_path):
         assert RecordedFrames(tmp_path / layout)[0].boxes is None
 
 
-def test_what_cannot_be_written_is_refused_before_the_first_step(both, tmp_path, monkeypatch):
+def test_unsupported_recordings_are_refused_before_the_first_frame(both, tmp_path, monkeypatch):
     monkeypatch.setattr(both.simulator, "step", lambda index: pytest.fail("a step was simulated"))
     with pytest.raises(ValueError, match=r"format 'bag': recordings are written as folder or kitti"):
         write_recording(both, tmp_path, "bag")
@@ -209,7 +209,7 @@ def texts(folder):
 
 
 @pytest.mark.parametrize("layout", ["folder", "kitti"])
-def test_a_part_of_a_recording_is_never_read_and_gone_on_with(both, simulated_once, tmp_path, monkeypatch, layout):
+def test_incomplete_recording_is_refused_and_can_be_resumed(both, simulated_once, tmp_path, monkeypatch, layout):
     if layout == "kitti":
         monkeypatch.setattr(KittiRecorder, "__init__", anything)
     write_recording(both, tmp_path / "whole", layout)
@@ -230,14 +230,14 @@ def test_a_part_of_a_recording_is_never_read_and_gone_on_with(both, simulated_on
 
 
 def anything(recorder, add, setup, init=KittiRecorder.__init__):
-    """Two sensors in a layout of one, whose clouds are the first's."""
+    """Write two sensors in a layout for one, with the cloud of the first."""
     name = setup.lidar_names[0]
     init(recorder, add, setup._replace(mounts={name: setup.mounts[name]}, lidar_names=[name]))
     write = recorder.write
     recorder.write = lambda step: write(step._replace(clouds={name: step.clouds[name]}))
 
 
-def test_another_recording_is_not_gone_on_with(both, simulated_once, tmp_path):
+def test_different_recordings_cannot_be_resumed(both, simulated_once, tmp_path):
     with pytest.raises(ZeroDivisionError):
         write_recording(both, tmp_path / "part", progress=until(2, lambda: 1 / 0))
     write_recording(both, tmp_path / "whole")
@@ -248,7 +248,7 @@ def test_another_recording_is_not_gone_on_with(both, simulated_once, tmp_path):
             write_recording(simulated(FRONT, REAR, steps=1), folder, resume=True)
 
 
-def test_a_recording_has_the_frames_that_were_written(tmp_path):
+def test_recordings_are_checked_against_their_manifest(tmp_path):
     frames = simulated(FRONT, steps=2)
     write_recording(frames, tmp_path / "training", "kitti")
     label = tmp_path / "training" / "label_2" / "000000.txt"
@@ -271,7 +271,7 @@ def test_a_recording_has_the_frames_that_were_written(tmp_path):
     assert len(open_recording(tmp_path).frame_names) == 2
 
 
-def test_a_kill_at_any_file_operation_costs_a_frame_at_most(tmp_path, monkeypatch):
+def test_kill_at_any_file_operation_costs_one_frame(tmp_path, monkeypatch):
     frames = simulated(FRONT, scenario="courtyard", steps=2, frame_interval_s=0.1, boxes=False)
     made, content = [writing._step(frames, index) for index in range(2)], frames.content
     monkeypatch.setattr(writing, "_step", lambda _, index: made[index])

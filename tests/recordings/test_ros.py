@@ -1,4 +1,4 @@
-"""Bags of ROS: clouds of all shapes, times of single points, trees of frames, and bags that do not hold together."""
+"""ROS bags: layouts of clouds, point times, trees of frames, and inconsistent bags."""
 
 import os
 
@@ -55,7 +55,7 @@ def driven(count=60, every_ns=10_000_000):
 
 @pytest.mark.parametrize("order", "<>")
 @pytest.mark.parametrize("kind", ["f4", "f8"])
-def test_a_cloud_may_have_gaps_rows_and_big_ends(tmp_path, kind, order):
+def test_clouds_may_have_padding_rows_and_big_endian(tmp_path, kind, order):
     columns = {"ring": np.arange(6, dtype="u2"), "x": np.arange(6), "y": -np.arange(6), "z": np.full(6, 0.5)}
     columns |= {axis: columns[axis].astype(kind) for axis in "xyz"}
     columns["y"][3] = np.nan
@@ -81,7 +81,7 @@ def test_a_cloud_without_gaps_needs_no_row_step(tmp_path, height, row_step):
 
 
 @pytest.mark.parametrize("ending", ["-wal", "-journal"])
-def test_messages_beside_a_database_are_not_lost(tmp_path, ending):
+def test_messages_in_a_journal_are_not_lost(tmp_path, ending):
     path = bag(tmp_path / "a", MOUNTED + clouds(), "sqlite3")
     (path / f"a.db3{ending}").touch()
     assert len(RosBag(path).frame_names) == 2
@@ -101,7 +101,7 @@ def test_messages_beside_a_database_are_not_lost(tmp_path, ending):
         ("time_stamp", lambda offset_ns, _: offset_ns.astype("i4")),
     ],
 )
-def test_points_with_times_are_moved_to_the_instant(tmp_path, field, stored):
+def test_points_are_compensated_to_the_frame_time(tmp_path, field, stored):
     check_points_are_moved(tmp_path, field, stored)
 
 
@@ -119,7 +119,7 @@ def test_points_with_times_are_moved_to_the_instant(tmp_path, field, stored):
         (lambda offset_ns, _: (offset_ns / STEP_NS).astype("f4"), "read as shares of the scan period"),
     ],
 )
-def test_the_unit_of_times_of_points_is_found_by_the_time_between_scans(tmp_path, stored, words):
+def test_point_time_unit_follows_from_scan_period(tmp_path, stored, words):
     with pytest.warns(UserWarning, match=f"lidar: the point times .*{words}; choose another by"):
         check_points_are_moved(tmp_path, "t", stored)
 
@@ -132,7 +132,7 @@ def test_the_unit_of_times_of_points_is_found_by_the_time_between_scans(tmp_path
         lambda offset_ns, _: (offset_ns / STEP_NS * 36000).astype("u2"),  # an angle
     ],
 )
-def test_times_of_points_in_no_unit_are_refused_with_the_setting(tmp_path, stored):
+def test_point_times_without_plausible_unit_are_refused(tmp_path, stored):
     offset_ns = np.linspace(0, STEP_NS, 4)
 
     def timed(time_ns):
@@ -148,7 +148,7 @@ def test_times_of_points_in_no_unit_are_refused_with_the_setting(tmp_path, store
         RosBag(path, point_time_unit="h")
 
 
-def test_times_of_points_over_a_part_of_a_turn_are_said(tmp_path):
+def test_point_times_over_part_of_a_scan_warn(tmp_path):
     def timed(time_ns):
         return cloud(points(CORNERS_M, t=np.array([0, 1e7, 2e7, 2.5e7], "u4")), time_ns, "lidar")
 
@@ -178,7 +178,7 @@ def check_points_are_moved(tmp_path, field, stored):
         np.testing.assert_allclose(np.delete(there_m, 7, axis=0), np.delete(world_m, 7, axis=0), atol=1e-3)
 
 
-def test_clouds_of_other_times_are_moved_to_the_instant(tmp_path):
+def test_clouds_are_compensated_to_the_frame_time(tmp_path):
     def late(time_ns):
         world_T_sensor = pose_at((time_ns - T0_NS) * 1e-9 + 0.04) @ mount
         return cloud(points(transform_points(invert(world_T_sensor), FAR_CORNERS_M)), time_ns + 40_000_000, "lidar")
@@ -194,7 +194,7 @@ def test_clouds_of_other_times_are_moved_to_the_instant(tmp_path):
     np.testing.assert_array_equal(chosen.sensor, frame.sensor[4:])
 
 
-def test_odometry_may_be_that_of_another_frame(tmp_path):
+def test_odometry_may_refer_to_another_frame(tmp_path):
     vehicle_T_imu = build_transform(convert_euler_to_rotation(90.0, 0.0, 0.0), [-1.0, 0.5, 0.3])
     mounted = [static(link("base_link", "/lidar", mount), link("base_link", "imu", vehicle_T_imu))]
     measured = [
@@ -205,7 +205,7 @@ def test_odometry_may_be_that_of_another_frame(tmp_path):
     np.testing.assert_allclose(recording.get_world_T_vehicle(1), pose_at(0.1), atol=1e-9)
 
 
-def test_a_tree_leads_to_the_frame_that_never_jumps(tmp_path):
+def test_transforms_lead_to_the_continuous_odom_frame(tmp_path):
     jump = [link("map", "odom", pose_at(7.0), T0_NS + k * STEP_NS) for k in range(2)]
     here = [link("odom", "footprint", pose_at(0.1 * k), T0_NS + k * STEP_NS) for k in range(2)]
     raised = build_transform(np.eye(3), [0.0, 0.0, 0.3])
@@ -215,7 +215,7 @@ def test_a_tree_leads_to_the_frame_that_never_jumps(tmp_path):
     np.testing.assert_allclose(recording.get_world_T_vehicle(1), pose_at(0.1) @ raised, atol=1e-9)
 
 
-def test_scans_beyond_the_poses_are_left_out(tmp_path):
+def test_scans_beyond_the_poses_are_excluded(tmp_path):
     late = [(topic, time_ns + 5 * STEP_NS, message) for topic, time_ns, message in driven(30)]
     late = [("/odom", time_ns, odometry(pose_at(0.0), time_ns)) for _, time_ns, _ in late]
     recording = RosBag(bag(tmp_path / "a", MOUNTED + late + clouds(count=20)))
@@ -224,7 +224,7 @@ def test_scans_beyond_the_poses_are_left_out(tmp_path):
     assert recording.frame_names[0] == str(T0_NS + 4 * STEP_NS)
 
 
-def test_what_was_chosen_is_said(tmp_path):
+def test_choices_between_alternatives_warn(tmp_path):
     chart = [("/chart", T0_NS, cloud(points(CORNERS_M), T0_NS, "map"))]
     lost = [("/b", time_ns, cloud(points(CORNERS_M), time_ns, "nowhere")) for _, time_ns, _ in clouds(count=5)]
     goal = [("/goal", time_ns, posed(np.eye(4), time_ns)) for _, time_ns, _ in clouds(count=5)]
@@ -244,7 +244,7 @@ def test_what_was_chosen_is_said(tmp_path):
 raised = build_transform(np.eye(3), [0.0, 0.0, 0.2])
 
 
-def test_the_frame_on_the_ground_is_the_vehicles(tmp_path):
+def test_base_footprint_is_the_default_vehicle_frame(tmp_path):
     mounted = [static(link("base_link", "lidar", mount), link("base_footprint", "base_link", raised))]
     path = bag(tmp_path / "a", mounted + driven() + clouds())
     with pytest.warns(UserWarning, match="base_footprint is used as the vehicle frame, not base_link"):
@@ -265,7 +265,7 @@ def moved_tree(k, *links):
 
 
 @pytest.mark.parametrize("write", [bag, lambda path, messages: bags.bag1(path.with_suffix(".bag"), messages)])
-def test_mounts_may_come_with_what_moves(tmp_path, write):
+def test_mounts_may_come_in_tf(tmp_path, write):
     # The head turns, and its camera with it.
     turned = [build_transform(convert_euler_to_rotation(float(k), 0.0, 0.0), [0.0, 0.0, 1.0]) for k in range(8)]
     moved = [
@@ -282,8 +282,8 @@ def test_mounts_may_come_with_what_moves(tmp_path, write):
     np.testing.assert_allclose(recording.get_world_T_vehicle(2), pose_at(0.2), atol=1e-6)
 
 
-def test_mounts_may_be_told(tmp_path):
-    # Odometry of the LiDAR itself, and what is mounted beside it.
+def test_mounts_may_come_from_the_user(tmp_path):
+    # Odometry of the LiDAR frame, and a static transform to the vehicle.
     of_lidar = [
         ("/odom", time_ns, odometry(pose_at((time_ns - T0_NS) * 1e-9) @ mount, time_ns, "lidar"))
         for _, time_ns, _ in driven()
@@ -313,7 +313,7 @@ def test_mounts_may_be_told(tmp_path):
         RosBag(path, mounts={"roof": mount})
 
 
-def test_files_of_ros_1_are_parts_of_one_bag(tmp_path):
+def test_files_of_ros_1_form_one_bag(tmp_path):
     (tmp_path / "drive").mkdir()
     bags.bag1(tmp_path / "drive" / "lidar.bag", MOUNTED + clouds(count=3))
     bags.bag1(tmp_path / "drive" / "poses.bag", driven())
@@ -326,7 +326,7 @@ def test_files_of_ros_1_are_parts_of_one_bag(tmp_path):
 
 
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
-def test_to_open_a_bag_reads_few_clouds(tmp_path, monkeypatch, storage):
+def test_opening_a_bag_reads_few_clouds(tmp_path, monkeypatch, storage):
     path = bag(tmp_path / "a", MOUNTED + driven(250) + clouds(count=200), storage)
     read = []
     messages = Bag.read_messages
@@ -339,7 +339,7 @@ def test_to_open_a_bag_reads_few_clouds(tmp_path, monkeypatch, storage):
     monkeypatch.setattr(Bag, "read_messages", counted)
     recording = RosBag(path)
     assert len(recording.frame_names) == 27  # 2.49 s of poses
-    # The first for its frame; those within 1 s of the first pose and of the last for their stamps.
+    # One cloud is read for its frame, others within 1 s of the first and last pose for their stamps.
     assert read.count("/lidar") <= 1 + 11 + 20
     assert len(RosBag(next(path.glob("a.*"))).frame_names) == 27  # the file alone
 
@@ -381,7 +381,7 @@ XYZ = (("x", 0, 7), ("y", 4, 7))
         ({"fields": fields(*XYZ, ("z", 8, 7), ("t", 8, 99))}, "within the 12 bytes"),
     ],
 )
-def test_clouds_that_lie_about_themselves(tmp_path, changes, told):
+def test_inconsistent_clouds_are_bad_files(tmp_path, changes, told):
     recording = RosBag(other(tmp_path / "a", **changes))
     with pytest.raises(BadFileError, match=told):
         recording.read_scan("lidar", 0)
@@ -415,7 +415,7 @@ NOT_FINITE = build_transform(np.eye(3), [0.0, np.nan, 0.0])
         ([*MOUNTED, *clouds(), clouds()[1]], "times have to ascend"),
     ],
 )
-def test_bags_that_do_not_hold_together(tmp_path, messages, told):
+def test_inconsistent_bags_are_bad_files(tmp_path, messages, told):
     path = bag(tmp_path / "a", messages)
     with pytest.raises(BadFileError, match=told) as error:
         RosBag(path)
@@ -447,7 +447,7 @@ def test_poses_in_two_frames_are_not_mixed(tmp_path, odom_every, map_every):
         np.testing.assert_allclose(recording.get_world_T_vehicle(index), pose_at(0.1 * index), atol=1e-6)
 
 
-def test_a_second_way_to_the_same_frame_is_told(tmp_path):
+def test_second_path_to_the_same_frame_warns(tmp_path):
     """As in hector_slam issue 27: `map -> odom -> base_link` and `map -> scanmatcher -> base_link`."""
     messages = []
     for k in range(12):
@@ -466,7 +466,7 @@ def test_a_second_way_to_the_same_frame_is_told(tmp_path):
     np.testing.assert_allclose(off_m, 0.0, atol=1e-6)
 
 
-def test_two_senders_of_one_pose_are_told(tmp_path):
+def test_two_senders_of_one_pose_warn(tmp_path):
     messages = [
         (
             "/tf",
@@ -479,7 +479,7 @@ def test_two_senders_of_one_pose_are_told(tmp_path):
         RosBag(bag(tmp_path / "a", MOUNTED + messages + clouds(count=3)))
 
 
-def test_a_frame_that_is_mounted_twice_is_told(tmp_path):
+def test_conflicting_static_transforms_warn(tmp_path):
     other_mount = build_transform(np.eye(3), [1.0, 0.2, 2.1])
     rack = [static(link("base_link", "rack", raised)), static(link("rack", "lidar", other_mount))]
     driver = [static(link("sensor", "lidar", other_mount))]
@@ -498,7 +498,7 @@ def test_a_frame_that_is_mounted_twice_is_told(tmp_path):
         np.testing.assert_allclose(recording.read_scan("lidar", 0).vehicle_T_sensor, expected, atol=1e-12)
 
 
-def test_the_frame_of_the_poses_may_lie_above_the_ground(tmp_path):
+def test_frame_of_poses_may_be_above_ground(tmp_path):
     mounted = [static(link("base_link", "lidar", mount), link("base_footprint", "base_link", raised))]
     moved = [moved_tree(k) for k in range(8)]
     with pytest.warns(UserWarning, match="base_footprint is used"):
@@ -506,7 +506,7 @@ def test_the_frame_of_the_poses_may_lie_above_the_ground(tmp_path):
     np.testing.assert_allclose(recording.get_world_T_vehicle(2), pose_at(0.2) @ invert(raised), atol=1e-6)
 
 
-def test_a_static_transform_that_moves_is_told(tmp_path):
+def test_moving_static_transform_warns(tmp_path):
     both = [static(link("odom", "base_link", mount), link("base_link", "lidar", mount))]
     with pytest.warns(UserWarning, match="odom -> base_link: sent as static and as moving transforms"):
         recording = RosBag(bag(tmp_path / "a", both + [moved_tree(k) for k in range(8)] + clouds(count=3)))
@@ -515,8 +515,8 @@ def test_a_static_transform_that_moves_is_told(tmp_path):
 
 @pytest.mark.parametrize("count", [5, 90])
 @pytest.mark.parametrize("slowness", [4.0, 20.0])
-def test_stamps_are_the_times(tmp_path, count, slowness):
-    """A bag that was recorded while another one played slowly."""
+def test_frame_times_are_stamps(tmp_path, count, slowness):
+    """A bag that was recorded during the slow replay of another one."""
     messages = [*MOUNTED, *driven(count * 10), *clouds(count=count)]
     slow = [(topic, T0_NS + int((time_ns - T0_NS) * slowness), message) for topic, time_ns, message in messages]
     with pytest.warns(UserWarning, match="scans of lidar were recorded 0 to .* s after their stamps, which are used"):
@@ -533,7 +533,7 @@ def test_scans_are_paired_by_their_stamps(tmp_path):
     assert recording._stamps_ns["b"].tolist() == recording._stamps_ns["lidar"].tolist()
 
 
-def test_clouds_without_stamps_are_as_recorded(tmp_path):
+def test_clouds_without_stamps_use_log_times(tmp_path):
     unstamped = [(topic, time_ns, cloud(points(CORNERS_M), 0, "lidar")) for topic, time_ns, _ in clouds(count=3)]
     with pytest.warns(UserWarning, match="clouds of lidar have no stamps: their log times are used"):
         assert RosBag(bag(tmp_path / "a", MOUNTED + unstamped)).times_s.tolist() == pytest.approx([0.0, 0.1, 0.2])
@@ -550,7 +550,7 @@ def test_a_gap_in_the_poses_is_not_bridged(tmp_path):
         recording.read_scan("lidar", 6)
 
 
-def test_a_sensor_that_pauses_is_missing_there(tmp_path):
+def test_pausing_sensor_is_missing_in_those_frames(tmp_path):
     paused = [
         ("/b", time_ns, message)
         for _, time_ns, message in clouds(count=12)
@@ -572,7 +572,7 @@ def test_a_sensor_that_pauses_is_missing_there(tmp_path):
         (("storage_identifier: mcap", "storage_identifier: rosbag_v2"), "got 'rosbag_v2'"),
     ],
 )
-def test_metadata_that_cannot_be(tmp_path, change, told):
+def test_invalid_metadata_is_refused(tmp_path, change, told):
     path = bag(tmp_path / "a", MOUNTED + clouds())
     text = (path / "metadata.yaml").read_text()
     assert change[0] in text
@@ -586,7 +586,7 @@ REMEDIES = {"mcap": "mcap recover a.mcap -o ", "sqlite3": "sqlite3 a.db3 .recove
 
 @pytest.mark.parametrize("share", [0.5, 0.98])
 @pytest.mark.parametrize("storage", REMEDIES)
-def test_a_bag_that_was_cut_off_or_is_gone(tmp_path, storage, share):
+def test_truncated_or_missing_bags_are_bad_files(tmp_path, storage, share):
     if storage == "ros1":
         path = file = bags.bag1(tmp_path / "a.bag", MOUNTED + clouds())
     else:
@@ -638,7 +638,7 @@ def test_bags_stay_compressed_and_bounded(tmp_path, monkeypatch, storage, compre
         RosBag(path)
 
 
-def test_messages_are_bounded_by_what_they_become(tmp_path, monkeypatch):
+def test_memory_limit_counts_deserialized_messages(tmp_path, monkeypatch):
     recording = RosBag(bag(tmp_path / "a", MOUNTED + clouds(lambda t: cloud(points(np.zeros((9000, 3))), t, "lidar"))))
     monkeypatch.setenv("TORCHCOVER_MAX_FILE_GB", "0.002")
     with pytest.raises(BadFileError, match=r"reading it takes 0.00216 GB of memory, more than the 0.002 GB"):
@@ -646,7 +646,7 @@ def test_messages_are_bounded_by_what_they_become(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("storage", ["ros1", "mcap", "sqlite3"])
-def test_pipes_and_links_out_of_the_folder_are_no_bags(tmp_path, storage):
+def test_pipes_and_links_out_of_folder_are_refused(tmp_path, storage):
     if storage == "ros1":
         (tmp_path / "a").mkdir()
         bags.bag1(tmp_path / "a" / "a.bag", MOUNTED + clouds())
@@ -665,7 +665,7 @@ def test_pipes_and_links_out_of_the_folder_are_no_bags(tmp_path, storage):
 
 
 @pytest.mark.parametrize("name", ["..%2Fa.db3", "a#.db3", "a?vfs=unix-dotfile&.db3"])
-def test_names_of_databases_are_no_addresses(tmp_path, name):
+def test_database_names_are_no_uris(tmp_path, name):
     """SQLite would open another file, or create one beside it."""
     path = bag(tmp_path / "a", MOUNTED + clouds(), "sqlite3")
     (path / "a.db3").rename(tmp_path / "a.db3")
@@ -675,7 +675,7 @@ def test_names_of_databases_are_no_addresses(tmp_path, name):
         RosBag(path)
 
 
-def test_an_index_that_lies_is_found_out(tmp_path):
+def test_wrong_index_is_detected(tmp_path):
     path = next(bags.ros(Drive(steps=2), tmp_path).glob("*.mcap"))
     data = path.read_bytes()
     count = data.rindex((2).to_bytes(8, "little"))

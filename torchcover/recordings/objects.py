@@ -3,7 +3,7 @@
 import hashlib
 import math
 from bisect import bisect_left
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -300,7 +300,7 @@ def find_vehicle_class(category: str) -> str | None:
         >>> find_vehicle_class("Car"), find_vehicle_class("walker.pedestrian.07"), find_vehicle_class("static.barrier")
         ('passenger', 'pedestrian', None)
     """
-    classes: dict[str, str] = load_road_user_classes()["usual"]
+    classes: Mapping[str, str] = load_road_user_classes()["usual"]
     for word in reversed(category.strip().lower().split(".")):
         if word in classes:
             return classes[word]

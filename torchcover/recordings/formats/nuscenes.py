@@ -236,7 +236,7 @@ def _find_scene_token(samples: list[dict[str, Any]], path: Path, scene: str | No
 
 def _find_class(category: str) -> str | None:
     """Find SUMO's vehicle class by the first matching prefix of a category."""
-    classes: dict[str, str] = load_road_user_classes()["nuscenes"]
+    classes: Mapping[str, str] = load_road_user_classes()["nuscenes"]
     for prefix, vehicle_class in classes.items():
         if category.lower().startswith(prefix):
             return vehicle_class
