@@ -171,7 +171,7 @@ def scene(**options) -> Picture:
 def test_what_stands_is_drawn_the_darker_the_higher_and_the_ground_is_not():
     squares = [(box(x, 5)[:3], height) for x, height in ((10, 0.0), (15, 0.3), (20, 8.0))]
     standing = StaticFaces(np.array([corners for corners, _ in squares]), np.array([height for _, height in squares]))
-    picture = scene(standing=standing)
+    picture = scene(static_faces=standing)
     ground, kerb, house = (picture.at(0, x + 1, 4.6).mean() for x in (10, 15, 20))
     assert ground == 1.0
     assert 1.0 > kerb > house + 0.1

@@ -62,7 +62,7 @@ def colours(figure: Figure) -> np.ndarray:
 
 
 def test_there_is_a_figure_for_each_quantity_and_band(tmp_path):
-    coverage = coverage_of(SQUARE, thresholds=(1.0,))
+    coverage = coverage_of(SQUARE, thresholds_m=(1.0,))
     keys = ("radius_m", "detection_1m")
     paths = write_figures(plot_maps({"a": coverage}, ego_outline_m=EGO), tmp_path / "new" / "maps")
     stems = [name for key in keys for name in (*(f"{key}_{band}" for band in BANDS), f"near_{key}")]
@@ -91,7 +91,7 @@ def test_maps_show_what_was_asked_for_and_is_known_and_the_ego():
 def test_the_near_field_is_two_lengths_of_the_ego_to_scale_and_nothing_lies_over_it():
     sensors = {"a": [SensorView("roof", np.eye(4), 90.0, (-10.0, 10.0), 8.0)]}
     coverage = blocked(16)
-    near = dict(plot_maps({"a": coverage}, ego_outline_m=EGO, sensors=sensors))["near_radius_m"]
+    near = dict(plot_maps({"a": coverage}, ego_outline_m=EGO, sensors=sensors))["near_field_radius_m"]
     *views, _ = near.axes
     assert [view.get_xlim() for view in views] == [(-10.0, 10.0)] * 2
     assert [view.get_ylim() for view in views] == [(-9.0, 9.0)] * 2
@@ -134,7 +134,7 @@ class Emptiness(Aggregation):
 
 
 def test_a_quantity_of_ones_own_is_drawn_without_being_known():
-    coverage = coverage_of(SMALL, thresholds=(), aggregations=(Emptiness(),))
+    coverage = coverage_of(SMALL, thresholds_m=(), aggregations=(Emptiness(),))
     figure = dict(plot_maps({"a": coverage}))["emptiness_all"]
     assert words(figure)[0] == "Share of emptiness, all"
     assert (figure.axes[1].get_ylabel(), figure.axes[1].get_ylim()) == ("share of emptiness (%)", (0.0, 100.0))
@@ -143,7 +143,7 @@ def test_a_quantity_of_ones_own_is_drawn_without_being_known():
 
 def test_the_bands_of_a_quantity_share_their_colours():
     grid = BevGrid(x_m=(0.0, 1.0), y_m=(0.0, 1.0), cell_m=1.0, heights={"low": (0.0, 1.0), "high": (9.0, 11.0)})
-    metric = CoverageMetric(grid, thresholds=())
+    metric = CoverageMetric(grid, thresholds_m=())
     metric.update(torch.zeros(1, 3), torch.tensor([[0.5, 0.5, 0.5], [0.5, 0.5, 10.0]]))
     low, high = (colours(figure)[400, 400] for _, figure in plot_maps({"a": metric.compute()}))
     assert np.abs(low - high).max() > 0.5
@@ -154,21 +154,21 @@ def test_any_band_name_becomes_a_file_in_the_folder_and_no_two_share_one(tmp_pat
     bands = ["../up", "a/b", "a\\b", "A b", "a_b_3", "$x$", "long" * 99, "Höhe", "\n"]
     heights = {name: (float(at), at + 1.0) for at, name in enumerate(bands)}
     grid = BevGrid(x_m=(0.0, 2.0), y_m=(0.0, 1.0), cell_m=1.0, heights=heights)
-    paths = write_figures(plot_maps({"a": coverage_of(grid, thresholds=())}), tmp_path / "maps")
+    paths = write_figures(plot_maps({"a": coverage_of(grid, thresholds_m=())}), tmp_path / "maps")
     assert len({path.name.lower() for path in paths}) == len(bands)
     assert sorted(tmp_path.rglob("*.png")) == sorted(paths)
     assert all(path.parent == tmp_path / "maps" for path in paths)
 
 
 def test_the_title_names_quantity_band_cell_and_steps():
-    figures = dict(plot_maps({"a": coverage_of(SQUARE, thresholds=())}))
+    figures = dict(plot_maps({"a": coverage_of(SQUARE, thresholds_m=())}))
     expected = ["Mean blind spot radius, obstacle", "z 0.5 to 2 m; 1 step, cells of 1 m"]
     assert words(figures["radius_m_obstacle"]) == expected
 
 
 def test_the_sensors_of_the_rig_are_named():
     sensor = SensorView("the lidar", np.eye(4), 90.0, (-9.0, 9.0), 5.0)
-    coverage = coverage_of(SQUARE, thresholds=())
+    coverage = coverage_of(SQUARE, thresholds_m=())
     _, figure = next(plot_maps({"a": coverage}, sensors={"a": [sensor], "another": []}, ego_outline_m=EGO))
     assert {"the lidar", "ego"} <= set(legend(figure))
 
@@ -190,14 +190,14 @@ def test_there_is_a_difference_for_each_rig_but_the_first(pair, measure, points,
     places = [f"{key}_{band}" for key in ("radius_m", "detection_0.4m") for band in BANDS]
     expected = [f"{place}.png" for place in places]
     expected += [f"difference_{place}_{rig}_minus_few.png" for place in places for rig in ("many", "a_b")]
-    expected += ["near_radius_m.png", "near_detection_0.4m.png"]
+    expected += ["near_field_radius_m.png", "near_field_detection_0.4m.png"]
     assert sorted(path.name for path in paths) == sorted(expected)
 
 
 def test_a_worse_place_is_red_and_a_better_one_blue_whatever_is_measured(measure):
     """The second rig sees at the front left only, the first at the rear right only."""
     front_left, rear_right = torch.tensor([[11.0, 4.0, 0.0]]), torch.tensor([[-4.0, -4.0, 0.0]])
-    rigs = {"first": measure(rear_right, thresholds=(5.0,)), "second": measure(front_left, thresholds=(5.0,))}
+    rigs = {"first": measure(rear_right, thresholds_m=(5.0,)), "second": measure(front_left, thresholds_m=(5.0,))}
     differences = [figure for name, figure in plot_maps(rigs) if name.startswith("difference")]
     assert len(differences) == 4
     for figure in differences:

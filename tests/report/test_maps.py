@@ -109,7 +109,7 @@ def test_unknown_cells_are_grey_and_named_with_their_share():
     assert red == green == blue
     assert 0.65 < red < 0.8
     assert np.ptp(picture.at(5.0, 3.0)) > 0.3
-    assert picture.legend[0] == "unknown: never probed (25.0 % of the cells)"
+    assert picture.legend[0] == "unobserved (25.0 % of the cells)"
 
 
 def test_infinite_cells_have_a_colour_of_their_own_and_leave_the_scale_alone():
@@ -117,7 +117,7 @@ def test_infinite_cells_have_a_colour_of_their_own_and_leave_the_scale_alone():
     values[:, 20:] = math.inf
     picture = draw(values, scale=build_color_scale(RADIUS, values))
     assert picture.at(10.5, 3.5) == pytest.approx(to_rgb(INFINITE_COLOR), abs=0.01)
-    assert "infinite: a step saw nothing (50.0 % of the cells)" in picture.legend
+    assert "infinite: no sensor points in some frame (50.0 % of the cells)" in picture.legend
     assert picture.bar.get_ylim() == (0.0, 0.5)
     assert not any("infinite" in entry for entry in draw(flat()).legend)
 
@@ -126,7 +126,7 @@ def test_values_beyond_the_colours_are_admitted():
     values = flat(0.5)
     values[:2] = 9.0
     bar = draw(values).bar
-    assert "10.0 % of the known cells lie beyond" in bar.get_ylabel()
+    assert "10.0 % of the observed cells lie beyond" in bar.get_ylabel()
     # The arrow takes a piece of the place of the bar.
     assert bar.get_window_extent().height < draw(flat(0.5)).bar.get_window_extent().height
 
@@ -179,7 +179,7 @@ def test_several_sensors_are_numbered_and_those_close_together_share_a_label():
     labels = [text.get_text() for text in picture.axes.texts]
     assert "1, 2" in labels
     assert "3" in labels
-    assert picture.legend[1:5] == ["a", "b", "c", "$away$ (beyond the map)"]
+    assert picture.legend[1:5] == ["a", "b", "c", "$away$ (outside the map)"]
     marks = [entry.get_marker() for entry in picture.axes.get_legend().legend_handles[1:5]]
     assert marks == ["$1$", "$2$", "$3$", "$4$"]
     assert picture.pixels.size < draw(flat()).pixels.size * 1.3  # the paper does not follow it
@@ -218,7 +218,7 @@ def test_a_map_of_one_cell_or_one_value_can_be_drawn(value):
     values = flat(value, grid)
     picture = draw(values, grid, scale=build_color_scale(RADIUS, values))
     unknown = picture.axes.get_legend().get_texts()[0].get_text()
-    assert unknown == f"unknown: never probed ({100 if math.isnan(value) else 0} % of the cells)"
+    assert unknown == f"unobserved ({100 if math.isnan(value) else 0} % of the cells)"
 
 
 def test_the_radius_scale_ends_at_the_98th_percentile_of_the_known_cells():
@@ -273,7 +273,7 @@ def test_what_is_unknown_or_infinite_is_so_whatever_its_opacity():
 
 
 def test_wrong_shapes_are_refused_with_what_arrived():
-    with pytest.raises(ValueError, match=r"opacity: shape \(20, 40\) is needed.*got \(40, 20\)"):
+    with pytest.raises(ValueError, match=r"opacity: got shape \(40, 20\); give that of a band, \(20, 40\)"):
         draw(flat(), opacity=flat().T)
     with pytest.raises(ValueError, match=r"shape \(20, 40\) is needed.*got \(40, 20\)"):
         draw(flat().T)

@@ -73,7 +73,7 @@ def test_a_column_says_in_words_what_it_says_in_files(measure, table, trio, regi
 
 def test_files_have_both_measures_each_under_its_name():
     wall, nothing = records(CoverageTable.from_coverages({"rig": two_cells()}, [WALL, NOTHING]))
-    assert (wall["measure"], wall["visible_m2"], nothing["visible_m2"]) == ("area", 2.0, 0.0)
+    assert (wall["average"], wall["visible_m2"], nothing["visible_m2"]) == ("area", 2.0, 0.0)
     assert (wall["radius_m"], wall["cells_radius_m"]) == (0.25, 0.5)
     assert (wall["detection_0.4m"], wall["cells_detection_0.4m"]) == (0.75, 0.5)
     assert (nothing["radius_m"], nothing["cells_radius_m"]) == (None, None)
@@ -93,13 +93,13 @@ def test_records_are_those_of_the_summary(table, surface_pair, regions):
     for record, row in zip(records(table), rows, strict=True):
         for key in KEYS if row.observed_cells else ():
             assert tuple(record[f"{key}{end}"] for end in ("", "_error", "_low", "_high")) == row.numbers[key][1:5]
-            assert tuple(record[f"known_{key}{end}"] for end in ("", "_error", "_low", "_high")) == row.known[key][1:5]
-            assert record[key] != record[f"known_{key}"]
+            assert tuple(record[f"cells_{key}{end}"] for end in ("", "_error", "_low", "_high")) == row.known[key][1:5]
+            assert record[key] != record[f"cells_{key}"]
 
 
 def test_the_surface_adds_the_numbers_over_known_cells_and_no_other_column(table, trio, regions):
     known = CoverageTable.from_coverages({name: trio[name] for name in table.rigs}, regions)
-    more = {f"known_{key}{end}" for key in KEYS for end in ("", "_error", "_low", "_high")}
+    more = {f"cells_{key}{end}" for key in KEYS for end in ("", "_error", "_low", "_high")}
     assert [name for name in header(table) if name not in more] == header(known)
     assert set(header(table)) - set(header(known)) == more
 
@@ -108,7 +108,7 @@ def test_the_surface_adds_the_numbers_over_known_cells_and_no_other_column(table
 def test_readers_are_told_which_measure_it_is(name, table, trio, regions):
     surface, known = RENDERERS[name](table), RENDERERS[name](CoverageTable.from_coverages(trio, regions))
     assert (SURFACE in surface, CELLS in surface, SURFACE in known, CELLS in known) == (True, False, False, True)
-    assert ("visible surface" in surface, "known cells" in known) == (True, True)
+    assert ("visible surface" in surface, "observed cells" in known) == (True, True)
 
 
 def test_without_a_region_no_measure_is_told(surface_pair):
@@ -129,12 +129,12 @@ def test_maps_are_those_of_the_measure_and_name_what_is_unknown():
     for figure in figures.values():
         (legend,) = [axes.get_legend() for axes in figure.axes if axes.get_legend()]
         assert [text.get_text() for text in legend.get_texts()] == [
-            "unknown: no visible surface found (0 % of the cells)",  # the third one is outside what is shown
-            "paler: less visible surface in a step than open ground has",
+            "no visible surface (0 % of the cells)",  # the third one is outside what is shown
+            "paler: less visible surface per frame than open ground",
         ]
     title, conditions = (text.get_text() for text in figures["radius_area_m_all"].axes[0].texts)
     assert title == "Mean blind spot radius, by area, all"
-    assert conditions == "z -1 to 1 m; 2 steps, cells of 1 m, larger where points are few"
+    assert conditions == "z -1 to 1 m; 2 frames, cells of 1 m, larger where points are few"
     assert figures["detection_area_0.4m_all"].axes[1].get_ylabel() == "detection within 0.4 m, by area (%)"
 
 

@@ -235,7 +235,7 @@ def test_menus_offer_what_there_is_and_a_choice_stays(seen):
     assert quantities == [TITLE, "detection within 0.4 m, by area"]
     assert bands == ["ground, z -0.5 to 0.5 m", "obstacle, z 0.5 to 2 m"]
     assert rigs == [NASTY, "many", f"many minus {NASTY}"]
-    assert views == ["near the ego", NASTY, "everything known"]
+    assert views == ["two vehicle lengths", NASTY, "all observed cells"]
     assert seen[0]["kept"] == [1, 1, 1]
     assert len(seen[0]["gallery"]) == 12
     assert seen[0]["from_gallery"] == f"{TITLE}, obstacle, z 0.5 to 2 m, many"
@@ -262,7 +262,7 @@ def test_a_wide_table_fits_the_paper_and_breaks_no_short_heading(tmp_path):
     if CHROMIUM is None:
         pytest.skip("no Chromium here: nobody looks at the page")
     sensors = [f"{what}_{side}" for what in ("camera", "lidar") for side in ("front", "rear", "left", "right")]
-    headings = ["region", "height", "sensors that see\nit", "by two or more\n(%)", *sensors, "most lost with"]
+    headings = ["region", "band", "sensors that see\nit", "by two or more\n(%)", *sensors, "most lost with"]
     row = [TextCell("behind"), TextCell("ground"), *[TextCell("unknown")] * 10, TextCell("camera_right")]
     text = render_page(Page("rig", "lead", tables=[PageTable("", headings, [row])])).replace(
         "@media print", "@media all"
@@ -358,7 +358,7 @@ def decoded(codes, bits, scale):
     top = 2**bits - 1
     share = (codes.astype(np.float64) - 1) / (top - 2)
     low, high = scale["low"], scale["high"]
-    values = low * (high / low) ** share if scale["log"] else low + share * (high - low)
+    values = low * (high / low) ** share if scale["is_logarithmic"] else low + share * (high - low)
     return np.where(codes == top, np.inf, np.where(codes == 0, 0.0, values))
 
 
@@ -374,8 +374,8 @@ def test_codes_keep_what_a_reader_can_read(values, bits):
     read = decoded(codes, bits, scale)
     assert read[-2:].tolist() == [0.0, np.inf]
     finite = values[:-1]
-    step = (np.log(3e6) if scale["log"] else np.ptp(finite)) / (2**bits - 3)
-    allowed = step / 2 * (np.abs(finite) if scale["log"] else 1.0) * 1.1 + 1e-12
+    step = (np.log(3e6) if scale["is_logarithmic"] else np.ptp(finite)) / (2**bits - 3)
+    allowed = step / 2 * (np.abs(finite) if scale["is_logarithmic"] else 1.0) * 1.1 + 1e-12
     assert (np.abs(read[:-1] - finite) <= allowed).all()
 
 

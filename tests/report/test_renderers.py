@@ -58,7 +58,7 @@ def markdown_lines(text: str) -> list[list[str]]:
 
 def markdown_cells(table: CoverageTable) -> list[list[str]]:
     rows = markdown_lines(RENDERERS["markdown"](table))
-    body = [row for row in rows if row[:2] not in (["region", "height"], ["---", "---"])]
+    body = [row for row in rows if row[:2] not in (["region", "band"], ["---", "---"])]
     return [[re.sub(r"\\(?=[^\w\s])", "", cell.strip("*")) for cell in row] for row in body]
 
 
@@ -71,7 +71,7 @@ def test_csv_reads_back_as_json_and_json_as_the_table(table):
     rows = json_of(table)["rows"]
     assert csv_rows(table) == [{name: as_field(value) for name, value in row.items()} for row in rows]
     for record, row in zip(rows, [row for rows in table.rows.values() for row in rows], strict=True):
-        assert (record["rig"], record["region"], record["height"]) == (row.rig, row.region.name, row.summary.height)
+        assert (record["rig"], record["region"], record["band"]) == (row.rig, row.region.name, row.summary.band)
         assert (record["observed_cells"], record["observed_share"]) == (
             row.summary.observed_cells,
             row.summary.observed_share,
@@ -114,7 +114,7 @@ def test_no_renderer_calls_anything_nan(table):
 def test_the_columns_are_the_same_for_one_rig_and_for_several_which_have_more(trio, regions):
     one, three = (list(csv_rows(CoverageTable.from_coverages(of, regions))[0]) for of in ({"few": trio["few"]}, trio))
     assert three[: len(one)] == one
-    assert one[:5] == ["rig", "region", "height", "radius_m", "radius_m_error"]
+    assert one[:5] == ["rig", "region", "band", "radius_m", "radius_m_error"]
     numbers = ("difference", "difference_error", "difference_low", "difference_high")
     names = ("best", *numbers, "difference_significant")
     assert three[len(one) :] == [f"{key}_{name}" for key in ("radius_m", "detection_0.4m") for name in names]
@@ -123,14 +123,14 @@ def test_the_columns_are_the_same_for_one_rig_and_for_several_which_have_more(tr
 def test_without_regions_csv_still_has_its_header(trio, regions):
     headers = {RENDERERS["csv"](CoverageTable.from_coverages(trio, places)).splitlines()[0] for places in ((), regions)}
     assert len(headers) == 1
-    assert headers.pop().startswith("rig,region,height,radius_m,")
+    assert headers.pop().startswith("rig,region,band,radius_m,")
 
 
 def test_files_hold_the_bounds_and_the_blocks(trio, regions):
     table = CoverageTable.from_coverages(trio, regions)
     row = csv_rows(table)[3]
     assert [float(row[f"{axis}_{end}_m"]) for axis in "xyz" for end in ("min", "max")] == [-8, -6, -5, 5, 0.5, 2]
-    assert (row["steps"], row["blocks"], row["frames_per_block"], row["cell_m"]) == ("24", "12", "2", "1.0")
+    assert (row["num_frames"], row["blocks"], row["frames_per_block"], row["cell_m"]) == ("24", "12", "2", "1.0")
     content = json_of(table)
     assert (content["blocks"], content["frames_per_block"], content["thresholds_m"]) == (12, 2, [0.4])
     assert content["grid"] == {
@@ -193,7 +193,7 @@ def test_a_renderer_of_ones_own_needs_no_more_than_what_is_public(trio, regions)
     assert html.count("<td>") == len(cells_of(table))
     assert html.count("<b>") == sum(bool(cell.mark) for cell in cells_of(table)) > 4
     assert html.count("<li>") == len(list_notes(table)) + len(BOLD_MARKS)
-    assert "<li>In bold among the differences: more than chance" in html
+    assert "<li>In bold among the differences: significant" in html
 
 
 @pytest.mark.parametrize(("steps", "explained"), [(4, False), (24, True)])

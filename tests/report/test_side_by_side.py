@@ -90,8 +90,8 @@ def test_every_panel_is_headed_and_the_legend_says_everything_once():
     (legend,) = [axes.get_legend() for axes in figure.axes if axes.get_legend()]
     entries = [text.get_text() for text in legend.get_texts()]
     assert entries == [
-        "unknown: never probed (0 % of the cells)",
-        "infinite: a step saw nothing (50.0 % of the cells)",
+        "unobserved (0 % of the cells)",
+        "infinite: no sensor points in some frame (50.0 % of the cells)",
         "ego",
         "sensor, with its direction",
         "field of view, up to its range",

@@ -45,7 +45,7 @@ def coverage():
 @pytest.fixture(scope="module")
 def sides(coverage):
     """How its maps are cut."""
-    return compute_square_sides(coverage.points, CELL_M)
+    return compute_square_sides(coverage.point_counts, CELL_M)
 
 
 def cut(points: np.ndarray, sides: np.ndarray, y: int, x: int, side: int) -> None:
@@ -64,7 +64,7 @@ def test_squares_are_cut_where_every_quarter_has_points_enough_or_none(coverage,
     for band in range(2):
         for y in range(0, GRID.shape[1], 8):
             for x in range(0, GRID.shape[2], 8):
-                cut(coverage.points[band].numpy(), expected[band], y, x, 8)
+                cut(coverage.point_counts[band].numpy(), expected[band], y, x, 8)
     assert set(sides.unique().tolist()) == {1, 2, 4, 8}
     np.testing.assert_array_equal(sides, expected)
 
@@ -80,7 +80,7 @@ def test_no_square_is_larger_than_two_metres_unless_the_cell_is(cell_m, largest)
 
 
 def test_where_points_are_many_a_cell_has_its_own_ratio(coverage, sides):
-    alone = (sides == 1) & (coverage.points > 0)
+    alone = (sides == 1) & (coverage.point_counts > 0)
     assert int(alone.sum()) > 40
     for found, key in zip(compute_ratios(coverage.area_sums, sides), list(coverage.layers)[3:], strict=True):
         assert torch.equal(found[alone], coverage.layers[key].values[alone])

@@ -50,7 +50,7 @@ def test_the_order_of_the_rigs_changes_no_number_and_no_mark(trio, regions):
 
 
 def test_a_rig_against_itself_differs_nowhere_and_none_is_marked(measure, points, regions):
-    one = measure(points(50, 1), thresholds=(0.4, 1.0))
+    one = measure(points(50, 1), thresholds_m=(0.4, 1.0))
     table = CoverageTable.from_coverages({"a": one, "b": one}, regions)
     for rows in table.rows.values():
         for row in rows[:2]:
@@ -93,7 +93,7 @@ def test_remarks_are_made_of_what_did_happen_only(blind, trios, regions):
     assert "empty_sensor_frames" not in names(table, "seeing")
     (remark,) = [remark for remark in collect_table_notes(table, "blind") if remark.name == "empty_sensor_frames"]
     assert (remark.count, remark.total) == (1, 1)
-    assert "unknown_cells" in names(table, "seeing")
+    assert "unobserved_cells" in names(table, "seeing")
     assert names(CoverageTable.from_coverages({"few": trios(5)["few"]}, ()), "few") == {"no_region", "too_few_blocks"}
 
 

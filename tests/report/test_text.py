@@ -24,9 +24,9 @@ def no_other_columns(monkeypatch):
     monkeypatch.setattr("torchcover.report.table_layout.COLUMNS", kept)
 
 
-def metric(thresholds=(0.4, 1.0), **options) -> CoverageMetric:
+def metric(thresholds_m=(0.4, 1.0), **options) -> CoverageMetric:
     grid = BevGrid(x_m=(0.0, 4.0), y_m=(0.0, 2.0), cell_m=1.0, heights={"ground": (-0.5, 0.5)})
-    return CoverageMetric(grid, thresholds=thresholds, **options)
+    return CoverageMetric(grid, thresholds_m=thresholds, **options)
 
 
 def one_cell_known() -> Coverage:
@@ -38,7 +38,7 @@ def one_cell_known() -> Coverage:
 
 def over_steps(steps: int) -> Coverage:
     """A point with a radius of its own in every step, and so in every cell."""
-    coverage = metric(blocks=16)
+    coverage = metric(num_blocks=16)
     radii = torch.rand(steps, generator=torch.Generator().manual_seed(0))
     for index, radius in enumerate(radii):
         place = torch.tensor([[0.5 + index % 2, 0.5 + index // 2 % 2, 0.0]])
@@ -80,7 +80,7 @@ def test_units_cell_size_steps_and_bands_are_told():
 
 
 def test_trouble_is_told_in_words_with_its_count():
-    coverage = metric(thresholds=(0.4,), max_radius=0.5)
+    coverage = metric(thresholds_m=(0.4,), max_radius_m=0.5)
     reference = torch.tensor([[0.2, 0.0, 0.0], [0.6, 0.0, 0.0], [-9.0, 0.0, 0.0]])
     coverage.update([ORIGIN, torch.zeros(0, 3), ORIGIN], [reference, reference, torch.zeros(0, 3)])
     text = text_of(coverage.compute(), NEAR)
@@ -117,7 +117,7 @@ def test_every_number_has_its_interval_with_the_digits_of_its_error():
 
 @pytest.mark.parametrize("differ", [False, True])
 def test_brackets_are_explained_where_there_are_any(differ):
-    coverage, place = metric(blocks=16), torch.tensor([[0.5, 0.5, 0.0]])
+    coverage, place = metric(num_blocks=16), torch.tensor([[0.5, 0.5, 0.0]])
     for index in range(16):
         radius_m = torch.tensor([0.0, 0.0, 0.1 + 0.05 * index * differ])
         coverage.update(place - radius_m, place, block_index=index)
@@ -127,7 +127,7 @@ def test_brackets_are_explained_where_there_are_any(differ):
 
 
 def test_a_region_that_one_block_alone_has_probed_has_a_number_without_error():
-    coverage = metric(blocks=16)
+    coverage = metric(num_blocks=16)
     for index in range(16):
         x = 2.5 if index == 3 else 0.5
         coverage.update(torch.tensor([[x, 0.5, -0.2]]), torch.tensor([[x, 0.5, 0.0]]), block_index=index)
@@ -155,14 +155,14 @@ def test_without_blocks_nothing_is_said_about_errors():
 
 def test_notes_about_one_rig_name_it(blind, regions):
     text = re.sub(r"\s+", " ", printed(blind, regions))
-    assert "[blind]: 1 of 1 steps had no sensor point" in text
+    assert "[blind]: 1 of 1 frames had no sensor points" in text
     assert "seeing:" not in text
 
 
 def test_from_too_few_steps_no_difference_is_called_significant(trios, regions):
     text = printed(trios(5), regions)
     assert "[" not in text
-    assert " ".join(text.split()).count("Not enough steps for intervals: 5 blocks, about 9 are needed.") == 1
+    assert " ".join(text.split()).count("Not enough frames for confidence intervals: got 5 blocks, about 9 are needed.") == 1
     assert "Difference to few" in text
     assert not re.search(r"│ +! ", text)
 
@@ -236,7 +236,7 @@ def test_a_table_of_words_that_fits_is_not_folded(capsys):
 
 def test_with_many_sensors_each_has_a_row_and_eighty_columns_are_enough():
     sensors = [f"sensor_number_{at}" for at in range(8)]
-    coverage = metric(thresholds=(0.4,), blocks=16, sensors=sensors)
+    coverage = metric(thresholds_m=(0.4,), num_blocks=16, sensors=sensors)
     for index in range(16):
         generator = torch.Generator().manual_seed(index)
         size_m = torch.tensor([4.0, 2.0, 0.2])

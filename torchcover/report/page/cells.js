@@ -1,4 +1,4 @@
-// The numbers of cells: read as torchcover/report/page/codes.py wrote them, taken together, and coloured.
+// Numbers of cells: decode the arrays of torchcover/report/page/map_content.py, merge cells, and color them.
 
 async function inflated(text) {
   const bytes = Uint8Array.from(atob(text), (letter) => letter.charCodeAt(0));
@@ -12,14 +12,14 @@ function decoded(array, bytes, size) {
     if (code === 0) return 0;
     if (code === top) return Infinity;
     const share = (code - 1) / (top - 2);
-    return array.log ? array.low * (array.high / array.low) ** share : array.low + share * (array.high - array.low);
+    return array.is_logarithmic ? array.low * (array.high / array.low) ** share : array.low + share * (array.high - array.low);
   };
   const table = Float64Array.from({ length: top + 1 }, (_, code) => value(code));
   const values = new Float64Array(size).fill(NaN);
-  const low = array.at + (array.bits === 16 ? array.count : 0);
+  const low = array.offset + (array.bits === 16 ? array.count : 0);
   for (let cell = 0, at = 0; cell < size; cell++) {
     if (!(bytes[array.mask + (cell >> 3)] & (1 << (cell & 7)))) continue;
-    values[cell] = table[bytes[low + at] + (array.bits === 16 ? 256 * bytes[array.at + at] : 0)];
+    values[cell] = table[bytes[low + at] + (array.bits === 16 ? 256 * bytes[array.offset + at] : 0)];
     at++;
   }
   return values;
@@ -50,11 +50,11 @@ function overSquares(values, weights, sides, columns) {
 
 const FAINTEST = 0.3, APART = [213, 94, 0];
 
-// Infinity, and nothing at all where the scale is logarithmic, have a colour of their own.
-const isApart = (value, shown) => (value === Infinity && !shown.isDifference) || (value === 0 && shown.scale.log);
+// Infinity, and nothing at all where the scale is logarithmic, have a color of their own.
+const isApart = (value, shown) => (value === Infinity && !shown.isDifference) || (value === 0 && shown.scale.is_logarithmic);
 
-// An image of one pixel a cell, the lowest row last; unknown cells are transparent.
-function coloured(shown, palette) {
+// An image of one pixel a cell, the lowest row last; unobserved cells are transparent.
+function colored(shown, palette) {
   const { columns, rows } = shown.raster, image = new ImageData(columns, rows);
   for (let cell = 0; cell < shown.values.length; cell++) {
     const value = shown.values[cell];
@@ -70,23 +70,23 @@ function coloured(shown, palette) {
 }
 
 function opacity(shown, cell) {
-  if (!shown.full) return 1;
+  if (!shown.opaqueWeight) return 1;
   const side = shown.squares ? shown.squares[cell] : 1;
-  return FAINTEST + (1 - FAINTEST) * Math.sqrt(Math.min(1, shown.weights[cell] / (shown.full * side * side)));
+  return FAINTEST + (1 - FAINTEST) * Math.sqrt(Math.min(1, shown.weights[cell] / (shown.opaqueWeight * side * side)));
 }
 
-// The colours of a scale: from a value to [red, green, blue].
+// The colors of a scale: from a value to [red, green, blue].
 function paletteOf(scale, luts) {
-  const lut = luts[scale.colours], table = [];
+  const lut = luts[scale.colormap], table = [];
   for (let at = 0; at < 256; at++) table.push([0, 2, 4].map((byte) => parseInt(lut.substr(6 * at + byte, 2), 16)));
   return (value) => table[Math.max(0, Math.min(255, Math.floor(256 * shareOf(value, scale))))];
 }
 
 // Where a value is between the ends of a scale, and back.
-function shareOf(value, { low, high, log }) {
-  return log ? Math.log(value / low) / Math.log(high / low) : (value - low) / (high - low);
+function shareOf(value, { low, high, is_logarithmic }) {
+  return is_logarithmic ? Math.log(value / low) / Math.log(high / low) : (value - low) / (high - low);
 }
 
-function valueAt(share, { low, high, log }) {
-  return log ? low * (high / low) ** share : low + share * (high - low);
+function valueAt(share, { low, high, is_logarithmic }) {
+  return is_logarithmic ? low * (high / low) ** share : low + share * (high - low);
 }

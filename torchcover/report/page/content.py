@@ -1,4 +1,4 @@
-"""What a page is made of: tables, maps, rigs and facts with their names and units, whoever measured them."""
+"""Content of a page: tables, maps, rigs and facts with their names and units."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -30,11 +30,11 @@ Sides = NDArray[np.integer]
 
 @dataclass(frozen=True, eq=False)
 class MapLine:
-    """A line over a map, in metres in the vehicle frame.
+    """Line on a map.
 
     Args:
-        name: What it is, for the legend.
-        points_m: (K, 2) x, y; NaN between two parts.
+        name: Name in the legend.
+        points_m: (K, 2) x, y in the vehicle frame in meters; NaN between two parts.
     """
 
     name: str
@@ -43,26 +43,26 @@ class MapLine:
 
 @dataclass(frozen=True, eq=False)
 class PageMap:
-    """One quantity of one rig in one band over the cells of a raster.
+    """Map of one quantity of one rig in one band.
 
     Args:
-        quantity: What the values are, without the unit.
-        band: Where: a height band, or a target.
-        rig: Whose.
-        x: Bounds of the raster forward in metres.
-        y: Bounds to the left.
-        cell_m: Side of a cell.
-        values: (Y, X) in the unit of the scale; NaN is unknown.
-        scale: What the colours mean: the same for all bands and rigs.
-        unobserved_label: Why a cell is.
+        quantity: Name of the quantity, without unit.
+        band: Height band or test target.
+        rig: Name of the rig.
+        x: Bounds of the raster forward in meters.
+        y: Bounds of the raster to the left in meters.
+        cell_m: Side of a cell in meters.
+        values: (Y, X) values in the unit of the scale; NaN is unobserved.
+        scale: Color scale, the same for all bands and rigs.
+        unobserved_label: Label of unobserved cells.
         errors: (Y, X) standard errors.
-        weights: (Y, X) what each cell weighs where several are taken together.
-        weight_name: What the weights are, with the unit.
-        opaque_weight: That of an opaque cell; less is paler. 0 if all are alike.
-        sides: (Y, X) how many cells wide the square is that each cell is drawn in; a power of 2.
-        difference_scale: Colours of the difference to the first rig; None for the first, and where nothing is compared.
-        lines: What is drawn over it.
-        num_bits: Of each number and weight in the file, 16 or 8.
+        weights: (Y, X) weight of each cell when cells are merged.
+        weight_name: Name of the weights, with unit.
+        opaque_weight: Weight of an opaque cell; cells with less are paler. 0 makes all cells opaque.
+        sides: (Y, X) side of the square of each cell in cells; a power of 2.
+        difference_scale: Color scale of the difference to the first rig; None for the first rig.
+        lines: Lines on the map.
+        num_bits: Bits of each number and weight in the file, 16 or 8.
     """
 
     quantity: str
@@ -86,19 +86,19 @@ class PageMap:
 
 @dataclass(frozen=True, eq=False)
 class TargetVisibilityMap:
-    """Where a body is seen beside a vehicle, from above and true to scale.
+    """Map of the positions near a vehicle at which a test target is detected.
 
     Args:
-        rig: Who sees it.
-        title: A line above it.
-        x: Bounds of the cells forward in metres.
-        y: Bounds to the left.
-        cell_m: Side of a cell.
-        sensor_counts: (Y, X) by how many sensors; 0 where it is not seen, -1 where it has no room.
-        vehicle_box_m: (4, 2) corners x, y of what distances are from.
-        vehicle_outline_m: (K, 2) what the vehicle looks like.
-        max_distance_m: Up to which distance places count.
-        failure_effects_m2: Sensor -> how much more is not seen within it when this one fails.
+        rig: Name of the rig.
+        title: Line above the map.
+        x: Bounds of the cells forward in meters.
+        y: Bounds of the cells to the left in meters.
+        cell_m: Side of a cell in meters.
+        sensor_counts: (Y, X) number of detecting sensors; -1 where the position is not free.
+        vehicle_box_m: (4, 2) corners x, y of the box from which distances are measured.
+        vehicle_outline_m: (K, 2) outline of the vehicle.
+        max_distance_m: Maximum distance of counted positions in meters.
+        failure_effects_m2: Sensor -> additional undetected area within this distance when it fails.
     """
 
     rig: str
@@ -115,10 +115,10 @@ class TargetVisibilityMap:
 
 @dataclass(frozen=True, eq=False)
 class DetectionShares:
-    """Shares of one kind, of one rig or of several below each other.
+    """Detection shares of one region and band, for one or several rigs.
 
     Args:
-        name: What they are of.
+        name: Description of the region and band.
         shares: Name of the rig -> its share, with its interval if there is one.
     """
 
@@ -128,12 +128,12 @@ class DetectionShares:
 
 @dataclass(frozen=True, eq=False)
 class PageRig:
-    """A rig as a page shows it.
+    """Rig on a page.
 
     Args:
-        name: What tables and maps call it.
-        sensors: Its sensors, if they are known.
-        document: It as YAML; empty if it is unknown.
+        name: Name of the rig in tables and maps.
+        sensors: Sensors; empty if unknown.
+        document: The rig as YAML; empty if unknown.
     """
 
     name: str
@@ -143,11 +143,11 @@ class PageRig:
 
 @dataclass(frozen=True, eq=False)
 class PagePicture:
-    """A diagram.
+    """Picture on a page.
 
     Args:
-        title: What it shows, for those too who do not see it.
-        png: The file.
+        title: Description, also for screen readers.
+        png: Content of the PNG file.
     """
 
     title: str
@@ -156,22 +156,22 @@ class PagePicture:
 
 @dataclass(frozen=True, eq=False)
 class Page:
-    """All that a page shows.
+    """Content of a page.
 
     Args:
-        title: Its name.
-        lead: One line below.
-        findings: The answer in sentences, the first of which says most.
-        target_maps: What shows it, at the top.
-        detection_shares: How far it is seen, below.
-        tables: The numbers.
-        pictures: Above them.
-        maps: In the order of the menus; differences are to the first rig.
-        rigs: Drawn on the ego, and as YAML.
-        ego_outline_m: (K, 2) corners x, y of the ego in metres.
-        outlines: Regions that the maps show, by name: (K, 2) corners x, y.
-        facts: Heading -> name -> what holds, such as settings.
-        more_tables: Below the facts, such as what was left out.
+        title: Title.
+        lead: Line below the title.
+        findings: Findings in sentences, the most important first.
+        target_maps: Maps of test targets, at the top.
+        detection_shares: Detection shares, below them.
+        tables: Tables of numbers.
+        pictures: Pictures above the tables.
+        maps: Maps in the order of the menus; differences are to the first rig.
+        rigs: Rigs, plotted on the ego vehicle and as YAML.
+        ego_outline_m: (K, 2) corners x, y of the ego vehicle in meters.
+        outlines: Outlines of the regions on the maps.
+        facts: Heading -> name -> value, such as settings.
+        more_tables: Tables below the facts, such as omissions.
     """
 
     title: str
@@ -190,44 +190,58 @@ class Page:
 
 
 def build_page_maps(coverages: Mapping[str, Coverage]) -> Iterator[PageMap]:
-    """A map for each quantity, height band and rig; first those of bodies, if there are any: the answer tells of them.
+    """Yield a map for each quantity, height band and rig; maps of test targets come first.
 
     Args:
-        coverages: By the name of the rig; one, or several that are paired.
+        coverages: Name of the rig -> its coverage; several must be paired.
     """
     coverages = {name: downsample_coverage(coverage) for name, coverage in coverages.items()}
     first = next(iter(coverages.values()))
-    for rig, bodies in ((rig, coverage.target_sums) for rig, coverage in coverages.items() if coverage.target_sums):
-        for body, cells in zip(bodies.target_names, bodies.position_counts, strict=True):
-            free, share, quantity = _nan_where_none(cells[..., 0]), cells[..., 1] / cells[..., 0], bodies.quantities[0]
+    for rig, coverage in coverages.items():
+        targets = coverage.target_sums
+        if targets is None:
+            continue
+        quantity = targets.quantities[0]
+        for target, counts in zip(targets.target_names, targets.position_counts, strict=True):
+            share = counts[..., 1] / counts[..., 0]
             yield PageMap(
                 quantity=quantity.title,
-                band=body,
+                band=target,
                 rig=rig,
-                x=bodies.grid.x_m,
-                y=bodies.grid.y_m,
-                cell_m=bodies.grid.cell_m,
+                x=targets.grid.x_m,
+                y=targets.grid.y_m,
+                cell_m=targets.grid.cell_m,
                 values=get_display_unit(quantity.unit).factor * to_array(share),
                 scale=build_color_scale(quantity, share),
-                unobserved_label="no place was free",
-                weights=free,
-                weight_name="free places",
+                unobserved_label="no free position",
+                weights=_replace_zeros(counts[..., 0]),
+                weight_name="free positions",
             )
-    shown = list_map_quantities(first)
-    surface = _weights(first) if first.average == "area" else None
-    steps = CellWeights([_nan_where_none(one) for one in first.observed_frames], "steps that probed it")
-    for quantity, by_surface in shown:
+    area_weights = _build_area_weights(first) if first.average == "area" else None
+    frame_weights = CellWeights([_replace_zeros(counts) for counts in first.observed_frames], "observing frames")
+    for quantity, is_area_average in list_map_quantities(first):
         layers = {rig: coverage.sparse_layers[quantity.key] for rig, coverage in coverages.items()}
-        errors = {rig: one.sparse_errors.get(quantity.key) for rig, one in coverages.items()}
-        yield from _of_quantity(layers, errors, (surface if by_surface else None) or steps, first)
-    of_sensors = {rig: one.redundancy.sparse_layers for rig, one in coverages.items() if one.redundancy is not None}
-    for key in dict.fromkeys(key for layers in of_sensors.values() for key in layers):
-        having = {rig: layers[key] for rig, layers in of_sensors.items() if key in layers}
-        yield from _of_quantity(having, dict.fromkeys(having), surface or steps, first)
+        errors = {rig: coverage.sparse_errors.get(quantity.key) for rig, coverage in coverages.items()}
+        weights = area_weights if is_area_average and area_weights else frame_weights
+        yield from _build_quantity_maps(layers, errors, weights, first)
+    redundancy_layers: dict[str, dict[str, Layer]] = {}
+    for rig, coverage in coverages.items():
+        if coverage.redundancy is not None:
+            for key, layer in coverage.redundancy.sparse_layers.items():
+                redundancy_layers.setdefault(key, {})[rig] = layer
+    for layers in redundancy_layers.values():
+        yield from _build_quantity_maps(layers, dict.fromkeys(layers), area_weights or frame_weights, first)
 
 
 class CellWeights(NamedTuple):
-    """What a cell weighs, in each band; see `PageMap`."""
+    """Weights of cells, see `PageMap`.
+
+    Args:
+        values: (Y, X) weights of each band.
+        name: Name of the weights, with unit.
+        opaque_weight: Weight of an opaque cell; 0 makes all cells opaque.
+        sides: (Y, X) sides of squares of each band; None without squares.
+    """
 
     values: list[Array]
     name: str
@@ -235,53 +249,58 @@ class CellWeights(NamedTuple):
     sides: list[Sides] | None = None
 
 
-def _of_quantity(
+def _build_quantity_maps(
     layers: Mapping[str, Layer], errors: Mapping[str, Tensor | None], weights: CellWeights, first: Coverage
 ) -> Iterator[PageMap]:
-    """Maps from numbers of the known cells, which are the same of all rigs; so are those of `first`."""
+    """Build maps from numbers of the observed cells, which are the same for all rigs, as in `first`."""
     grid, quantity = first.grid, next(iter(layers.values())).quantity
     factor = get_display_unit(quantity.unit).factor
     values = {rig: factor * layer.values for rig, layer in layers.items()}
     scale = build_color_scale(quantity, torch.stack(list(values.values())))
-    expected, *others = values.values()
-    differences = [compute_difference(one, expected) for one in others]
-    against = build_difference_scale(quantity, torch.stack(differences)) if differences else None
-    spread = {rig: to_array(first.observed_cells.expand_to_grid(one)) for rig, one in values.items()}
-    of_errors = {
-        rig: None if one is None else factor * to_array(first.observed_cells.expand_to_grid(one))
-        for rig, one in errors.items()
-    }
-    for band, height in enumerate(grid.heights):
-        for at, rig in enumerate(values):
-            error = of_errors[rig]
+    baseline, *compared = values.values()
+    differences = [compute_difference(rig_values, baseline) for rig_values in compared]
+    difference_scale = build_difference_scale(quantity, torch.stack(differences)) if differences else None
+    value_maps = {}
+    error_maps: dict[str, Array | None] = {}
+    for rig, rig_values in values.items():
+        rig_errors = errors[rig]
+        value_maps[rig] = to_array(first.observed_cells.expand_to_grid(rig_values))
+        error_maps[rig] = None
+        if rig_errors is not None:
+            error_maps[rig] = factor * to_array(first.observed_cells.expand_to_grid(rig_errors))
+    for index, band in enumerate(grid.heights):
+        for rig_index, rig in enumerate(values):
+            error_map = error_maps[rig]
             yield PageMap(
                 quantity=quantity.title,
-                band=f"{height}, {format_height_band(grid, height)}",
+                band=f"{band}, {format_height_band(grid, band)}",
                 rig=rig,
                 x=grid.x_m,
                 y=grid.y_m,
                 cell_m=grid.cell_m,
-                values=spread[rig][band],
+                values=value_maps[rig][index],
                 scale=scale,
                 unobserved_label=UNOBSERVED if weights.sides is None else NO_SURFACE,
-                errors=None if error is None else error[band],
-                weights=weights.values[band],
+                errors=None if error_map is None else error_map[index],
+                weights=weights.values[index],
                 weight_name=weights.name,
                 opaque_weight=weights.opaque_weight,
-                sides=None if weights.sides is None else weights.sides[band],
-                difference_scale=against if at else None,
+                sides=None if weights.sides is None else weights.sides[index],
+                difference_scale=difference_scale if rig_index else None,
             )
 
 
-def _weights(first: Coverage) -> CellWeights | None:
-    """Square metres; the rigs share the reference points, and so the square metres."""
+def _build_area_weights(first: Coverage) -> CellWeights | None:
+    """Build weights by visible area, which all rigs share since they share the reference points."""
     if first.area_sums is None:
         return None
-    m2 = [_nan_where_none(one) for one in first.area_sums.sum_blocks()[0]]
-    sides = [one.cpu().numpy() for one in compute_square_sides(first.point_counts, first.grid.cell_m)]
-    return CellWeights(m2, "m² of surface seen in all steps", first.counts["num_frames"] * first.grid.cell_m**2, sides)
+    areas_m2 = [_replace_zeros(band_area_m2) for band_area_m2 in first.area_sums.sum_blocks()[0]]
+    sides = [band_sides.cpu().numpy() for band_sides in compute_square_sides(first.point_counts, first.grid.cell_m)]
+    opaque_weight_m2 = first.counts["num_frames"] * first.grid.cell_m**2
+    return CellWeights(areas_m2, "m² of visible surface in all frames", opaque_weight_m2, sides)
 
 
-def _nan_where_none(counts: Tensor) -> Array:
+def _replace_zeros(counts: Tensor) -> Array:
+    """Replace 0 by NaN."""
     array = to_array(counts)
     return np.where(array > 0, array, np.nan)

@@ -13,7 +13,7 @@ class Controls {
       part(name).addEventListener("change", (event) => { page.state[name] = event.target.checked; page.refresh(); });
     }
     part("menus").addEventListener("submit", (event) => event.preventDefault());
-    part("recolour").addEventListener("click", () => { page.fitColours(); page.refresh(); });
+    part("recolor").addEventListener("click", () => { page.fitColors(); page.refresh(); });
     part("closer").addEventListener("click", () => this.zoom(FURTHER));
     part("farther").addEventListener("click", () => this.zoom(1 / FURTHER));
     this.listen(part("map"));
@@ -29,7 +29,7 @@ class Controls {
     if (name === "quantity") page.state.band = kept(page.quantity.bands, old.band);
     if (name !== "rig") page.state.rig = kept(page.band.rigs, old.rig);
     this.fillMenus();
-    page.fitColours();
+    page.fitColors();
     page.refresh();
   }
 
@@ -43,15 +43,15 @@ class Controls {
   }
 
   fillViews() {
-    part("view").replaceChildren(...[...this.page.content.views, { name: "everything known" }].map((one) => made("option", one.name)));
+    part("view").replaceChildren(...[...this.page.content.views, { name: "all observed cells" }].map((one) => made("option", one.name)));
     this.look();
   }
 
   look() {
     const { page } = this, { views } = page.content, { selectedIndex } = part("view");
-    const { x, y } = selectedIndex < views.length ? views[selectedIndex] : page.content.rasters[page.choice.map.raster].known;
+    const { x, y } = selectedIndex < views.length ? views[selectedIndex] : page.content.rasters[page.choice.map.raster].observed_bounds;
     page.view.fit(x, y);
-    page.fitColours();
+    page.fitColors();
     page.refresh();
   }
 
@@ -107,7 +107,7 @@ class Controls {
 }
 
 // Every map, small: to choose one, and on paper. Each is drawn when it comes into sight; returned is what draws the rest
-// at once, and what has all drawn again in other colours.
+// at once, and what has all drawn again in other colors.
 function fillGallery(page, controls) {
   const all = page.choices.flatMap((quantity, q) => quantity.bands.flatMap((band, b) => band.rigs.map((rig, r) => ({ quantity, band, rig, at: { quantity: q, band: b, rig: r } }))));
   const draws = new Map(), todo = new Set();
@@ -126,7 +126,7 @@ function fillGallery(page, controls) {
       page.refresh();
       part("map").scrollIntoView();
     });
-    figure.append(button, barOf(rig.against ? rig.map.difference : rig.map.scale, page.content.luts));
+    figure.append(button, barOf(rig.against ? rig.map.difference_scale : rig.map.scale, page.content.luts));
     return figure;
   }));
   const again = () => { for (const canvas of draws.keys()) { todo.add(canvas); sight.observe(canvas); } };
@@ -136,9 +136,9 @@ function fillGallery(page, controls) {
 
 // A canvas as large as what is known of a raster, and what draws an image of all of it there, on hatching.
 function cropped(canvas, raster, ego) {
-  const { x, y } = raster.known;
-  const left = Math.round((x[0] - raster.x[0]) / raster.cell), top = Math.round((raster.y[1] - y[1]) / raster.cell);
-  const columns = Math.round((x[1] - x[0]) / raster.cell), rows = Math.round((y[1] - y[0]) / raster.cell);
+  const { x, y } = raster.observed_bounds;
+  const left = Math.round((x[0] - raster.x[0]) / raster.cell_m), top = Math.round((raster.y[1] - y[1]) / raster.cell_m);
+  const columns = Math.round((x[1] - x[0]) / raster.cell_m), rows = Math.round((y[1] - y[0]) / raster.cell_m);
   const larger = columns < 700 ? Math.floor(700 / columns) : 700 / columns;
   canvas.width = larger * columns; canvas.height = Math.ceil(larger * rows);
   return (image) => {
@@ -147,7 +147,7 @@ function cropped(canvas, raster, ego) {
     pen.fillRect(0, 0, canvas.width, canvas.height);
     pen.imageSmoothingEnabled = larger < 1;
     pen.drawImage(image, left, top, columns, rows, 0, 0, canvas.width, canvas.height);
-    const pixel = (low, high) => (larger * (high - low)) / raster.cell;
+    const pixel = (low, high) => (larger * (high - low)) / raster.cell_m;
     pen.beginPath();
     for (const corner of ego || []) pen.lineTo(pixel(x[0], corner[0]), pixel(corner[1], y[1]));
     pen.closePath();
@@ -156,7 +156,7 @@ function cropped(canvas, raster, ego) {
   };
 }
 
-// What is drawn has the colours of the page, dark or light, and those of paper.
+// What is drawn has the colors of the page, dark or light, and those of paper.
 function drawAgain(page, gallery) {
   const redraw = () => { gallery.again(); page.draw(); };
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);

@@ -79,7 +79,7 @@ class MapView {
     const { x, y } = shown.raster, [left, top] = this.toPixel(x[0], y[1]), [right, bottom] = this.toPixel(x[1], y[0]);
     pen.fillStyle = hatching(pen);
     pen.fillRect(left, top, right - left, bottom - top);
-    pen.imageSmoothingEnabled = shown.raster.cell / this.metres < 1;
+    pen.imageSmoothingEnabled = shown.raster.cell_m / this.metres < 1;
     pen.imageSmoothingQuality = "high";
     pen.drawImage(shown.image, left, top, right - left, bottom - top);
     pen.imageSmoothingEnabled = true;
@@ -129,17 +129,17 @@ class MapView {
   // The field of view from above: the outline of a tilted sensor, otherwise an arc.
   pathOfField(pen, sensor) {
     if (sensor.outline) return this.path(pen, [...sensor.outline, sensor.outline[0]]);
-    const [x, y] = this.toPixel(sensor.x, sensor.y), yaw = (sensor.yaw * Math.PI) / 180;
-    const half = (sensor.wide * Math.PI) / 360;
+    const [x, y] = this.toPixel(sensor.x, sensor.y), yaw = (sensor.yaw_deg * Math.PI) / 180;
+    const half = (sensor.horizontal_fov_deg * Math.PI) / 360;
     pen.beginPath();
-    if (sensor.wide < 360) pen.moveTo(x, y);
-    pen.arc(x, y, sensor.range / this.metres, -yaw - half, -yaw + half);
-    if (sensor.wide < 360) pen.closePath();
+    if (sensor.horizontal_fov_deg < 360) pen.moveTo(x, y);
+    pen.arc(x, y, sensor.range_m / this.metres, -yaw - half, -yaw + half);
+    if (sensor.horizontal_fov_deg < 360) pen.closePath();
   }
 
   drawProbe(pen, [x, y], raster) {
-    const low = (value, bounds) => bounds[0] + Math.floor((value - bounds[0]) / raster.cell) * raster.cell;
-    const [left, bottom] = this.toPixel(low(x, raster.x), low(y, raster.y)), size = raster.cell / this.metres;
+    const low = (value, bounds) => bounds[0] + Math.floor((value - bounds[0]) / raster.cell_m) * raster.cell_m;
+    const [left, bottom] = this.toPixel(low(x, raster.x), low(y, raster.y)), size = raster.cell_m / this.metres;
     const grown = Math.max(size, 5), shift = (grown - size) / 2;
     pen.strokeStyle = "white"; pen.lineWidth = 3.5; pen.strokeRect(left - shift, bottom - size - shift, grown, grown);
     pen.strokeStyle = "black"; pen.lineWidth = 1.5; pen.strokeRect(left - shift, bottom - size - shift, grown, grown);
@@ -171,12 +171,12 @@ class MapView {
   }
 }
 
-// What is unknown is hatched grey: no colour of any scale.
+// Unobserved cells are hatched gray, which is no color of any scale.
 function hatching(pen) {
   const tile = document.createElement("canvas"), style = getComputedStyle(pen.canvas);
   tile.width = tile.height = 8;
   const own = tile.getContext("2d");
-  own.fillStyle = style.getPropertyValue("--unknown"); own.fillRect(0, 0, 8, 8);
+  own.fillStyle = style.getPropertyValue("--unobserved"); own.fillRect(0, 0, 8, 8);
   own.strokeStyle = style.getPropertyValue("--hatch"); own.lineWidth = 1;
   own.beginPath();
   for (const shift of [-8, 0, 8]) { own.moveTo(shift, 8); own.lineTo(shift + 8, 0); }

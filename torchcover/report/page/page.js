@@ -51,7 +51,7 @@ class MapPage {
       for (const rigs of bands.values()) {
         const [first, ...others] = rigs;
         for (const { name, map } of others) {
-          if (map.difference) rigs.push({ name: `${name} minus ${first.name}`, map, against: first.map });
+          if (map.difference_scale) rigs.push({ name: `${name} minus ${first.name}`, map, against: first.map });
         }
       }
     }
@@ -71,7 +71,7 @@ class MapPage {
   }
 
   // The cells of a map, or of a difference, as they are drawn: values, weights, their image.
-  // Its colours are those of the place that is looked at where `high` is given, else those of all maps.
+  // Its colors are those of the place that is looked at where `high` is given, else those of all maps.
   shown(choice, single, high = null) {
     const key = `${single} ${this.content.maps.indexOf(choice.map)} ${Boolean(choice.against)} ${high}`;
     return this.kept.get(key, () => this.made(choice, single, high), ({ values }) => 3 * values.byteLength);
@@ -88,21 +88,21 @@ class MapPage {
       [values, weights] = overSquares(values, weights, squares, raster.columns);
     }
     if (against) values = values.map((value, cell) => (value === expected[cell] ? 0 : value - expected[cell]));
-    const scale = { ...(against ? map.difference : map.scale) };
+    const scale = { ...(against ? map.difference_scale : map.scale) };
     if (high !== null) { scale.high = high; scale.low = against ? -high : scale.low; }
-    const shown = { raster, values, weights, squares, full: map.full, isDifference: Boolean(against), scale };
-    shown.image = coloured(shown, paletteOf(scale, this.content.luts));
+    const shown = { raster, values, weights, squares, opaqueWeight: map.opaque_weight, isDifference: Boolean(against), scale };
+    shown.image = colored(shown, paletteOf(scale, this.content.luts));
     return shown;
   }
 
-  // What is looked at now: lengths in the colours of this place, the same for all bands and rigs.
+  // What is looked at now: lengths in the colors of this place, the same for all bands and rigs.
   get now() {
     return this.shown(this.choice, this.state.single, this.highs.get(this.isOf(this.choice)) ?? null);
   }
 
   isOf(choice) { return `${this.quantity.name} ${Boolean(choice.against)}`; }
 
-  fitColours() {
+  fitColors() {
     const [left, top] = this.view.toMetres(MARGIN.left, MARGIN.top);
     const { width, height } = this.view.area;
     const [right, bottom] = this.view.toMetres(MARGIN.left + width, MARGIN.top + height);
@@ -112,8 +112,8 @@ class MapPage {
       const { raster, values } = this.shown(choice, false), sizes = found.get(this.isOf(choice)) || [];
       found.set(this.isOf(choice), sizes);
       for (let cell = 0; cell < values.length; cell++) {
-        const x = raster.x[0] + ((cell % raster.columns) + 0.5) * raster.cell;
-        const y = raster.y[0] + (Math.floor(cell / raster.columns) + 0.5) * raster.cell;
+        const x = raster.x[0] + ((cell % raster.columns) + 0.5) * raster.cell_m;
+        const y = raster.y[0] + (Math.floor(cell / raster.columns) + 0.5) * raster.cell_m;
         if (x > left && x < right && y > bottom && y < top && Number.isFinite(values[cell])) sizes.push(Math.abs(values[cell]));
       }
     }
@@ -145,12 +145,12 @@ class MapPage {
   }
 
   fillLegend(shown) {
-    const { map, against } = this.choice, entries = [`hatched: unknown, ${map.unknown}`];
+    const { map, against } = this.choice, entries = [`hatched: ${map.unobserved_label}`];
     if (shown.values.includes(Infinity) && !against) entries.push("orange: infinite, a step saw nothing");
-    if (shown.scale.log && shown.values.includes(0)) entries.push("orange: none");
+    if (shown.scale.is_logarithmic && shown.values.includes(0)) entries.push("orange: none");
     if (against) entries.push(`blue: ${this.choice.map.rig} is better; red: ${against.rig} is better`);
     if (shown.squares) entries.push(`squares are larger where points are few`);
-    if (shown.full) entries.push("fainter: less visible surface in a step than open ground has");
+    if (shown.opaqueWeight) entries.push("paler: less visible surface per frame than open ground");
     if (this.content.outlines.length) entries.push(`dotted: ${this.content.outlines.map((line) => line.name).join(", ")}`);
     for (const [at, line] of map.lines.entries()) entries.push(`${at ? "dashed" : "thick"} line: ${line.name}`);
     part("legend").replaceChildren(...entries.map((words) => made("li", words)));
@@ -163,25 +163,25 @@ class MapPage {
 
   words(x, y) {
     const { map, against } = this.choice, raster = this.content.rasters[map.raster];
-    const column = Math.floor((x - raster.x[0]) / raster.cell), row = Math.floor((y - raster.y[0]) / raster.cell);
-    const place = (low, at) => `${tidy(low + at * raster.cell)} to ${tidy(low + (at + 1) * raster.cell)} m`;
+    const column = Math.floor((x - raster.x[0]) / raster.cell_m), row = Math.floor((y - raster.y[0]) / raster.cell_m);
+    const place = (low, at) => `${tidy(low + at * raster.cell_m)} to ${tidy(low + (at + 1) * raster.cell_m)} m`;
     const where = `x ${place(raster.x[0], column)}, y ${place(raster.y[0], row)}`;
     if (column < 0 || row < 0 || column >= raster.columns || row >= raster.rows) return `${where}: beyond the grid`;
     const cell = row * raster.columns + column, unit = map.scale.unit;
-    const one = (own) => said(this.numbers(own.values, raster)[cell], this.error(own, raster, cell), unit, own.unknown);
+    const one = (own) => said(this.numbers(own.values, raster)[cell], this.error(own, raster, cell), unit, own.unobserved_label);
     const parts = [`${where}: ${one(map)}`];
     if (against) {
       const value = this.numbers(map.values, raster)[cell], expected = this.numbers(against.values, raster)[cell];
       const error = Math.hypot(this.error(map, raster, cell), this.error(against, raster, cell));
       const difference = value === expected ? 0 : value - expected;
-      parts[0] = `${where}: difference ${said(difference, error, map.difference.unit, map.unknown, -Infinity)} (as if independent)`;
+      parts[0] = `${where}: difference ${said(difference, error, map.difference_scale.unit, map.unobserved_label, -Infinity)} (as if independent)`;
       parts.push(`${map.rig} ${one(map)}`, `${against.rig} ${one(against)}`);
     }
     const weights = this.numbers(map.weights, raster);
     if (weights && !Number.isNaN(weights[cell])) parts.push(`${map.weight_name}: ${figures(weights[cell])}`);
     const shown = this.now;
     if (shown.squares && shown.squares[cell] > 1 && !Number.isNaN(shown.values[cell])) {
-      parts.push(`its square of ${tidy(shown.squares[cell] * raster.cell)} m: ${figures(shown.values[cell])} ${unit}`);
+      parts.push(`its square of ${tidy(shown.squares[cell] * raster.cell_m)} m: ${figures(shown.values[cell])} ${unit}`);
     }
     return parts.join("; ");
   }
@@ -197,8 +197,8 @@ const figures = (value) => (value === Infinity ? "infinite" : tidy(+value.toPrec
 const tidy = (value) => String(+value.toFixed(6)).replace("-", "−");
 
 // A number, and two standard errors to either side within its range.
-function said(value, error, unit, unknown, least = 0, most = unit === "%" ? 100 : Infinity) {
-  if (Number.isNaN(value)) return `unknown, ${unknown}`;
+function said(value, error, unit, unobservedLabel, least = 0, most = unit === "%" ? 100 : Infinity) {
+  if (Number.isNaN(value)) return unobservedLabel;
   const end = (times) => figures(Math.min(Math.max(value + times * error, least), most));
   return `${figures(value)}${Number.isNaN(error) ? "" : ` [${end(-2)}, ${end(2)}]`} ${unit}`;
 }
