@@ -158,11 +158,11 @@ def scene(**options) -> Picture:
     nothing = np.zeros((0, 3), dtype=np.float32)
     bare = StaticFaces(np.zeros((0, 3, 2)), np.zeros(0))
     given = {
-        "standing": bare,
+        "static_faces": bare,
         "ego_outline_m": box(0, 0),
         "actors": [],
-        "sensor": nothing,
-        "reference": nothing,
+        "sensor_points": nothing,
+        "reference_points": nothing,
         "title": "Scene",
     }
     return Picture(plot_scene((-20.0, 30.0), (-10.0, 10.0), **(given | options)))
@@ -189,7 +189,7 @@ def test_actors_are_where_they_are_in_the_colour_of_their_category():
     assert alone.at(0, -10, 5) == pytest.approx(bus)
     assert picture.at(0, 20, -5) == pytest.approx((1, 1, 1))
     entries = [text.get_text() for text in picture.figure.axes[0].get_legend().get_texts()]
-    assert entries[2:] == ["car (2)", "bus (1)", "ego"]
+    assert entries[2:] == ["car (2)", "bus (1)", "ego vehicle"]
 
 
 def test_the_way_of_the_ego_is_drawn_if_it_moves():

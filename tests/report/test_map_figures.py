@@ -65,7 +65,7 @@ def test_there_is_a_figure_for_each_quantity_and_band(tmp_path):
     coverage = coverage_of(SQUARE, thresholds_m=(1.0,))
     keys = ("radius_m", "detection_1m")
     paths = write_figures(plot_maps({"a": coverage}, ego_outline_m=EGO), tmp_path / "new" / "maps")
-    stems = [name for key in keys for name in (*(f"{key}_{band}" for band in BANDS), f"near_{key}")]
+    stems = [name for key in keys for name in (*(f"{key}_{band}" for band in BANDS), f"near_field_{key}")]
     assert [path.stem for path in paths] == stems
     assert sorted(paths) == sorted((tmp_path / "new" / "maps").iterdir())
     for path in paths:
@@ -162,7 +162,7 @@ def test_any_band_name_becomes_a_file_in_the_folder_and_no_two_share_one(tmp_pat
 
 def test_the_title_names_quantity_band_cell_and_steps():
     figures = dict(plot_maps({"a": coverage_of(SQUARE, thresholds_m=())}))
-    expected = ["Mean blind spot radius, obstacle", "z 0.5 to 2 m; 1 step, cells of 1 m"]
+    expected = ["Mean blind spot radius, obstacle", "z 0.5 to 2 m; 1 frame, cells of 1 m"]
     assert words(figures["radius_m_obstacle"]) == expected
 
 
@@ -170,7 +170,7 @@ def test_the_sensors_of_the_rig_are_named():
     sensor = SensorView("the lidar", np.eye(4), 90.0, (-9.0, 9.0), 5.0)
     coverage = coverage_of(SQUARE, thresholds_m=())
     _, figure = next(plot_maps({"a": coverage}, sensors={"a": [sensor], "another": []}, ego_outline_m=EGO))
-    assert {"the lidar", "ego"} <= set(legend(figure))
+    assert {"the lidar", "ego vehicle"} <= set(legend(figure))
 
 
 def test_the_bands_of_a_quantity_lie_side_by_side_for_loggers():
@@ -237,6 +237,6 @@ def test_what_is_not_paired_is_refused_before_anything_is_drawn(measure, points)
 def test_titles_say_what_carried_the_rigs():
     coverage = coverage_of(SMALL)
     _, figure = next(plot_maps({"a": coverage}, vehicle="van"))
-    assert "; on van, 1 step" in words(figure)[1]
+    assert "; on van, 1 frame" in words(figure)[1]
     _, figure = next(plot_maps({"a": coverage}))
     assert " on " not in words(figure)[1]

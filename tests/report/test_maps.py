@@ -189,7 +189,7 @@ def test_the_ego_is_filled_and_named():
     picture = draw(flat(1.0), ego_outline_m=EGO)
     assert picture.at(0.0, 0.0) == pytest.approx((1.0, 1.0, 1.0))
     assert picture.at(3.0, 0.0).sum() < 1.0
-    assert "ego" in picture.legend
+    assert "ego vehicle" in picture.legend
 
 
 def test_nothing_is_clipped_and_the_legend_hides_no_data():
@@ -275,10 +275,10 @@ def test_what_is_unknown_or_infinite_is_so_whatever_its_opacity():
 def test_wrong_shapes_are_refused_with_what_arrived():
     with pytest.raises(ValueError, match=r"opacity: got shape \(40, 20\); give that of a band, \(20, 40\)"):
         draw(flat(), opacity=flat().T)
-    with pytest.raises(ValueError, match=r"shape \(20, 40\) is needed.*got \(40, 20\)"):
+    with pytest.raises(ValueError, match=r"got shape \(40, 20\)"):
         draw(flat().T)
     for outline, shape in ((EGO[:2], r"\(2, 2\)"), (EGO[0], r"\(2,\)"), (np.zeros((4, 3)), r"\(4, 3\)")):
-        with pytest.raises(ValueError, match=f"ego_outline_m: .* got shape {shape}"):
+        with pytest.raises(ValueError, match=f"ego_outline_m: got shape {shape}"):
             draw(flat(), ego_outline_m=outline)
 
 

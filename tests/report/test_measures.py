@@ -93,7 +93,10 @@ def test_records_are_those_of_the_summary(table, surface_pair, regions):
     for record, row in zip(records(table), rows, strict=True):
         for key in KEYS if row.observed_cells else ():
             assert tuple(record[f"{key}{end}"] for end in ("", "_error", "_low", "_high")) == row.numbers[key][1:5]
-            assert tuple(record[f"cells_{key}{end}"] for end in ("", "_error", "_low", "_high")) == row.known[key][1:5]
+            assert (
+                tuple(record[f"cells_{key}{end}"] for end in ("", "_error", "_low", "_high"))
+                == row.cell_averages[key][1:5]
+            )
             assert record[key] != record[f"cells_{key}"]
 
 
@@ -119,8 +122,8 @@ def test_without_a_region_no_measure_is_told(surface_pair):
 
 def test_what_rigs_share_is_said_in_the_words_of_the_measure(table, trio, regions):
     surface, known = list_notes(table)[0], list_notes(CoverageTable.from_coverages(trio, regions))[0]
-    assert surface.endswith("so they are asked about the same square metres.")
-    assert known.endswith("so they know the same cells.")
+    assert surface.endswith("so that the visible surface is the same.")
+    assert known.endswith("so that the same cells are observed.")
 
 
 def test_maps_are_those_of_the_measure_and_name_what_is_unknown():

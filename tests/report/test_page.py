@@ -197,11 +197,11 @@ def test_the_hover_shows_the_cell_as_it_is_in_the_file(seen, named, tmp_path):
         coverage.save(tmp_path / f"{name}.npz")
         with np.load(tmp_path / f"{name}.npz") as file:
             keys = ("radius_area_m", "radius_area_m_error", "detection_area_0.4m", "detection_area_0.4m_error")
-            number = np.arange(coverage.grid.cells).reshape(coverage.grid.shape)[:, row, column]
+            number = np.arange(coverage.grid.num_cells).reshape(coverage.grid.shape)[:, row, column]
             at = np.searchsorted(file["cell"], number)
             cells.append([file[key][at].tolist() for key in keys])
     (radius, error, *_), (of_many, its_error, detection, detection_error) = cells
-    m2 = named["many"].area.totals()[0][0, row, column].item()
+    m2 = named["many"].area.sum_blocks()[0][0, row, column].item()
     assert found["hover"].startswith("x 3 to 4 m, y 2 to 3 m: ")
     assert found["label"] == f"{TITLE}, ground, z -0.5 to 0.5 m, {NASTY}"
     assert close(*numbers(found["hover"], "m"), radius[0], error[0])
@@ -438,7 +438,7 @@ def test_cells_taken_together_have_their_mean_by_weight_and_the_page_says_so():
     four = np.s_[10:12, 20:22]
     assert coarse.values[5, 10] == pytest.approx(np.average(known.values[four], weights=known.weights[four]))
     assert np.isnan(coarse.values[:, 350:]).all()
-    assert "errors of single cells are left out; some maps show 2 x 2 cells as one" in notes[-1]
+    assert "standard errors of single cells are omitted; some maps merge 2 x 2 cells" in notes[-1]
     assert re.search(r"show \d x \d cells as one, so that", render_page(Page("rig", "lead", maps=noisy(1))))
 
 

@@ -86,8 +86,8 @@ def test_csv_reads_back_as_json_and_json_as_the_table(table):
             assert record[f"{key}_difference"] == expected["value"]
             for part in ("error", "low", "high"):
                 assert record[f"{key}_difference_{part}"] == expected[part]
-            assert record[f"{key}_difference_significant"] is difference.significant
-            assert record[f"{key}_best"] is (key in row.best)
+            assert record[f"{key}_difference_significant"] is difference.is_significant
+            assert record[f"{key}_best"] is (key in row.leading_keys)
 
 
 def test_text_and_markdown_have_the_same_cells_and_they_are_those_of_the_parts(table):

@@ -92,7 +92,7 @@ def test_every_panel_is_headed_and_the_legend_says_everything_once():
     assert entries == [
         "unobserved (0 % of the cells)",
         "infinite: no sensor points in some frame (50.0 % of the cells)",
-        "ego",
+        "ego vehicle",
         "sensor, with its direction",
         "field of view, up to its range",
     ]

@@ -87,7 +87,7 @@ def test_where_points_are_many_a_cell_has_its_own_ratio(coverage, sides):
 
 
 def test_a_square_has_the_ratio_of_the_sums_of_its_cells(coverage, sides):
-    m2, *sums = coverage.area_sums.totals().numpy()
+    m2, *sums = coverage.area_sums.sum_blocks().numpy()
     sums = np.stack(sums)
     found = compute_ratios(coverage.area_sums, sides).numpy()
     for band, y, x in zip(*(sides == 4).numpy().nonzero(), strict=True):
@@ -97,7 +97,7 @@ def test_a_square_has_the_ratio_of_the_sums_of_its_cells(coverage, sides):
 
 
 def test_what_is_drawn_weighs_as_much_as_the_region_has(coverage, sides):
-    m2 = sum_over_squares(coverage.area_sums.totals()[0], sides)
+    m2 = sum_over_squares(coverage.area_sums.sum_blocks()[0], sides)
     each = m2 / sum_over_squares(torch.ones_like(m2), sides)
     for band, height in enumerate(GRID.heights):
         weighted = (compute_ratios(coverage.area_sums, sides)[:, band] * each[band]).nansum(dim=(1, 2)) / each[
@@ -107,7 +107,7 @@ def test_what_is_drawn_weighs_as_much_as_the_region_has(coverage, sides):
 
 
 def test_a_place_without_a_square_metre_is_unknown_and_has_no_opacity(coverage, sides):
-    seen = sum_over_squares(coverage.area_sums.totals()[0], sides) > 0
+    seen = sum_over_squares(coverage.area_sums.sum_blocks()[0], sides) > 0
     assert 0 < int(seen.sum()) < seen.numel()
     assert torch.equal(compute_ratios(coverage.area_sums, sides).isfinite(), seen.expand(3, -1, -1, -1))
     opacity = compute_opacity(coverage.area_sums, 16, sides, CELL_M)

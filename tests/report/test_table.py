@@ -80,7 +80,7 @@ def test_the_best_is_marked_where_its_lead_over_the_next_is_more_than_chance(tri
     for rows in table.rows_by_region[:2]:
         for key in ("radius_m", "detection_0.4m"):
             each = {row.rig: trio[row.rig].estimate(row.region, row.summary.band) for row in rows}
-            ahead = [each["many"].differences(each[other])[key].significant for other in ("few", "other")]
+            ahead = [each["many"].compute_differences(each[other])[key].is_significant for other in ("few", "other")]
             assert [key in row.leading_keys for row in rows] == [False, False, all(ahead)]
             assert all(ahead)
     # Far ahead of the last is not ahead of the next.
@@ -109,8 +109,8 @@ def test_there_is_nothing_to_remark_where_every_cell_is_known():
     ("other", "message"),
     [
         ({"seed": 7}, "different reference points"),
-        ({"thresholds": (0.5,)}, "differ in their thresholds"),
-        ({"max_radius": 9.0}, "differ in their max_radius"),
+        ({"thresholds_m": (0.5,)}, "differ in their thresholds"),
+        ({"max_radius_m": 9.0}, "differ in their max_radius"),
         ({"grid": BevGrid(x_m=(0.0, 10.0), y_m=(-5.0, 5.0), cell_m=1.0)}, "differ in their grid"),
     ],
 )

@@ -26,7 +26,7 @@ def no_other_columns(monkeypatch):
 
 def metric(thresholds_m=(0.4, 1.0), **options) -> CoverageMetric:
     grid = BevGrid(x_m=(0.0, 4.0), y_m=(0.0, 2.0), cell_m=1.0, heights={"ground": (-0.5, 0.5)})
-    return CoverageMetric(grid, thresholds_m=thresholds, **options)
+    return CoverageMetric(grid, thresholds_m=thresholds_m, **options)
 
 
 def one_cell_known() -> Coverage:
@@ -75,7 +75,7 @@ def test_units_cell_size_steps_and_bands_are_told():
     text = text_of(one_cell_known(), NEAR)
     head = text[: text.index("near")]
     assert (head.count("(m)"), head.count("(%)")) == (1, 3)
-    for words in ("0.4 m (%)", "1 m (%)", "1 step, cells of 1 m", "ground z -0.5 to 0.5 m"):
+    for words in ("0.4 m (%)", "1 m (%)", "1 frame, cells of 1 m", "ground z -0.5 to 0.5 m"):
         assert words in text
 
 
@@ -84,7 +84,7 @@ def test_trouble_is_told_in_words_with_its_count():
     reference = torch.tensor([[0.2, 0.0, 0.0], [0.6, 0.0, 0.0], [-9.0, 0.0, 0.0]])
     coverage.update([ORIGIN, torch.zeros(0, 3), ORIGIN], [reference, reference, torch.zeros(0, 3)])
     text = text_of(coverage.compute(), NEAR)
-    assert "1 of 3 steps had no sensor point" in text
+    assert "1 of 3 frames had no sensor points" in text
     assert "1 of 3 steps had no reference point" in text
     assert "3 of 4 reference points count as 0.5 m far, the limit" in text
     assert "2 of 6 reference points lie outside the grid: left out." in text
@@ -94,7 +94,7 @@ def test_trouble_is_told_in_words_with_its_count():
 def test_a_reference_that_lies_elsewhere_is_doubted():
     coverage = metric()
     coverage.update(ORIGIN, torch.tensor([[0.2, 0.0, 0.0], *[[0.5, 0.5, -1.7]] * 9]))
-    assert "9 of 10 reference points lie outside the grid: left out. Is the ground at z = 0" in text_of(
+    assert "9 of 10 reference points outside the grid are excluded. Check that z = 0" in text_of(
         coverage.compute(), NEAR
     )
 
@@ -112,7 +112,9 @@ def test_every_number_has_its_interval_with_the_digits_of_its_error():
     assert radius == f"{near.value:.3f}  [{near.low:.3f}, {near.high:.3f}]"
     assert detection == [f"{100 * within.value:.1f}  [{100 * within.low:.1f}, {100 * within.high:.1f}]", "100"]
     assert known == "100"
-    assert "In brackets: 95 % intervals, from 16 blocks of up to 4 steps in a row." in text_of(coverage, NEAR)
+    assert "Brackets: 95 % confidence intervals from 16 blocks of up to 4 consecutive frames." in text_of(
+        coverage, NEAR
+    )
 
 
 @pytest.mark.parametrize("differ", [False, True])
@@ -122,8 +124,8 @@ def test_brackets_are_explained_where_there_are_any(differ):
         radius_m = torch.tensor([0.0, 0.0, 0.1 + 0.05 * index * differ])
         coverage.update(place - radius_m, place, block_index=index)
     text = text_of(coverage.compute(), NEAR)
-    assert ("[" in text, "In brackets: 95 % intervals, from 16 blocks of a step." in text) == (differ, differ)
-    assert ("In brackets" in text) == differ
+    assert ("[" in text, "Brackets: 95 % confidence intervals from 16 blocks of one frame." in text) == (differ, differ)
+    assert ("Brackets" in text) == differ
 
 
 def test_a_region_that_one_block_alone_has_probed_has_a_number_without_error():
@@ -134,14 +136,14 @@ def test_a_region_that_one_block_alone_has_probed_has_a_number_without_error():
     text = text_of(coverage.compute(), NEAR, FAR)
     assert cells_of(text, "near")[2] == "0.20"
     assert cells_of(text, "far")[2] == "0.20"
-    assert "No interval where too few blocks have probed the region, or all say the same." in text
+    assert "Numbers without interval: too few blocks observe the region, or all blocks agree." in text
 
 
 @pytest.mark.parametrize(("steps", "blocks", "needed"), [(1, "1 block", 11), (7, "7 blocks", 9)])
 def test_too_few_steps_for_an_error_are_told_once_and_never_as_0(steps, blocks, needed):
     text = text_of(over_steps(steps), NEAR)
     assert "[" not in text
-    assert text.count(f"Not enough steps for intervals: {blocks}, about {needed} are needed.") == 1
+    assert text.count(f"Not enough frames for confidence intervals: {blocks}, about {needed} are needed.") == 1
 
 
 def test_without_blocks_nothing_is_said_about_errors():
@@ -162,7 +164,10 @@ def test_notes_about_one_rig_name_it(blind, regions):
 def test_from_too_few_steps_no_difference_is_called_significant(trios, regions):
     text = printed(trios(5), regions)
     assert "[" not in text
-    assert " ".join(text.split()).count("Not enough frames for confidence intervals: got 5 blocks, about 9 are needed.") == 1
+    assert (
+        " ".join(text.split()).count("Not enough frames for confidence intervals: got 5 blocks, about 9 are needed.")
+        == 1
+    )
     assert "Difference to few" in text
     assert not re.search(r"│ +! ", text)
 
@@ -178,7 +183,7 @@ def test_on_a_narrow_terminal_names_fold_but_numbers_stay_whole(pair, regions, r
     one, other = pair.values()
     named = {f"rig_number_{at}_with_a_long_name": (one, other)[at % 2] for at in range(rigs)}
     narrowest = compute_min_width(build_rich_tables(CoverageTable.from_coverages(named, regions)), list(named))
-    assert narrowest == 35 + (len("unknown") + 3) * rigs
+    assert narrowest == 38 + (len("unknown") + 3) * rigs
     assert_whole(named, regions, narrowest, r"[\d.]+ │|unknown", 8 * rigs)
 
 

@@ -18,7 +18,7 @@ AHEAD = (Region("near", (0.0, 4.0), (-5.0, 5.0)), Region("far", (0.0, 12.0), (-5
 
 def with_bodies(table, shares, best=None, places=30):
     """The table with a child beside the vehicle: its rows of detection stand for the share of places."""
-    key = table.means[1].key
+    key = table.mean_quantities[1].key
     bodies = {}
     for rig, share in shares.items():
         row = table.rows[rig][0]
@@ -49,7 +49,7 @@ def test_of_several_only_who_leads_by_more_than_chance_is_told(trio):
     (sentence,) = summarize_findings(
         CoverageTable.from_coverages({name: trio[name] for name in ("few", "other")}, AHEAD)
     )
-    assert sentence == "No rig detects more than the others to 12 m ahead (a point within 0.4 m) beyond chance."
+    assert sentence == "No rig detects significantly more than the others to 12 m ahead (a point within 0.4 m)."
 
 
 def test_without_errors_nothing_is_told(pair, blind, trios, regions):
@@ -78,7 +78,7 @@ def test_the_advised_number_of_frames_gives_intervals(points, frames):
 
     table = table_of(frames)
     (sentence,) = summarize_findings(table)
-    assert sentence.startswith(f"Not enough frames for an answer: {frames} form {-(-frames // 3)} block")
+    assert sentence.startswith(f"Not enough frames for an answer: {frames} frames form {-(-frames // 3)} block")
     advised = int(re.search(r"which are (\d+) frames", sentence)[1])
     assert not table.has_intervals
     assert 24 < advised <= 40
@@ -115,9 +115,9 @@ def test_few_places_that_all_say_the_same_are_no_answer(trio):
 
 @pytest.mark.parametrize(("alone", "blocks", "sentence"), [
     (lambda index: 30 + index % 2, 16, "Single point of failure: roof; without it detection within 0.01 m is "),
-    (lambda index: 5 + index % 2, 16, "No single point of failure: no sensor's failure costs 10 % or more"),
-    (lambda index: 40 * (index < 3), 16, "No single point of failure: no sensor's failure costs 10 % or more"),
-    (lambda index: 30 + index % 2, 4, "Most is lost without roof: detection within 0.01 m is "),
+    (lambda index: 5 + index % 2, 16, "No single point of failure: no failure of a sensor changes a number significantly by 10 % or more"),
+    (lambda index: 40 * (index < 3), 16, "No single point of failure: no failure of a sensor changes a number significantly by 10 % or more"),
+    (lambda index: 30 + index % 2, 4, "Largest effect of a failure: without roof, detection within 0.01 m in "),
 ])  # fmt: skip
 def test_a_single_point_of_failure_costs_a_tenth_or_more_beyond_chance(alone, blocks, sentence):
     """So many of 100 points does the roof see alone; sixty others are seen by both sensors."""

@@ -1,4 +1,4 @@
-"""A page as one HTML file: nothing is loaded from anywhere, and every name is text."""
+"""Rendering of a page as one HTML file that loads nothing and escapes every name."""
 
 import base64
 import hashlib
@@ -24,111 +24,121 @@ from torchcover.report.page.svg import (
 )
 from torchcover.report.table_layout import PageTable, TextCell
 
-# What maps and pictures may take in a file that is sent by mail without a thought, and the maps in any case; and how
-# many times that they may take before they are packed.
-MOST_CHARS, LEAST_CHARS, MOST_PACKED = 440_000, 100_000, 8
-ROUNDED = "Numbers of single cells are rounded, those of a wide scale by up to 4 %"
-NO_ERRORS = "errors of single cells are left out"
+MAX_CHARS = 440_000  # of maps and pictures, so that the file can be sent by mail
 
 
-def fit_maps(maps: Sequence[PageMap], max_chars: int = MOST_CHARS) -> tuple[list[PageMap], CellBuffer, list[str]]:
-    """Round numbers, then leave out errors, then take cells together where most are, until what is packed is small.
+def fit_maps(maps: Sequence[PageMap], max_chars: int = MAX_CHARS) -> tuple[list[PageMap], CellBuffer, list[str]]:
+    """Reduce maps until they are small enough: round numbers, then remove errors, then merge cells of the largest maps.
+
+    Args:
+        maps: The maps.
+        max_chars: Maximum number of characters of the packed maps.
 
     Returns:
-        The maps, what is packed, and what was left out in words.
+        The reduced maps, their packed cells, and a note on the reduction.
     """
     codes: CellCodes = {}
-    kept, left_out = list(maps), []
-    cells = _packed(kept, max_chars, codes)
+    fitted, reductions = list(maps), []
+    cells = _pack_maps(fitted, max_chars, codes)
     if cells is None:
-        kept, left_out = [replace(one, num_bits=8) for one in kept], [ROUNDED]
-        cells = _packed(kept, max_chars, codes)
-    if cells is None and any(one.errors is not None for one in kept):
-        kept, left_out = [replace(one, errors=None) for one in kept], [ROUNDED, NO_ERRORS]
-        cells = _packed(kept, max_chars, codes)
+        fitted = [replace(page_map, num_bits=8) for page_map in fitted]
+        reductions.append("Numbers of single cells are rounded, those of a wide scale by up to 4 %")
+        cells = _pack_maps(fitted, max_chars, codes)
+    if cells is None and any(page_map.errors is not None for page_map in fitted):
+        fitted = [replace(page_map, errors=None) for page_map in fitted]
+        reductions.append("standard errors of single cells are omitted")
+        cells = _pack_maps(fitted, max_chars, codes)
     while cells is None:
-        most = max(one.values.size for one in kept)
-        kept = [downsample_map(one) if one.values.size > most / 4 else one for one in kept]
-        cells = _packed(kept, max_chars, codes)
-    sides = {round(one.cell_m / whole.cell_m) for one, whole in zip(kept, maps, strict=True)} - {1}
+        largest = max(page_map.values.size for page_map in fitted)
+        fitted = [downsample_map(page_map) if page_map.values.size > largest / 4 else page_map for page_map in fitted]
+        cells = _pack_maps(fitted, max_chars, codes)
+    sides = {round(page_map.cell_m / whole.cell_m) for page_map, whole in zip(fitted, maps, strict=True)} - {1}
     if sides:
-        left_out.append(f"some maps show {' or '.join(f'{side} x {side}' for side in sorted(sides))} cells as one")
-    notes = [f"{'; '.join(left_out)}, so that this file stays small: the .npz files have each."] * bool(left_out)
-    return kept, cells, notes
+        merged = " or ".join(f"{side} x {side}" for side in sorted(sides))
+        reductions.append(f"some maps merge {merged} cells")
+    notes = [f"{'; '.join(reductions)}, to keep this file small; the .npz files are complete."] if reductions else []
+    return fitted, cells, notes
 
 
-def _packed(maps: Sequence[PageMap], most_chars: int, codes: CellCodes) -> CellBuffer | None:
-    """Their cells; None if they are too many."""
-    if sum(int((~np.isnan(one.values)).sum()) * one.num_bits // 8 for one in maps) > MOST_PACKED * most_chars:
+def _pack_maps(maps: Sequence[PageMap], max_chars: int, codes: CellCodes) -> CellBuffer | None:
+    """Pack the cells of maps; None if they need too many characters."""
+    num_bytes = sum(int((~np.isnan(page_map.values)).sum()) * page_map.num_bits // 8 for page_map in maps)
+    if num_bytes > 8 * max_chars:  # compression saves less than this factor
         return None
     cells = CellBuffer(codes)
-    for one in maps:
-        add_arrays(one, cells)
-    return cells if len(cells.text) <= most_chars else None
+    for page_map in maps:
+        add_arrays(page_map, cells)
+    return cells if len(cells.text) <= max_chars else None
 
 
 def downsample_map(page_map: PageMap) -> PageMap:
-    """A map with four cells in each, without errors: their mean as the weights say, or all alike.
+    """Merge 2 x 2 cells of a map into one with their weighted mean, without errors.
+
+    Args:
+        page_map: The map; without weights all cells count equally.
 
     Example:
         >>> from torchcover.report.colors import ColorScale
         >>> scale = ColorScale("radius", "m", "viridis_r", 0.0, 4.0)
         >>> cells = np.array([[1.0, 3.0], [np.nan, 2.0]])
-        >>> coarser(PageMap("radius", "ground", "rig", (0.0, 2.0), (0.0, 2.0), 1.0, cells, scale)).values
+        >>> downsample_map(PageMap("radius", "ground", "rig", (0.0, 2.0), (0.0, 2.0), 1.0, cells, scale)).values
         array([[2.]])
     """
-    known = ~np.isnan(page_map.values)
-    weights = known.astype(float) if page_map.weights is None else np.where(known, page_map.weights, 0.0)
-    base, sums = _sums(weights), _sums(np.where(known, weights * np.where(known, page_map.values, 0.0), 0.0))
-    rows, columns = base.shape
+    is_observed = ~np.isnan(page_map.values)
+    weights = is_observed.astype(float) if page_map.weights is None else np.where(is_observed, page_map.weights, 0.0)
+    weighted_values = np.where(is_observed, weights * np.where(is_observed, page_map.values, 0.0), 0.0)
+    weight_sums, value_sums = _sum_blocks(weights), _sum_blocks(weighted_values)
+    rows, columns = weight_sums.shape
     cell_m = 2 * page_map.cell_m
     return replace(
         page_map,
         x=(page_map.x[0], page_map.x[0] + columns * cell_m),
         y=(page_map.y[0], page_map.y[0] + rows * cell_m),
         cell_m=cell_m,
-        values=np.where(base > 0, sums / np.where(base > 0, base, 1.0), np.nan),
+        values=np.where(weight_sums > 0, value_sums / np.where(weight_sums > 0, weight_sums, 1.0), np.nan),
         errors=None,
-        weights=None if page_map.weights is None else np.where(base > 0, base, np.nan),
+        weights=None if page_map.weights is None else np.where(weight_sums > 0, weight_sums, np.nan),
         opaque_weight=4 * page_map.opaque_weight,
         sides=None if page_map.sides is None else np.maximum(page_map.sides[::2, ::2] // 2, 1),
     )
 
 
-def _sums(values: Array) -> Array:
+def _sum_blocks(values: Array) -> Array:
+    """Sum blocks of 2 x 2 cells."""
     rows, columns = values.shape
-    even = np.pad(values, ((0, rows % 2), (0, columns % 2)))
-    across: Array = even[:, ::2] + even[:, 1::2]
-    return across[::2] + across[1::2]
-
-
-SCRIPTS = ("cells.js", "map.js", "page.js", "controls.js")
+    padded = np.pad(values, ((0, rows % 2), (0, columns % 2)))
+    column_sums: Array = padded[:, ::2] + padded[:, 1::2]
+    return column_sums[::2] + column_sums[1::2]
 
 
 def render_page(page: Page) -> str:
-    """The text of its file."""
-    first = render_target_maps(page.target_maps) + "".join(map(_picture, page.pictures))
-    maps, cells, notes = fit_maps(page.maps, max(MOST_CHARS - len(first), LEAST_CHARS))
+    """Render a page as HTML.
+
+    Args:
+        page: Content of the page.
+    """
+    overview = render_target_maps(page.target_maps) + "".join(map(_render_picture, page.pictures))
+    maps, cells, notes = fit_maps(page.maps, max(MAX_CHARS - len(overview), 100_000))
     content = to_json(build_map_content(replace(page, maps=maps), cells))
-    script = "\n".join(map(_file, SCRIPTS))
+    script = "\n".join(map(_read_file, ("cells.js", "map.js", "page.js", "controls.js")))
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     more = "".join(f"<li>{render_text_html(words)}</li>" for words in page.findings[1:])
     more = f'<ul class="more">{more}</ul>' if more else ""
-    return Template(_file("page.html")).substitute(
+    return Template(_read_file("page.html")).substitute(
         title=escape_html_attribute(page.title),
         heading=render_text_html(page.title),
         lead=render_text_html(page.lead),
         verdict="".join(f'<p class="verdict">{render_text_html(words)}</p>' for words in page.findings[:1]),
-        answer=first + more * bool(first or not maps) + render_detection_shares(page.detection_shares),
-        more=more * bool(maps and not first),
-        style=_file("page.css"),
+        answer=overview + more * bool(overview or not maps) + render_detection_shares(page.detection_shares),
+        more=more * bool(maps and not overview),
+        style=_read_file("page.css"),
         script_hash=f"sha256-{digest}",
         tables="\n".join(map(render_table, page.tables)),
-        map_notes=_notes(notes),
+        map_notes=_render_notes(notes),
         no_rigs="" if page.rigs else " hidden",
         rigs_heading="Rigs" if len(page.rigs) > 1 else "Rig",
-        rigs="\n".join(_rig(rig, page.ego_outline_m, at) for at, rig in enumerate(page.rigs)),
-        facts="\n".join(_facts(heading, facts) for heading, facts in page.facts.items()),
+        rigs="\n".join(_render_rig_section(rig, page.ego_outline_m, index) for index, rig in enumerate(page.rigs)),
+        facts="\n".join(_render_facts(heading, facts) for heading, facts in page.facts.items()),
         more_tables="\n".join(map(render_table, page.more_tables)),
         content=content,
         cells=cells.text,
@@ -137,7 +147,10 @@ def render_page(page: Page) -> str:
 
 
 def to_json(content: object) -> str:
-    r"""JSON that ends no script and opens no comment, whatever its names are.
+    r"""Convert content to JSON that is safe inside a script element.
+
+    Args:
+        content: Content for `json.dumps`.
 
     Example:
         >>> print(to_json({"rig": "</script>"}))
@@ -148,42 +161,46 @@ def to_json(content: object) -> str:
 
 
 @cache
-def _file(name: str) -> str:
+def _read_file(name: str) -> str:
     return files("torchcover.report.page").joinpath(name).read_text(encoding="utf-8")
 
 
 def render_table(table: PageTable) -> str:
-    """A table, with its notes below."""
+    """Render a table with its notes.
+
+    Args:
+        table: The table.
+    """
     caption = f"<caption>{render_text_html(table.title)}</caption>" if table.title else ""
-    kinds = ["" if at < table.num_text_columns else "number" for at in range(len(table.headings))]
+    kinds = ["" if index < table.num_text_columns else "number" for index in range(len(table.headings))]
     headings = [render_text_html(heading).replace("_", "_<wbr>").replace("\n", "<br>") for heading in table.headings]
     pairs = zip(kinds, headings, strict=True)
     head = "".join(f'<th scope="col" class="{kind}">{heading}</th>' for kind, heading in pairs)
-    rows = "\n".join(f"<tr>{''.join(map(_cell, row, kinds))}</tr>" for row in table.rows)
+    rows = "\n".join(f"<tr>{''.join(map(_render_cell, row, kinds))}</tr>" for row in table.rows)
     body = f"{caption}<thead><tr>{head}</tr></thead>\n<tbody>{rows}</tbody>"
-    return f'<div class="wide"><table>{body}</table></div>{_notes(table.notes)}'
+    return f'<div class="wide"><table>{body}</table></div>{_render_notes(table.notes)}'
 
 
-def _picture(picture: PagePicture) -> str:
+def _render_picture(picture: PagePicture) -> str:
     title, data = picture.title, base64.b64encode(picture.png).decode()
     image = f'<img src="data:image/png;base64,{data}" alt="{escape_html_attribute(title)}">'
     return f'<figure class="picture">{image}<figcaption>{render_text_html(title)}</figcaption></figure>'
 
 
-def _notes(notes: Sequence[str]) -> str:
+def _render_notes(notes: Sequence[str]) -> str:
     items = "".join(f"<li>{render_text_html(note)}</li>" for note in notes)
     return f'<ul class="notes">{items}</ul>' if notes else ""
 
 
-def _cell(cell: TextCell, kind: str) -> str:
+def _render_cell(cell: TextCell, kind: str) -> str:
     if not kind:
         return f'<th scope="row">{render_text_html(cell.text)}</th>'
     return f'<td class="{kind} {escape_html_attribute(cell.mark)}">{render_text_html(cell.text)}</td>'
 
 
-def _rig(rig: PageRig, ego_outline_m: Array | None, number: int) -> str:
+def _render_rig_section(rig: PageRig, ego_outline_m: Array | None, number: int) -> str:
     drawing = render_rig(rig.sensors, ego_outline_m, number) if rig.sensors else ""
-    table = render_table(build_sensor_table(rig.sensors)) if rig.sensors else "<p>Its sensors are unknown.</p>"
+    table = render_table(build_sensor_table(rig.sensors)) if rig.sensors else "<p>Sensors unknown.</p>"
     document = (
         f"<details><summary>{render_text_html(rig.name)} as YAML</summary><pre>{escape(rig.document)}</pre></details>"
     )
@@ -192,7 +209,7 @@ def _rig(rig: PageRig, ego_outline_m: Array | None, number: int) -> str:
     )
 
 
-def _facts(heading: str, facts: Mapping[str, str]) -> str:
+def _render_facts(heading: str, facts: Mapping[str, str]) -> str:
     each = "".join(
         f"<dt>{render_text_html(name)}</dt><dd>{render_text_html(value)}</dd>" for name, value in facts.items()
     )
