@@ -33,7 +33,7 @@ SHEARED = np.eye(4) + 0.1 * np.eye(4, k=1)
         ({"vehicle_T_camera": np.eye(3)}, r"got shape \(3, 3\)"),
     ],
 )
-def test_a_camera_that_cannot_be(change, message):
+def test_invalid_camera_arguments_are_refused(change, message):
     with pytest.raises(ValueError, match=message):
         Camera(**{**PLAIN, **change})
 
@@ -58,19 +58,19 @@ IMAGE = torch.ones(6, 8)
         ),
     ],
 )
-def test_a_depth_image_that_does_not_fit(depth, options, error, message):
+def test_mismatched_depth_images_are_refused(depth, options, error, message):
     for method in (Camera(**PLAIN).unproject, Camera(**PLAIN).count_excluded):
         with pytest.raises(error, match=message):
             method(depth, **options)
 
 
 @pytest.mark.parametrize("points", [torch.ones(3), torch.ones(4, 2), torch.ones(4, 3, dtype=torch.int64)])
-def test_points_that_are_none(points):
+def test_invalid_points_are_refused(points):
     with pytest.raises(ValueError, match=r"points are floats \(N, 3\)"):
         Camera(**PLAIN).project(points)
 
 
-def test_pixels_that_are_none():
+def test_invalid_pixels_are_refused():
     with pytest.raises(ValueError, match=r"pixels are floats \(..., 2\)"):
         Camera(**PLAIN).rays(torch.ones(3))
 
@@ -84,12 +84,12 @@ def test_pixels_that_are_none():
         ([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 2.0]], "0, 0, 1"),
     ],
 )
-def test_a_matrix_that_is_no_camera(matrix, message):
+def test_invalid_camera_matrices_are_refused(matrix, message):
     with pytest.raises(ValueError, match=message):
         Camera.from_matrix(matrix, 8, 6)
 
 
 @pytest.mark.parametrize("fov", [0.0, 180.0, NAN])
-def test_a_field_of_view_that_is_none(fov):
+def test_invalid_fields_of_view_are_refused(fov):
     with pytest.raises(ValueError, match="between 0 and 180 degrees"):
         Camera.from_fov(8, 6, fov)

@@ -68,7 +68,7 @@ def ros_region(x_offset, y_offset, width, height, binning):
         ((320, 200), (100, 80, 320, 200, 1), (520, 510, 218, 162), (320, 200)),
     ],
 )
-def test_a_camera_info_describes_the_image_that_is_published(tmp_path, messages, said, region, intrinsics, size):
+def test_camera_info_describes_the_published_image(tmp_path, messages, said, region, intrinsics, size):
     text = ROS_MESSAGE.replace("640", str(said[0])).replace("480", str(said[1])) + ros_region(*region)
     echoed = [text.replace("head}", f"head, seq: {number}}}") + "---\n" for number in range(messages)]
     (tmp_path / "info.yaml").write_text("".join(echoed))
@@ -114,13 +114,13 @@ def test_a_camera_info_describes_the_image_that_is_published(tmp_path, messages,
         ("", "an empty file"),
     ],
 )
-def test_ros_files_that_are_none(tmp_path, text, message):
+def test_invalid_ros_files_are_refused(tmp_path, text, message):
     (tmp_path / "info.yaml").write_text(text)
     with pytest.raises(BadFileError, match=rf"info\.yaml: .*({message})"):
         Camera.from_ros(tmp_path / "info.yaml")
 
 
-def test_a_calibration_that_laughs_is_not_written_out(tmp_path):
+def test_nested_yaml_aliases_are_refused(tmp_path):
     """Nested aliases: 9^11 numbers, of which nobody may ask."""
     laughs = "a0: &a0 [1.0, 1.0]\n" + "".join(f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]\n" for n in range(1, 12))
     for key in ("distortion_model", "d", "k", "width"):
@@ -182,7 +182,7 @@ def row(values):
 
 
 @pytest.mark.parametrize("layout", ["object", "odometry"])
-def test_kitti_sees_lidar_points_where_its_own_matrices_do(tmp_path, layout):
+def test_kitti_projection_equals_its_own_matrices(tmp_path, layout):
     P = MATRIX @ np.array([[1.0, 0.0, 0.0, 0.06], [0.0, 1.0, 0.0, -0.01], [0.0, 0.0, 1.0, 0.003]])
     velodyne = np.array([[0.0, -1.0, 0.0, 0.01], [0.0, 0.0, -1.0, -0.07], [1.0, 0.0, 0.0, -0.27]])
     rectify = convert_euler_to_rotation(0.5, -0.3, 0.2) if layout == "object" else np.eye(3)
@@ -197,7 +197,7 @@ def test_kitti_sees_lidar_points_where_its_own_matrices_do(tmp_path, layout):
     np.testing.assert_allclose(pixels.numpy(), homogeneous[:, :2] / homogeneous[:, 2:], rtol=0, atol=1e-6)
 
 
-def test_kitti_places_the_camera_through_the_lidar(tmp_path):
+def test_kitti_extrinsics_follow_from_the_lidar(tmp_path):
     (tmp_path / "c.txt").write_text(f"P0: {row(MATRIX @ np.eye(3, 4))}\nTr: {row(np.eye(3, 4))}\n")
     pose = np.eye(4)
     pose[:3, 3] = [0.76, 0.0, 1.73]
@@ -217,7 +217,7 @@ def test_kitti_places_the_camera_through_the_lidar(tmp_path):
         (("Tr", "Ts"), "Tr with 12 numbers is needed; got nothing; the file contains P0, Ts"),
     ],
 )
-def test_kitti_files_that_are_none(tmp_path, change, message):
+def test_invalid_kitti_files_are_refused(tmp_path, change, message):
     (tmp_path / "c.txt").write_text(f"P0: {row(MATRIX @ np.eye(3, 4))}\nTr: {row(np.eye(3, 4))}\n".replace(*change))
     with pytest.raises(BadFileError, match=rf"c\.txt: {message}"):
         Camera.from_kitti(tmp_path / "c.txt", 0, width=640, height=480)
@@ -248,7 +248,7 @@ def test_nuscenes(tmp_path):
     torch.testing.assert_close(ahead, torch.tensor([[11.7, 0.0, 1.5]]))
 
 
-def test_nuscenes_vehicles_are_told_apart(tmp_path):
+def test_nuscenes_vehicles_are_distinguished(tmp_path):
     write_nuscenes(tmp_path, calibrated("a", 1.7), calibrated("b", 1.8), calibrated("l", 0.9, "s2"))
     with pytest.raises(ValueError, match=r"2 calibrations of 'CAM_FRONT'.*a, b"):
         Camera.from_nuscenes(tmp_path, "CAM_FRONT")
@@ -275,7 +275,7 @@ def test_nuscenes_vehicles_are_told_apart(tmp_path):
         ("calibrated_sensor.json", "[520.0, 0.0, 318.0]", "5", "has three rows of three numbers; got a list"),
     ],
 )
-def test_nuscenes_tables_that_are_none(tmp_path, file, old, new, message):
+def test_invalid_nuscenes_tables_are_refused(tmp_path, file, old, new, message):
     write_nuscenes(tmp_path, calibrated("a", 1.7))
     content = (tmp_path / file).read_text()
     assert old in content
@@ -290,7 +290,7 @@ def test_a_matrix(tmp_path):
     assert (camera.name, camera.model) == ("x", "kannala_brandt")
 
 
-def test_the_field_of_view_runs_from_edge_to_edge():
+def test_field_of_view_extends_between_image_edges():
     camera = Camera.from_fov(500, 420, 110.0)
     edges = torch.tensor([[-0.5, 209.5], [499.5, 209.5]], dtype=torch.float64)
     left, right = camera.rays(edges)[0]
@@ -313,7 +313,7 @@ def carla_matrix(location, pitch, yaw, roll):
 @pytest.mark.parametrize(
     "angles", [(0.0, 0.0, 0.0), (10.0, 0.0, 0.0), (0.0, 90.0, 0.0), (0.0, 0.0, 20.0), (7.0, -50.0, 3.0)]
 )
-def test_carlas_pose_is_carlas_own_matrix_with_y_turned_over(angles):
+def test_carla_pose_equals_its_matrix_with_flipped_y(angles):
     pitch, yaw, roll = angles
     location = [1.5, 0.4, 2.8]
     in_camera = np.random.default_rng(0).uniform(-5.0, 5.0, (20, 3))  # x right, y down, z forward

@@ -25,19 +25,19 @@ def encode_carla(depth_m, order):
 
 
 @given(depth_m=st.floats(0.0, 999.9), order=st.sampled_from(["BGRA", "RGBA", "BGR", "RGB"]))
-def test_carla_depth_is_coded_to_a_sixteenth_of_a_millimeter(depth_m, order):
+def test_carla_depth_is_decoded_within_its_resolution(depth_m, order):
     depth = decode_carla(np.array([[encode_carla(depth_m, order)]], dtype=np.uint8), order)
     assert depth.item() == pytest.approx(depth_m, abs=1000.0 / (2**24 - 1) + depth_m * 1e-7)
 
 
-def test_carla_sky_is_infinite_and_the_code_below_it_is_not():
+def test_only_the_largest_carla_code_is_infinite():
     depth = decode_carla(np.array([[[255, 255, 255], [254, 255, 255]]], dtype=np.uint8), "RGB")
     assert depth[0, 0] == torch.inf
     assert depth[0, 1] < 1000.0001
 
 
 @pytest.mark.parametrize("order", ["RGB", "RGBA"])
-def test_a_colour_png_is_carlas(tmp_path, order):
+def test_color_png_is_read_as_carla_depth(tmp_path, order):
     depth_m = np.array([[2.5, 7.0], [400.0, 1000.0]])
     pixels = np.array([[encode_carla(value, order) for value in row] for row in depth_m], dtype=np.uint8)
     Image.fromarray(pixels).save(tmp_path / "depth.png")
@@ -45,14 +45,14 @@ def test_a_colour_png_is_carlas(tmp_path, order):
     torch.testing.assert_close(read_depth(tmp_path / "depth.png"), expected, rtol=0, atol=1e-4)
 
 
-def test_a_gray_png_is_scaled(tmp_path):
+def test_gray_png_is_scaled(tmp_path):
     Image.fromarray(np.array([[0, 1500, 65535]], dtype=np.uint16)).save(tmp_path / "depth.png")
     depth = read_depth(tmp_path / "depth.png", meters_per_unit=0.001)
     assert depth.tolist() == [[0.0, 1.5, torch.inf]]
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
-def test_npy_floats_are_metres(tmp_path, dtype):
+def test_npy_floats_are_meters(tmp_path, dtype):
     np.save(tmp_path / "depth.npy", np.array([[0.5, np.inf]], dtype=dtype))
     depth = read_depth(tmp_path / "depth.npy")
     assert depth.dtype == torch.float32
@@ -87,7 +87,7 @@ def png_header(width, height, bits=8, colour=6):
     return b"\x89PNG\r\n\x1a\n" + struct.pack(">I", 13) + body + struct.pack(">I", zlib.crc32(body))
 
 
-def test_an_image_is_not_larger_than_its_file_can_be_nor_than_is_granted(tmp_path, monkeypatch):
+def test_images_beyond_file_size_or_memory_are_refused(tmp_path, monkeypatch):
     path = tmp_path / "depth.png"
     path.write_bytes(png_header(30_000, 30_000))
     with pytest.raises(BadFileError, match=r"depth\.png: truncated: the header claims 30000x30000 pixels"):
@@ -109,7 +109,7 @@ def test_an_image_is_not_larger_than_its_file_can_be_nor_than_is_granted(tmp_pat
                 read_depth(path, meters_per_unit=scale)
 
 
-def test_a_truncated_image_is_named(tmp_path):
+def test_truncated_images_are_refused(tmp_path):
     save(tmp_path / "d.png", np.random.default_rng(0).integers(0, 255, (40, 40, 3), dtype=np.uint8))
     OpenEXR.File({}, {"Z": np.ones((40, 40), np.float32)}).write(str(tmp_path / "d.exr"))
     for name in ("d.png", "d.exr"):
@@ -137,7 +137,7 @@ def save(path, array):
         ("d.jpg", np.zeros((2, 2, 3), np.uint8), None, r"got '.jpg'"),
     ],
 )
-def test_what_cannot_be_depth_is_refused(tmp_path, name, array, scale, message):
+def test_invalid_depth_files_are_refused(tmp_path, name, array, scale, message):
     save(tmp_path / name, array)
     with pytest.raises(BadFileError, match=rf"{name}: .*{message}"):
         read_depth(tmp_path / name, meters_per_unit=scale)
@@ -151,6 +151,6 @@ def test_what_cannot_be_depth_is_refused(tmp_path, name, array, scale, message):
         (np.zeros((2, 2, 3), np.float32), "RGB", "dtype float32"),
     ],
 )
-def test_what_cannot_be_carlas_is_refused(image, order, message):
+def test_invalid_carla_images_are_refused(image, order, message):
     with pytest.raises(ValueError, match=message):
         decode_carla(image, order)

@@ -26,28 +26,28 @@ def cone(degrees, count=400):
 
 
 @pytest.mark.parametrize("count", [4, 5, 8, 12, 14])
-def test_brown_conrady_is_opencvs(count):
+def test_brown_conrady_equals_opencv(count):
     points = cone(35.0)
     expected, _ = cv2.projectPoints(points, np.zeros(3), np.zeros(3), MATRIX, np.array(BROWN_CONRADY[:count]))
     pixels, _ = make("brown_conrady", BROWN_CONRADY[:count]).project(torch.from_numpy(points))
     np.testing.assert_allclose(pixels.numpy(), expected[:, 0], rtol=0, atol=1e-9)
 
 
-def test_kannala_brandt_is_opencvs():
+def test_kannala_brandt_equals_opencv():
     points, k = cone(85.0), np.array([0.03, -0.01, 0.004, -0.001])
     expected, _ = cv2.fisheye.projectPoints(points[None], np.zeros(3), np.zeros(3), MATRIX, k)
     pixels, _ = make("kannala_brandt", k.tolist()).project(torch.from_numpy(points))
     np.testing.assert_allclose(pixels.numpy(), expected[0], rtol=0, atol=1e-9)
 
 
-def test_kannala_brandt_is_kornias_where_kornia_is_defined():
+def test_kannala_brandt_equals_kornia_where_defined():
     points, k = torch.from_numpy(cone(85.0)), [0.03, -0.01, 0.004, -0.001]
     parameters = torch.tensor([*INTRINSICS, *k], dtype=torch.float64)
     expected = distort_points_kannala_brandt(points[:, :2] / points[:, 2:], parameters)
     torch.testing.assert_close(make("kannala_brandt", k).project(points)[0], expected, rtol=0, atol=1e-9)
 
 
-def test_kornia_drops_the_polynomial_near_the_axis_and_we_do_not():
+def test_the_polynomial_applies_near_the_axis():
     camera = Camera(640, 480, 20000.0, 20000.0, 0.0, 0.0, "kannala_brandt", [0.5, 0.0, 0.0, 0.0])
     x = 9.9e-5
     angle = np.arctan(x)
@@ -60,7 +60,7 @@ def test_kornia_drops_the_polynomial_near_the_axis_and_we_do_not():
 
 
 @pytest.mark.parametrize("count", [4, 5, 8, 12])
-def test_the_solvers_formula_is_kornias(count):
+def test_linearized_distortion_equals_kornia(count):
     distortion = make("brown_conrady", BROWN_CONRADY[:count])._optics._solver.distortion
     a, b = np.random.default_rng(1).uniform(-0.8, 0.8, (2, 500))
     at = distortion.linearize(a, b)
@@ -119,7 +119,7 @@ def theta_polynomial(p, k1, k2, k3, k4):
         (theta_polynomial, [1.0, -0.1, 0.14, -0.02]),
     ],
 )
-def test_the_other_models_are_the_papers_formulas(formula, coefficients):
+def test_other_models_equal_their_papers(formula, coefficients):
     points = cone(100.0)
     pixels, _ = make(formula.__name__, coefficients).project(torch.from_numpy(points))
     expected = [np.array(formula(p, *coefficients)) * [520.0, 510.0] + [318.0, 242.0] for p in points]
@@ -144,7 +144,7 @@ def test_points_without_an_image_are_nan(camera):
     assert pixels.isnan().all()
 
 
-def test_shown_directions_are_looked_at_by_their_pixels(camera, directions):
+def test_rays_of_projected_directions_equal_them(camera, directions):
     pixels, visible = camera.project(3.0 * directions)
     # Also far outside the image, but not at the horizon, 1e16 px away, nor straight back, where azimuth is rounding.
     shown = (pixels.abs() < 1e5).all(dim=1) & (directions[:, 2] > -0.999)

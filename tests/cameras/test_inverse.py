@@ -20,7 +20,7 @@ def grid(camera):
     return torch.stack((x, y), dim=-1).double()
 
 
-def test_every_valid_pixel_comes_back_to_a_billionth(camera):
+def test_valid_pixels_project_back_within_a_billionth(camera):
     rays, valid = camera.rays(dtype=torch.float64)
     pixels, visible = camera.project(rays[valid])
     assert visible.all()
@@ -33,7 +33,7 @@ def test_rays_are_unit_where_valid_and_nan_elsewhere(camera):
     assert rays[~valid].isnan().all()
 
 
-def test_every_pixel_is_accounted_for_and_none_is_given_up(camera):
+def test_pixel_counts_add_up_without_unconverged(camera):
     counts = camera.count_pixels()
     assert sum(counts.values()) == camera.width * camera.height
     assert counts["pixels_valid"] == int(camera.rays()[1].sum()) > 0
@@ -47,7 +47,7 @@ def test_single_pixels_equal_the_table(camera):
     torch.testing.assert_close(single, table[::5, ::7], rtol=0, atol=1e-7, equal_nan=True)
 
 
-def test_float32_rays_hold_a_thousandth_of_a_pixel_at_4k():
+def test_float32_rays_are_precise_at_4k():
     camera = Camera(3840, 2160, 1900.0, 1900.0, 1925.0, 1070.0, "brown_conrady", [-0.16, -0.02, 1e-4, 5e-4, 0.04])
     pixels = grid(camera)[::40, ::40].float()
     rays, valid = camera.rays(pixels)
@@ -118,7 +118,7 @@ small = st.floats(-0.02, 0.02)
     prism=st.tuples(small, small, small, small),
     seed=st.integers(0, 2**31),
 )
-def test_every_point_of_the_valid_region_is_found_again(radial, tangential, k3, prism, seed):
+def test_all_points_of_valid_region_are_solved(radial, tangential, k3, prism, seed):
     coefficients = [*radial, *tangential, k3, 0.0, 0.0, 0.0, *prism]
     camera = Camera(100, 100, 500.0, 500.0, 0.0, 0.0, "brown_conrady", coefficients)
     distortion = camera._optics._solver.distortion
@@ -137,7 +137,7 @@ def test_every_point_of_the_valid_region_is_found_again(radial, tangential, k3, 
 
 
 @pytest.mark.parametrize("name", RADIAL)
-def test_the_radii_at_which_the_image_turns_back_are_known(name):
+def test_critical_radii_include_all_turning_points(name):
     distortion = build_lens(*RADIAL[name], is_trainable=False).distortion
     scan = np.linspace(0.0, 3.0, 30_001)
     with np.errstate(all="ignore"):
@@ -163,14 +163,14 @@ class Drawn:
         return SimpleNamespace(u=u, v=v, determinant=self.determinant(drawn))
 
 
-def test_where_a_determinant_is_no_number_the_region_has_ended():
+def test_valid_region_ends_at_nan_determinants():
     lens = Drawn(
         lambda radius, azimuth: (radius, azimuth), lambda radius: np.where(radius < 0.7, 1.0, np.nan), is_radial=True
     )
     assert find_valid_region(lens, 2.0).edge_radius.values == pytest.approx([0.7], abs=1e-12)
 
 
-def test_an_edge_whose_image_turns_back_is_within_reach():
+def test_max_distorted_radius_covers_cusped_edges():
     def image(radius, azimuth):
         return radius * (1 + 0.5 * np.cos(7 * azimuth)), azimuth + 0.8 * np.sin(3 * azimuth)
 
@@ -180,7 +180,7 @@ def test_an_edge_whose_image_turns_back_is_within_reach():
     assert region.max_distorted_radius.contains(np.hypot(at.u, at.v) * (1 - 1e-3), at.u, at.v).all()
 
 
-def test_of_two_images_the_one_nearer_the_axis_is_chosen(make_camera):
+def test_the_solution_nearer_the_axis_is_chosen(make_camera):
     camera = make_camera("fold")
     rays, valid = camera.rays(dtype=torch.float64)
     fold = (1.0 / 0.9) ** 0.5  # d(r - 0.3 r^3)/dr = 0
@@ -192,7 +192,7 @@ def test_of_two_images_the_one_nearer_the_axis_is_chosen(make_camera):
 
 
 @pytest.mark.parametrize(("name", "edge"), [("fold", (1.0 / 0.9) ** 0.5), ("pole", 2.0**0.5)])
-def test_behind_the_fold_or_the_pole_nothing_is_seen(name, edge, make_camera):
+def test_no_point_is_visible_behind_a_fold(name, edge, make_camera):
     radius = edge * torch.tensor([0.999, 1.001, 1.02, 1.3, 3.0], dtype=torch.float64)
     points = torch.stack((radius * 0.8, radius * -0.6, torch.ones_like(radius)), dim=1)
     pixels, visible = make_camera(name).project(points)
@@ -200,13 +200,13 @@ def test_behind_the_fold_or_the_pole_nothing_is_seen(name, edge, make_camera):
     assert not visible[1:].any()
 
 
-def test_a_fisheye_sees_behind_itself_and_a_pinhole_does_not(make_camera):
+def test_only_fisheyes_see_beyond_ninety_degrees(make_camera):
     sideways = torch.tensor([[1.0, 0.0, -0.1]], dtype=torch.float64)
     assert make_camera("fisheye 220").project(sideways)[1].all()
     assert not make_camera("pinhole").project(sideways)[1].any()
 
 
-def test_where_kornia_diverges_the_answer_is_right():
+def test_solution_is_right_where_kornia_diverges():
     # kornia issue 4285: k1 = 0.5, off by 288 px
     camera = Camera(640, 480, 500.0, 500.0, 319.5, 239.5, "brown_conrady", [0.5, 0.0, 0.0, 0.0])
     rays, valid = camera.rays(grid(camera)[::16, ::16])
@@ -220,7 +220,7 @@ def test_nan_pixels_have_no_ray(camera):
     assert rays.isnan().all()
 
 
-def test_the_size_of_the_chunks_changes_nothing(make_camera, monkeypatch):
+def test_chunk_size_changes_nothing(make_camera, monkeypatch):
     whole = make_camera("crooked fold").rays(dtype=torch.float64)
     monkeypatch.setattr(inverse, "_PIXELS_PER_CHUNK", 1000)
     pieces = make_camera("crooked fold").rays(dtype=torch.float64)

@@ -30,7 +30,7 @@ def rim_of(chart):
 
 
 @pytest.mark.parametrize("chart", CHARTS, ids=str)
-def test_an_image_grows_up_to_its_rim_and_ends_there(chart):
+def test_image_radius_grows_up_to_the_rim(chart):
     """All before the rim is shown, farther out the farther off the axis, and lifted to where it came from."""
     rim = rim_of(chart)
     angles = rim * (1 - torch.logspace(-6, 0, 400, dtype=torch.float64))
@@ -48,13 +48,13 @@ def test_an_image_grows_up_to_its_rim_and_ends_there(chart):
 
 
 @pytest.mark.parametrize("chart", [one for one in CHARTS if one.limit < 1e3], ids=str)
-def test_an_image_that_folds_is_largest_where_it_ends(chart):
+def test_folding_images_are_largest_at_the_rim(chart):
     rim = rim_of(chart)
     radius = [torch.hypot(*chart.project(*directions([rim * share]))[:2]).item() for share in (1 - 1e-4, 1 - 1e-8)]
     assert radius == pytest.approx([chart.limit] * 2, rel=1e-4)
 
 
 @pytest.mark.parametrize("chart", [one for one in CHARTS if math.isinf(one.limit)], ids=str)
-def test_an_image_without_end_goes_to_infinity(chart):
+def test_unlimited_images_grow_to_infinity(chart):
     rim = rim_of(chart)
     assert torch.hypot(*chart.project(*directions([rim * (1 - 1e-6)]))[:2]).item() > 100.0

@@ -57,7 +57,7 @@ BAD = {"zero": 0.0, "negative": -1.0, "nan": NAN, "infinite": INF, "beyond_range
 
 @pytest.mark.parametrize("reason", BAD)
 @pytest.mark.parametrize("kind", ["z", "distance"])
-def test_a_bad_depth_is_counted_and_never_a_point(reason, kind):
+def test_bad_depths_are_counted_without_points(reason, kind):
     camera = Camera.from_fov(6, 4, 90.0)
     depth = torch.full((4, 6), 2.0)
     depth[1, 2] = depth[3, 5] = BAD[reason]

@@ -29,7 +29,7 @@ def moving(drive, index):
 
 @pytest.mark.parametrize("origin_m", [(0.0, 0.0, 0.0), FAR_M])
 @pytest.mark.parametrize("index", [0, 2, 4])
-def test_every_point_is_where_its_surface_is_at_the_instant(origin_m, index):
+def test_points_lie_on_their_surfaces_at_the_frame(origin_m, index):
     drive = Drive(origin_m=origin_m)
     frames = RecordedFrames(drive, reference=AccumulatedReference(10.0, voxel_m=0.05))
     reference = frames[index].reference
@@ -48,7 +48,7 @@ class TightlyDrawn(Drive):
         return Boxes.from_rows(rows, ids=("car",))
 
 
-def test_what_sticks_out_of_its_box_moves_with_it():
+def test_points_beside_a_box_move_with_it():
     drive = TightlyDrawn()
     reference = RecordedFrames(drive, reference=AccumulatedReference(10.0, voxel_m=0.05))[2].reference
     assert distances_m(reference, np.concatenate([standing(drive, 2), moving(drive, 2)])).max() < 1e-4
@@ -65,7 +65,7 @@ class Parked(Drive):
         return Boxes.from_rows(torch.cat([moving.rows, row]), ids=("car", "parked"))
 
 
-def test_a_box_that_stands_changes_nothing():
+def test_static_boxes_change_nothing():
     labelled, other = (
         RecordedFrames(drive, reference=AccumulatedReference(10.0, voxel_m=0.05))[6]
         for drive in (Parked(steps=12), Drive(steps=12))
@@ -84,7 +84,7 @@ class OnARoad(Drive):
         self.wall_m, self.back_m = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1), np.empty((0, 3))
 
 
-def test_the_farther_away_the_higher_may_the_ground_be_by_errors_of_poses():
+def test_ground_tolerance_grows_with_distance():
     drive = OnARoad(labelled=False)
     points_m = np.array([[10.0, 0.0, 0.34], [10.0, 0.0, 0.36], [100.0, 0.0, -0.78], [100.0, 0.0, 0.82]])
     level_m = AccumulatedReference(10.0)._flatten_ground(drive, 0, points_m)
@@ -105,7 +105,7 @@ class Slim(Drive):
         return Boxes.from_rows(rows, ids=("walker",))
 
 
-def test_few_points_of_a_box_stand_for_no_more_than_its_sides():
+def test_sides_of_a_box_limit_its_area():
     drive = Slim()
     frame = RecordedFrames(drive, reference=AccumulatedReference(10.0, voxel_m=0.05))[2]
     own = distances_m(frame.reference, moving(drive, 2)) < 1e-3
@@ -113,14 +113,14 @@ def test_few_points_of_a_box_stand_for_no_more_than_its_sides():
     assert 0.5 < float(frame.reference_weights[own].sum()) <= 1.1 * 1.5 + 0.5 * 0.6  # by how many places see it
 
 
-def test_objects_without_a_name_are_left_out_and_counted():
+def test_unnamed_objects_are_excluded_and_counted():
     drive = Drive(named=False)
     frame = RecordedFrames(drive, reference=AccumulatedReference(10.0, voxel_m=0.05))[2]
     assert len(frame.reference) == len(drive.wall_m)
     assert frame.counts["reference_unlabeled"] == 4 * len(drive.back_m)  # not the sensor's own scan of that instant
 
 
-def test_a_judged_sensor_takes_no_part_at_the_instant_itself():
+def test_evaluated_sensors_are_excluded_at_the_frame():
     drive = Drive()
     alone = RecordedFrames(drive, rigs={"left": ("left",)}, reference=AccumulatedReference(0.0, voxel_m=0.05))
     both = len(standing(drive, 1)) + len(moving(drive, 1))
@@ -133,7 +133,7 @@ def test_a_judged_sensor_takes_no_part_at_the_instant_itself():
         RecordedFrames(drive, reference=AccumulatedReference(0.0))
 
 
-def test_a_frame_does_not_depend_on_those_read_before():
+def test_frames_do_not_depend_on_reading_order():
     drive = Drive(steps=5)
 
     def frames():
@@ -158,7 +158,7 @@ def test_one_reference_serves_several_recordings():
     assert all(torch.equal(*pair) for pair in zip(shared, alone, strict=True))
 
 
-def test_where_the_vehicle_stands_is_no_reference():
+def test_reference_has_no_points_in_the_vehicle():
     body = BoundingBox((-30.0, -30.0, 0.0), (30.0, 30.0, 1.0))
     frame = RecordedFrames(Drive(ego_box=body), reference=AccumulatedReference(10.0))[2]
     beside = (frame.reference[:, :2].abs() >= 30.0).any(dim=1)
@@ -170,7 +170,7 @@ def test_where_the_vehicle_stands_is_no_reference():
         RecordedFrames(nothing, reference=AccumulatedReference(10.0))[2]
 
 
-def test_what_a_recording_does_not_say_is_named():
+def test_missing_times_poses_and_sensors_are_named():
     drive = Drive()
     drive.times_s = None
     with pytest.raises(ValueError, match=r"no reference can be accumulated because .* has no times of its scans"):
@@ -186,7 +186,7 @@ def test_what_a_recording_does_not_say_is_named():
             AccumulatedReference(**bad)
 
 
-def test_what_is_left_out_is_counted_and_points_have_square_metres():
+def test_excluded_points_are_counted_and_areas_positive():
     frame = RecordedFrames(Drive(steps=12, labelled=False), reference=AccumulatedReference(10.0, voxel_m=0.05))[5]
     counts = {name.removeprefix("reference_"): count for name, count in frame.counts.items()}
     assert counts["sweeps"] == 2 * 11  # all but the two of the instant
@@ -206,7 +206,7 @@ def test_a_pose_that_jumps_ends_the_window():
 
 
 @pytest.mark.parametrize("steps", [1, 2])
-def test_a_drive_of_hardly_any_sweeps(steps):
+def test_a_drive_of_one_or_two_sweeps(steps):
     drive = Drive(steps=steps, labelled=False)
     frames = RecordedFrames(drive, rigs={"left": ("left",)}, reference=AccumulatedReference(2.0, min_motion_m=1.0))
     wall_m = np.concatenate([standing(drive, 0), moving(drive, 0)])
@@ -221,7 +221,7 @@ class Standing(Drive):
         return super().get_world_T_vehicle(0)
 
 
-def test_a_vehicle_that_stands_sees_what_moves_move():
+def test_moving_objects_are_found_by_stationary_vehicles():
     drive = Standing(steps=12, labelled=False)
     frame = RecordedFrames(drive, reference=AccumulatedReference(10.0, voxel_m=0.05, min_motion_m=0.0))[6]
     here_m = np.concatenate([standing(drive, 6), moving(drive, 6)])
@@ -241,7 +241,7 @@ def test_memory_does_not_grow_with_the_drive():
     assert len(sweeps._counter._images) <= kept
 
 
-def test_one_bad_sweep_costs_its_own_frame():
+def test_one_bad_sweep_fails_only_its_frame():
     def gone(sensor, index):
         if index == 2:
             raise ValueError("f2.bin: truncated")
@@ -263,7 +263,7 @@ def test_one_bad_sweep_costs_its_own_frame():
     assert frames[0].counts["reference_sweeps"] == whole.counts["reference_sweeps"] - 2
 
 
-def test_labels_that_cannot_be_read_cost_their_own_sweep():
+def test_unreadable_labels_fail_only_their_sweep():
     def gone(index):
         if index == 6:
             raise ValueError("f6.csv: truncated")

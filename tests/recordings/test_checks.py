@@ -91,7 +91,7 @@ def doubts(street, **options):
     return RecordedFrames(street, **options).check(None)
 
 
-def test_nothing_is_wrong_with_what_is_right():
+def test_valid_recordings_have_no_warnings():
     assert doubts(Street()) == []
     assert doubts(Street(), reference=AccumulatedReference(1.0)) == []
     assert doubts(Street(slope=(0.12, 0.0))) == []  # a hill
@@ -124,7 +124,7 @@ def test_nothing_is_wrong_with_what_is_right():
         ({"same": True}, r"reference points are those of the rig one itself.*--reference accumulated"),
     ],
 )
-def test_each_mistake_is_named(mistake, says):
+def test_each_error_is_reported(mistake, says):
     found = doubts(Street(**mistake))
     assert found
     for doubt in found:  # and nothing else is
@@ -132,13 +132,13 @@ def test_each_mistake_is_named(mistake, says):
         assert re.search(says, doubt)
 
 
-def test_a_window_that_holds_one_instant():
+def test_windows_with_one_frame_are_reported():
     (doubt,) = doubts(Street(step_s=100.0), reference=AccumulatedReference(2.0))
     assert "frames are 100 s apart, and a window of 2 s" in doubt
 
 
 @pytest.mark.parametrize(("steps", "lasts"), [(1, "0 s, 1 frames"), (2, "0.1 s, 2 frames")])
-def test_a_drive_far_shorter_than_the_window(steps, lasts):
+def test_drives_shorter_than_the_window_are_reported(steps, lasts):
     (doubt,) = doubts(Drive(steps=steps), reference=AccumulatedReference(2.0))
     assert f"it lasts {lasts}, and its reference is accumulated over 2 s" in doubt
     assert (
@@ -146,7 +146,7 @@ def test_a_drive_far_shorter_than_the_window(steps, lasts):
     )
 
 
-def test_a_sensor_that_was_off_for_a_while():
+def test_empty_clouds_are_reported():
     street = Street()
     scan = street.read_scan
     off = Scan(np.empty((0, 3)), MOUNT, "off")
@@ -155,7 +155,7 @@ def test_a_sensor_that_was_off_for_a_while():
     assert "lidar has no point in 2 of 5 frames" in doubt
 
 
-def test_ground_is_what_is_connected_below_the_vehicle():
+def test_ground_is_connected_below_the_vehicle():
     generator = np.random.default_rng(0)
     x, y = generator.uniform(-20, 20, (2, 5000))
     flat_m = np.stack([x, y, np.full(5000, -1.73)], axis=1)
@@ -170,7 +170,7 @@ def test_ground_is_what_is_connected_below_the_vehicle():
     assert abs(estimate_ground_height(ahead_m)) < 0.5
 
 
-def test_a_frame_that_cannot_be_read_is_not_looked_at():
+def test_unreadable_frames_are_skipped():
     street = Street(mount=np.eye(4))
     scan = street.read_scan
     street.read_scan = lambda sensor, index: scan(sensor, index) if index == 5 else Path("gone").read_bytes()
@@ -179,7 +179,7 @@ def test_a_frame_that_cannot_be_read_is_not_looked_at():
     assert doubts(street) == []
 
 
-def test_a_run_warns_before_it_begins():
+def test_evaluation_warns_before_it_begins():
     frames = RecordedFrames(Street(mount=np.eye(4), steps=1))
     with pytest.warns(UserWarning, match=r"^street: the ground lies at z = -1.[78] m \(lidar\)") as caught:
         torchcover.evaluate(frames=frames, cell_m=8.0)
@@ -213,7 +213,7 @@ class Striped(Drive):
         return (apart_m.min(axis=1) < 0.4).mean()
 
 
-def test_a_vehicle_that_stands_still_has_no_reference_of_its_own():
+def test_stationary_vehicles_have_no_own_reference():
     def measure(drive, **options):
         frames = RecordedFrames(drive, reference=AccumulatedReference(2.0, **options))
         with warnings.catch_warnings(record=True) as caught:

@@ -28,7 +28,7 @@ def votes_of(image, points_m):
     return votes.tolist()
 
 
-def test_what_lies_before_a_wall_is_refuted_up_to_the_tolerance():
+def test_points_before_a_wall_are_contradicted():
     image = RangeImage.from_points(upright(20.0), np.eye(4))
     free_m = (20.0 - 0.4) / 1.12
     places_m = [[free_m - 0.05, 0.0, 0.0], [free_m + 0.05, 0.0, 0.0], [19.9, 0.0, 0.0], [25.0, 0.0, 0.0]]
@@ -36,7 +36,7 @@ def test_what_lies_before_a_wall_is_refuted_up_to_the_tolerance():
     assert votes_of(image, [*places_m, [10.0, 8.0, 0.0], [-10.0, 0.0, 0.0], [10.0, 0.0, 5.0]]) == [1, 0, 0, 0, 0, 0, 0]
 
 
-def test_a_ray_that_passes_an_edge_refutes_nothing_beside_it():
+def test_rays_past_an_edge_contradict_no_edge():
     near_m = upright(8.0, half_m=1.0, step_m=0.02)
     near_m = near_m[near_m[:, 1] < 0]
     image = RangeImage.from_points(np.concatenate([near_m, upright(30.0, half_m=15.0, high_m=6.0)]), np.eye(4))
@@ -45,7 +45,7 @@ def test_a_ray_that_passes_an_edge_refutes_nothing_beside_it():
 
 
 @pytest.mark.parametrize("rows_deg", [0.2, 0.4, 2.0])
-def test_flat_ground_is_never_refuted(rows_deg):
+def test_flat_ground_is_never_contradicted(rows_deg):
     elevation, azimuth = np.meshgrid(
         np.deg2rad(np.arange(-25.0, -1.0, rows_deg)), np.deg2rad(np.arange(-180, 180, 0.1))
     )
@@ -59,7 +59,7 @@ def test_flat_ground_is_never_refuted(rows_deg):
     assert votes_of(image, standing) == [1]
 
 
-def test_votes_do_not_depend_on_the_way_to_an_instant():
+def test_votes_do_not_depend_on_earlier_windows():
     generator = np.random.default_rng(0)
     scans = {("a", k): generator.uniform(-20.0, 20.0, (500, 3)) for k in range(6)}
     images = {key: RangeImage.from_points(generator.normal(0.0, 30.0, (4000, 3)), np.eye(4)) for key in scans}
@@ -81,7 +81,7 @@ def test_votes_do_not_depend_on_the_way_to_an_instant():
     assert max(votes.max() for votes in fresh.values()) > 1
 
 
-def test_loops_do_what_arrays_do():
+def test_compiled_kernels_equal_array_kernels():
     pytest.importorskip("numba")
     from torchcover.recordings import compiled_kernels as loops
 
@@ -123,7 +123,7 @@ def test_loops_do_what_arrays_do():
     assert np.ptp(overlaps[0]) > 0.1
 
 
-def test_what_a_wall_or_the_vehicle_hides_is_not_seen():
+def test_occluded_points_are_not_visible():
     wall_m = upright(6.0, half_m=4.0, step_m=0.1, low_m=0.0, high_m=4.0)
     behind_m = [[9.0, 0.0, 1.0], [30.0, 5.0, 1.0]]
     beside_m, above_m, close_m = [[9.0, 12.0, 1.0], [9.0, 0.0, 9.0]], [[0.0, 30.0, 1.0]], [[6.3, 0.0, 1.0]]
@@ -138,7 +138,7 @@ def test_what_a_wall_or_the_vehicle_hides_is_not_seen():
     np.testing.assert_array_equal(share, estimate_visible_share(points_m, CAR, 0.1, 3))
 
 
-def test_square_metres_add_up_to_the_surface():
+def test_areas_add_up_to_the_surface():
     generator = np.random.default_rng(0)
     sparse_m = np.column_stack([generator.uniform(0.0, 40.0, (4000, 2)), np.zeros(4000)])
     dense_m = np.column_stack([generator.uniform(60.0, 70.0, (4000, 2)), np.zeros(4000)])
@@ -149,7 +149,7 @@ def test_square_metres_add_up_to_the_surface():
 
 
 @pytest.mark.parametrize("velocity_mps", [(0.0, 0.0), (1.3, -0.8), (-28.0, 2.0)])
-def test_a_mover_is_put_back_where_it_is(velocity_mps):
+def test_moving_objects_are_placed_at_the_frame(velocity_mps):
     generator = np.random.default_rng(0)
     times_s = np.array([-0.3, -0.2, -0.1, 0.1, 0.2, 0.3])
     box_m = np.concatenate([upright(0.0, 0.9, 0.15, 0.3, 1.4), upright(0.0, 2.0, 0.15, 0.3, 1.4)[:, [1, 0, 2]]])
@@ -176,7 +176,7 @@ def test_a_mover_is_put_back_where_it_is(velocity_mps):
         assert len(same.points_m) == len(found.points_m)
 
 
-def test_nothing_moves_where_there_is_nothing():
+def test_empty_scans_have_no_moving_objects():
     assert find_moving_clusters([], np.empty(0)) == []
     assert find_moving_clusters([np.empty((0, 3))] * 3, np.array([-0.1, 0.1, 0.2])) == []
     assert find_moving_clusters([np.zeros((9, 3)), np.empty((0, 3))], np.array([-0.1, 0.1])) == []

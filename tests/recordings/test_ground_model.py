@@ -67,14 +67,14 @@ def rms_m(ground, heights, within_m=38.0):
 @pytest.mark.parametrize(
     ("heights", "most_m"), [(level, 0.01), (kerbs, 0.03), (ramp, 0.03), (hills, 0.01), (lambda x, y: 0.2 * x, 0.02)]
 )
-def test_heights_are_those_above_what_one_drives_on(heights, most_m):
+def test_heights_are_relative_to_the_road(heights, most_m):
     ground = ground_of(seen(heights))
     error_m, known = rms_m(ground, heights)
     assert error_m < most_m
     assert known == 1.0
 
 
-def test_what_stands_and_what_hangs_is_no_ground():
+def test_objects_and_roofs_are_no_ground():
     cars = []
     for k, (x, y) in enumerate([(-15, 4), (-8, -4), (7, 4), (14, -4), (14, 4), (22, 4)]):
         roof = seen(level, 300, 1.0, seed=k, noise_m=0.01) * [2.0, 0.9, 1.0] + [x, y, 1.45]
@@ -90,7 +90,7 @@ def test_what_stands_and_what_hangs_is_no_ground():
         np.testing.assert_allclose(ground.compute_heights_m(what), what[:, 2], atol=0.05)
 
 
-def test_a_few_reflections_below_the_road_do_not_lower_it():
+def test_reflections_below_do_not_lower_the_road():
     below = seen(level, 1600, 40.0, seed=5) - [0.0, 0.0, 2.0]
     below[:800] = below[800:] + np.array([0.05, 0.05, -0.05])  # in pairs
     ground = ground_of(np.concatenate([seen(level), below]))
@@ -98,7 +98,7 @@ def test_a_few_reflections_below_the_road_do_not_lower_it():
     assert (ground.compute_heights_m(below) < -1.5).all()
 
 
-def test_a_lorry_without_a_foot_far_away_is_unknown_and_not_ground():
+def test_distant_trucks_without_base_are_no_ground():
     far = upright([(70.0, -1.2), (70.0, 1.2)], 1.0, 3.5, 60)
     ground = ground_of(np.concatenate([seen(level), far]))
     assert np.isnan(ground.compute_heights_m(far)).all()
@@ -108,7 +108,7 @@ def test_a_lorry_without_a_foot_far_away_is_unknown_and_not_ground():
     )
 
 
-def test_of_two_roads_above_each_other_it_is_that_of_the_vehicle():
+def test_road_level_of_the_vehicle_is_chosen():
     road = seen(level)
     deck = seen(level, 6000, 40.0, seed=2) * [1.0, 0.12, 1.0] + [0.0, 0.0, 5.5]  # 10 m wide
     under = ground_of(road, deck, place_m=np.array([0.0, 0.0, 0.0]))
@@ -121,7 +121,7 @@ def test_of_two_roads_above_each_other_it_is_that_of_the_vehicle():
     np.testing.assert_allclose(off_m[np.isfinite(off_m)], -5.5, atol=0.5)
 
 
-def test_beyond_what_was_seen_nothing_is_known():
+def test_ground_is_unknown_beyond_observed_points():
     road = seen(level)
     holed = road[np.hypot(*(road[:, :2] - [5.0, 20.0]).T) > 16.0]
     ground = ground_of(holed)
@@ -131,7 +131,7 @@ def test_beyond_what_was_seen_nothing_is_known():
     np.testing.assert_allclose(found_m[1:3], 1.0, atol=0.05)
 
 
-def test_where_there_are_only_walls_there_is_no_ground():
+def test_walls_alone_give_no_ground():
     walls = [upright([(-40.0, y), (40.0, y)], 0.0, 6.0, 8000) for y in (-4.0, 4.0)]
     assert ground_of(*walls) is None
     ceiling = seen(level, 5000) * [1.0, 0.1, 1.0] + [0.0, 0.0, 6.0]
@@ -141,7 +141,7 @@ def test_where_there_are_only_walls_there_is_no_ground():
     assert ground_of(seen(level) + np.array([100.0, 0.0, 0.0])) is None  # none of it is near
 
 
-def test_points_without_a_place_say_nothing():
+def test_nonfinite_points_are_ignored():
     road = seen(hills)
     bad = np.array([[np.nan, 0.0, 0.0], [0.0, 0.0, np.inf], [1.0, 1.0, -np.inf]])
     places_m = seen(hills, 100, seed=7)
@@ -150,7 +150,7 @@ def test_points_without_a_place_say_nothing():
     assert np.isnan(ground_of(road).compute_heights_m(np.array([[np.nan, 0.0, 0.0], [0.0, 0.0, np.nan]]))).all()
 
 
-def test_neither_the_order_of_points_nor_of_sweeps_matters():
+def test_order_of_points_and_sweeps_is_irrelevant():
     one, two, places_m = seen(hills, seed=1), seen(kerbs, 3000, seed=2), seen(hills, 300, seed=3)
     expected_m = ground_of(one, two).compute_heights_m(places_m)
     turned = np.random.default_rng(0).permutation(one)
@@ -188,7 +188,7 @@ def rises(x, y):
 
 @pytest.mark.parametrize("tilt_deg", [(0.0, 0.0), (2.0, -2.0)])
 @pytest.mark.parametrize("origin_m", [(0.0, 0.0, 0.0), (513_248.0, 5_403_655.0, 260.0)])
-def test_heights_of_a_drive_are_those_of_its_world_however_the_vehicle_leans(tilt_deg, origin_m):
+def test_pitch_and_roll_do_not_change_heights(tilt_deg, origin_m):
     road = Road(steps=3, labelled=False, origin_m=origin_m)
     road.tilt_deg = tilt_deg
     frames = RecordedFrames(road, reference=AccumulatedReference(10.0))
@@ -212,7 +212,7 @@ def test_the_bottom_of_a_box_has_a_height():
     np.testing.assert_allclose(boxes.bottom_heights_m, [expected_m], atol=0.02)
 
 
-def test_heights_do_not_depend_on_the_frames_read_before():
+def test_heights_do_not_depend_on_reading_order():
     forward, backward = (RecordedFrames(Road(steps=4), reference=AccumulatedReference(0.2)) for _ in range(2))
     one = [forward[index].reference_heights_m for index in range(4)]
     other = [backward[index].reference_heights_m for index in reversed(range(4))][::-1]
@@ -220,7 +220,7 @@ def test_heights_do_not_depend_on_the_frames_read_before():
         np.testing.assert_array_equal(first, second)
 
 
-def test_without_times_the_ground_is_that_of_the_instant():
+def test_ground_of_one_frame_without_times():
     road = Road(steps=2, labelled=False)
     road.times_s = None
     frames = RecordedFrames(road, rigs={"left": ("left",)}, reference=AccumulatedReference(0.0))
@@ -230,7 +230,7 @@ def test_without_times_the_ground_is_that_of_the_instant():
     assert np.sqrt(np.nanmean(off_m**2)) < 0.03
 
 
-def test_without_ground_bands_are_over_the_vehicle_and_the_result_says_so():
+def test_bands_are_over_z_without_ground():
     frames = RecordedFrames(Drive(), reference=AccumulatedReference(0.5))
     result = torchcover.evaluate(frames=frames, cell_m=8.0)
     assert result.coverage.band_frame == "vehicle"
@@ -239,7 +239,7 @@ def test_without_ground_bands_are_over_the_vehicle_and_the_result_says_so():
     assert RecordedFrames(Road(steps=2), use_ground_model=False)[0].reference_heights_m is None
 
 
-def test_with_ground_bands_are_over_it():
+def test_bands_are_over_ground_with_ground():
     frames = RecordedFrames(Road(steps=4), reference=AccumulatedReference(0.5))
     result = torchcover.evaluate(frames=frames, cell_m=8.0)
     assert result.coverage.band_frame == "ground"

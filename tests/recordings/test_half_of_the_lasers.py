@@ -25,7 +25,7 @@ def turn(generator):
     return (ray * range_m).reshape(3, -1).T.astype("<f4"), laser
 
 
-def test_numbers_are_those_of_an_independent_computation(tmp_path):
+def test_numbers_equal_an_independent_computation(tmp_path):
     metric = CoverageMetric(GRID, max_radius_m=5.0)
     for place in ("sensor", "reference"):
         (tmp_path / place).mkdir()
@@ -64,7 +64,7 @@ def test_numbers_are_those_of_an_independent_computation(tmp_path):
     assert 0.01 < np.nanmean(shares) < 0.99
 
 
-def test_weights_stay_with_their_points_where_own_ones_are_left_out():
+def test_weights_stay_with_their_points():
     points_m = np.random.default_rng(0).uniform(-4, 4, (9000, 3))
     scan = Scan(points_m, None, "", weights=np.arange(9000.0))
     kept = transform_to_vehicle(scan, BoundingBox((-2, -1, 0), (2, 1, 2)))

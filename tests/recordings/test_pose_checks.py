@@ -122,7 +122,7 @@ def jumped(yard):
         Yard(pose_noise=0.05),
     ],
 )
-def test_what_is_right_is_left_alone(right):
+def test_right_poses_have_no_warning(right):
     assert not doubts(right)
 
 
@@ -137,7 +137,7 @@ MENDED = {
 
 
 @pytest.mark.parametrize("fault", MENDED)
-def test_what_would_mend_a_fault_is_named_and_mends_it(fault):
+def test_reported_remedies_correct_the_error(fault):
     doubt = doubts(Yard(fault))
     assert MENDED[fault] in doubt
     name, value = MENDED[fault].removeprefix("--set recording.").split("=")
@@ -160,13 +160,13 @@ def test_what_would_mend_a_fault_is_named_and_mends_it(fault):
     ("fault", "says"),
     [("same", "repeats the same scan while the vehicle moves")],
 )
-def test_what_nothing_mends_is_said(fault, says):
+def test_errors_without_remedy_are_reported(fault, says):
     doubt = doubts(Yard(fault))
     assert re.search(says, doubt)
 
 
 @pytest.mark.parametrize("unit", ["mm", "cm"])
-def test_units_of_clouds(unit):
+def test_wrong_units_are_reported_and_corrected(unit):
     frames = RecordedFrames(Yard(unit), reference=AccumulatedReference(1.0))
     (doubt,) = frames.check()
     assert f"(--set recording.units={unit})" in doubt
@@ -176,7 +176,7 @@ def test_units_of_clouds(unit):
     assert mended.content != frames.content
 
 
-def test_clouds_in_feet_are_read_as_asked():
+def test_clouds_in_feet_are_converted():
     drive = Yard("unlabelled")
     (sensor, *_), feet = (
         drive.sensors,
@@ -185,13 +185,13 @@ def test_clouds_in_feet_are_read_as_asked():
     np.testing.assert_allclose(feet.read_scan(sensor, 0).points_m, 0.3048 * drive.read_scan(sensor, 0).points_m)
 
 
-def test_labels_of_which_none_fits():
+def test_missing_labels_are_reported():
     (doubt,) = RecordedFrames(Yard("unlabelled")).check()
     assert "labels, and none in 12 frames" in doubt
 
 
 @pytest.mark.parametrize(("jump_m", "turn_deg"), [((0.8, 0.4, 0.0), 0.0), ((0.0, 0.0, 0.0), 4.0)])
-def test_poses_that_jump_are_told_and_no_scans_are_compared_across(jump_m, turn_deg):
+def test_jumps_are_reported_and_separate_scan_pairs(jump_m, turn_deg):
     class Jumping(Yard):
         def get_world_T_vehicle(self, index):
             pose = super().get_world_T_vehicle(index)
@@ -209,7 +209,7 @@ def test_poses_that_jump_are_told_and_no_scans_are_compared_across(jump_m, turn_
     assert jumped(Yard(speed_mps=0.0)) is None
 
 
-def test_lags_that_are_none():
+def test_invalid_time_offsets_are_refused():
     with pytest.raises(ValueError, match="at most 1 s"):
         RecordingSettings(time_offset_s=3.0)
     untimed = Yard()
@@ -220,7 +220,7 @@ def test_lags_that_are_none():
     assert RecordingSettings(units="mm").command_line_options == "--set recording.units=mm"
 
 
-def test_poses_with_noise_are_not_late():
+def test_noisy_poses_have_no_time_offset():
     """Many lags are better, with worse ones in between."""
 
     class Noisy(NamedTuple):

@@ -57,7 +57,7 @@ def test_a_frame_is_two_float32_clouds_with_counts(tmp_path):
     assert not any(frame.counts.values())
 
 
-def test_the_two_sides_may_have_different_formats_and_double_suffixes(tmp_path):
+def test_sides_may_differ_in_format_and_suffix(tmp_path):
     record(tmp_path, [])
     np.full((3, 5), 7.0, dtype="<f4").tofile(tmp_path / "sensor" / "LIDAR_TOP__123.pcd.bin")
     (tmp_path / "reference" / "LIDAR_TOP__123.xyz").write_text("1 2 3\n")
@@ -66,7 +66,7 @@ def test_the_two_sides_may_have_different_formats_and_double_suffixes(tmp_path):
     assert (frame.name, frame.sensor.shape, frame.reference.tolist()) == ("LIDAR_TOP__123", (3, 3), [[1, 2, 3]])
 
 
-def test_non_finite_points_are_dropped_and_counted(tmp_path):
+def test_nonfinite_points_are_excluded_and_counted(tmp_path):
     sensor = np.array([[np.nan, 0, 0], [1, 2, 3], [0, np.inf, 0], [0, 0, -np.inf]])
     reference = np.array([[4.0, 5, 6], [np.nan, np.nan, np.nan]])
     record(tmp_path, ["a"], sensor=sensor, reference=reference)
@@ -78,7 +78,7 @@ def test_non_finite_points_are_dropped_and_counted(tmp_path):
     assert counted == {"sensor_nonfinite": 3, "reference_nonfinite": 1}
 
 
-def test_an_empty_sensor_cloud_is_a_blind_step_and_an_empty_reference_an_error(tmp_path):
+def test_only_an_empty_reference_is_an_error(tmp_path):
     blind = RecordedFrames(record(tmp_path / "blind", ["a"], sensor=CLOUD[:0]))[0]
     assert blind.sensor.shape == (0, 3)
     assert blind.reference.shape == (2, 3)
@@ -132,7 +132,7 @@ def test_missing_folders_and_empty_ones(tmp_path):
         RecordedFrames(tmp_path)
 
 
-def test_names_on_one_side_only_are_counted_and_the_first_listed(tmp_path):
+def test_names_of_one_side_are_listed(tmp_path):
     record(tmp_path, ["a"])
     for number in (1, 2, 10, 3, 4, 5, 6):
         np.save(tmp_path / "sensor" / f"s{number}.npy", CLOUD)
@@ -144,7 +144,7 @@ def test_names_on_one_side_only_are_counted_and_the_first_listed(tmp_path):
         RecordedFrames(tmp_path)
 
 
-def test_two_files_of_one_name_and_files_that_are_no_clouds(tmp_path):
+def test_duplicate_names_and_other_files_are_refused(tmp_path):
     record(tmp_path, ["a"])
     (tmp_path / "sensor" / "a.xyz").write_text("1 2 3")
     with pytest.raises(ValueError, match=r"sensor: two files for the frame a: a\.npy and a\.xyz"):
@@ -206,7 +206,7 @@ def spoiled(folder):
     return RecordedFrames(folder)
 
 
-def test_a_bad_frame_says_which_it_is_and_leaves_the_others(tmp_path):
+def test_bad_frames_name_themselves_and_spare_others(tmp_path):
     frames = spoiled(tmp_path)
     with pytest.raises(BadFrameError, match=r"^f2 \(frame 2\): .*sensor.f2\.npy: .* 12 bytes follow it$") as caught:
         frames[2]
@@ -226,7 +226,7 @@ def test_dataset_and_error_survive_pickle(tmp_path):
 
 
 @pytest.mark.parametrize("workers", [0, 1])
-def test_a_caller_skips_bad_frames_with_and_without_workers(tmp_path, workers):
+def test_callers_skip_bad_frames_with_workers(tmp_path, workers):
     loader = DataLoader(spoiled(tmp_path), batch_size=1, collate_fn=collate_frames, num_workers=workers)
     batches, seen, skipped = iter(loader), [], []
     while True:
@@ -242,7 +242,7 @@ def test_a_caller_skips_bad_frames_with_and_without_workers(tmp_path, workers):
     assert str(skipped[0]).endswith("12 bytes follow it")
 
 
-def test_several_rigs_share_a_reference_and_have_a_pose_each(tmp_path):
+def test_rigs_share_a_reference_with_own_poses(tmp_path):
     nowhere = np.array([[np.nan, 0, 0], [1.0, 2.0, 3.0]])
     frames = RecordedFrames(record_rigs(tmp_path, rig10=CLOUD, rig2=nowhere))
     assert frames.rigs == ("rig2", "rig10")
@@ -256,7 +256,7 @@ def test_several_rigs_share_a_reference_and_have_a_pose_each(tmp_path):
     assert frame.clouds["rig10"].tolist() == frame.reference.tolist() == CLOUD.tolist()
 
 
-def test_what_is_wrong_with_several_rigs_is_named(tmp_path):
+def test_errors_of_several_rigs_are_named(tmp_path):
     folder = record_rigs(tmp_path, a=CLOUD, b=CLOUD)
     (folder / "frames.yaml").write_text(f"rigs: {{c: {{vehicle_T_sensor: {MATRIX}}}}}")
     with pytest.raises(ValueError, match=r"frames\.yaml: rigs\.c: the folder rigs/c/ does not exist in the recording"):
@@ -276,7 +276,7 @@ def test_what_is_wrong_with_several_rigs_is_named(tmp_path):
         RecordedFrames(folder)
 
 
-def test_frames_of_one_window_share_a_place_in_time():
+def test_frames_of_one_window_share_a_block():
     drive = Drive(steps=30)  # 0.1 s apart
 
     def places(window_s, **changed):
