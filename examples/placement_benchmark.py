@@ -103,7 +103,7 @@ def simulate(rigs, steps, seed, name):
     for index in track(range(steps), description=f"simulating {name}", console=Console(stderr=True)):
         frame = frames[index]
         clouds = {rig: thinned(frame.get_measured_points(rig)) for rig in frame.clouds}
-        kept.append(replace(frame, clouds=clouds, measurements={}, boxes=in_region(frame.boxes), sensor_points=None))
+        kept.append(replace(frame, clouds=clouds, measurements={}, boxes=in_region(frame.boxes), sensor_point_counts=None))
     return kept
 
 

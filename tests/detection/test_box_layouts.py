@@ -39,10 +39,10 @@ def test_no_boxes_are_none():
 
 
 @pytest.mark.parametrize(("at", "value", "message"), [
-    (0, [[0.0, 0.0, np.nan], [0.0, 0.0, 0.0]], "centres of boxes: 1 of 2 are not finite"),
+    (0, [[0.0, 0.0, np.nan], [0.0, 0.0, 0.0]], "centers of boxes: 1 of 2 are not finite"),
     (1, [[1.0, 2.0], [1.0, 2.0]], r"sizes of boxes: shape \(K, 3\) is needed; got \(2, 2\)"),
     (2, [1.0, 0.0, 0.0], r"headings of boxes: shape \(K, 3\) is needed; got \(3,\)"),
-    (2, [[1.0, 0.0, 0.0]], "as many centres, sizes and headings are needed; got 2, 2 and 1"),
+    (2, [[1.0, 0.0, 0.0]], "equal numbers of centers, sizes and headings are needed; got 2, 2 and 1"),
 ])  # fmt: skip
 def test_what_is_no_list_of_boxes_is_refused(at, value, message):
     given = [np.ones((2, 3)).tolist() for _ in range(3)]
@@ -82,6 +82,6 @@ def test_labels_at_once_are_those_one_by_one():
 
 @pytest.mark.parametrize("shape", [(14, 15), (13, 15), (28, 7), (14,), (2, 2, 14)])
 def test_labels_of_kitti_have_14_numbers_each(shape):
-    with pytest.raises(ValueError, match=rf"numbers: shape \(K, 14\) is needed, .* got \({shape[0]},"):
+    with pytest.raises(ValueError, match=rf"label_values: shape \(K, 14\) is needed, .* got \({shape[0]},"):
         Boxes.from_kitti_label(np.ones(shape))
     assert len(Boxes.from_kitti_label([])) == 0

@@ -180,7 +180,7 @@ def test_without_a_point_in_it_a_box_is_unknown_and_so_is_one_that_the_vehicle_s
     [
         ({"sensor": torch.full((5, 3), math.nan)}, "sensor: 5 of 5 points have NaN"),
         ({"reference": torch.zeros(5, 4)}, r"reference: shape \(N, 3\) is needed; got \(5, 4\)"),
-        ({"threshold_m": -0.1}, "threshold: a distance >= 0 in metres is needed; got -0.1"),
+        ({"threshold_m": -0.1}, "threshold: a distance >= 0 in meters is needed; got -0.1"),
         ({"threshold_m": math.nan}, "threshold: .* got nan"),
         ({"reference_weights": torch.ones(4)}, r"reference_weights: shape \(5,\), one for each .*got \(4,\)"),
         ({"reference_weights": torch.zeros(5)}, "reference_weights: finite weights > 0"),

@@ -324,7 +324,7 @@ def test_boxes_move_with_their_frame():
         (lambda a, t, boxes: find_points_in_boxes(a, boxes), "points"),
         (lambda a, t, boxes: match_detections(a, t[:, 0], t, "distance", 2.0), "detections"),
         (lambda a, t, boxes: match_detections(t, a[:, 0], t, "distance", 2.0), "scores"),
-        (lambda a, t, boxes: match_detections(t, t[:, 0], a, "distance", 2.0), "truth"),
+        (lambda a, t, boxes: match_detections(t, t[:, 0], a, "distance", 2.0), "ground_truth"),
         (lambda a, t, boxes: measure_box_visibility(a[:, :3], t[:, :3], boxes, reference_weights=None), "sensor"),
         (
             lambda a, t, boxes: measure_box_visibility(t[:, :3], t[:, :3], boxes, reference_weights=a[:, 0]),

@@ -49,7 +49,9 @@ def test_overlap_of_boxes_along_the_axes_in_closed_form():
 
 def test_boxes_whose_circles_do_not_meet_are_not_compared_any_further(monkeypatch):
     asked = []
-    monkeypatch.setattr(matching, "_intersection", lambda a, b: asked.append(len(a)) or torch.zeros(len(a)).double())
+    monkeypatch.setattr(
+        matching, "_compute_intersection_m2", lambda a, b: asked.append(len(a)) or torch.zeros(len(a)).double()
+    )
     diagonal = math.hypot(4.0, 2.0)
     compute_bev_iou(torch.tensor([row(0.0, 0.0)]), torch.tensor([row(1.01 * diagonal, 0.0), row(0.0, 0.99 * diagonal)]))
     assert asked == [1]
@@ -156,7 +158,7 @@ def test_a_distance_of_exactly_the_threshold_is_too_far_and_an_overlap_of_exactl
 
 def test_matching_by_something_else_or_without_a_score_for_each_is_refused():
     boxes = torch.tensor([row(0, 0), row(9, 0)])
-    with pytest.raises(ValueError, match="by: 'distance' or 'iou' is needed; got 'centre'"):
+    with pytest.raises(ValueError, match="match_by: 'distance' or 'iou' is needed; got 'centre'"):
         match_detections(boxes, torch.ones(2), boxes, "centre", 2.0)
     with pytest.raises(ValueError, match=r"scores: one for each of 2 detections is needed; got \(1,\)"):
         match_detections(boxes, torch.ones(1), boxes, "distance", 2.0)
@@ -345,8 +347,8 @@ def test_intervals_are_wilson_s_and_unknown_without_trials():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"match_by": "height"}, "by: 'distance' or 'iou' is needed; got 'height'"),
-        ({"threshold": 0.0}, "threshold: metres > 0"),
+        ({"match_by": "height"}, "match_by: 'distance' or 'iou' is needed; got 'height'"),
+        ({"threshold": 0.0}, "threshold: meters > 0"),
         ({"match_by": "iou", "threshold": 2.0}, r"threshold: .* a share in \(0, 1\] for 'iou', is needed; got 2.0"),
         ({"visibility_borders": (0.4, 0.4)}, r"visibility_borders: ascending numbers within \(0, 1\)"),
         ({"visibility_borders": (0.5, 1.0)}, "visibility_borders: ascending"),
@@ -370,7 +372,7 @@ def test_one_bad_number_of_a_detection_is_enough(column, bad):
     if bad == -1e-9 and column not in (3, 4, 5):
         RecallByVisibility().update(detections, boxes, share)
         return
-    with pytest.raises(ValueError, match=r"1 of 3 have NaN .*the first is 1; drop them"):
+    with pytest.raises(ValueError, match=r"1 of 3 have NaN .*the first is 1; remove them"):
         RecallByVisibility().update(detections, boxes, share)
 
 
@@ -427,7 +429,7 @@ def test_a_plot_of_recall_has_a_point_and_its_wilson_interval_for_every_bin_with
         np.testing.assert_allclose(ends, expected, atol=1e-12)
         assert [len(caps.get_xdata()) for caps in axes.lines[1:]] == [3, 3]  # both ends of each interval are marked
         assert [label.get_text().split("\n")[1] for label in axes.get_xticklabels()] == ["1", "1", "0", "1"]
-        assert axes.get_xlabel() == "visibility of the object; below, objects"
+        assert axes.get_xlabel() == "visibility of the object; second line: number of objects"
         plt.close(figure)
     with pytest.raises(ValueError, match=r"score_threshold: one of \(0.0, 0.5\) is needed; got 0.4"):
         metric.plot(score_threshold=0.4)

@@ -1,4 +1,4 @@
-"""Objects: their boxes, how much of each a rig could see, and which of them a detector found."""
+"""Object detection: bounding boxes, visibility of objects, recall and precision of detectors."""
 
 import lazy_loader
 

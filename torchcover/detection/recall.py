@@ -1,4 +1,4 @@
-"""Recall and precision of a detector over what was visible, frame by frame as it finds it."""
+"""Recall and precision of a detector by visibility and distance, accumulated over frames."""
 
 import math
 import warnings
@@ -22,15 +22,15 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-# A box looks as if z were that of its bottom if its center is lower than this share of its height above z = 0.
-LOW_CENTER = 0.15
-# The share of boxes that look so, and how many there have to be, for a warning.
-MOST_LOW = 0.9
+# The center of a box is taken for its bottom if |z| is lower than this share of its height.
+LOW_CENTER_SHARE = 0.15
+# A warning is issued if more than this share of at least this number of boxes have low centers.
+MAX_LOW_SHARE = 0.9
 MIN_BOXES = 20
 
 
 class DetectedFrame:
-    """The objects and the detections of one frame in float64 on the CPU, checked."""
+    """Validated objects and detections of one frame in float64 on the CPU."""
 
     def __init__(
         self,
@@ -53,26 +53,26 @@ class DetectedFrame:
         if bad.any():
             raise ValueError(
                 f"detections: {int(bad.sum())} of {len(bad)} have NaN or infinite numbers or a negative size, "
-                f"the first is {int(bad.nonzero()[0])}; drop them"
+                f"the first is {int(bad.nonzero()[0])}; remove them"
             )
         self.ground_truth = boxes.rows.detach().cpu().double()
-        self.visibility_share = _shares(visibility, len(boxes), "visibility")
-        self.is_hidden = _hidden(visibility, len(boxes))
-        given = torch.zeros(len(bad), device="cpu") if scores is None else scores.detach().cpu()
-        if given.shape != (len(bad),) or given.isnan().any():
+        self.visibility_share = _get_shares(visibility, len(boxes), "visibility")
+        self.is_hidden = _get_hidden(visibility, len(boxes))
+        scores_or_zero = torch.zeros(len(bad), device="cpu") if scores is None else scores.detach().cpu()
+        if scores_or_zero.shape != (len(bad),) or scores_or_zero.isnan().any():
             raise ValueError(
-                f"scores: one number for each of {len(bad)} detections is needed; got shape {tuple(given.shape)} with "
-                f"{int(given.isnan().sum())} NaN"
+                f"scores: one number for each of {len(bad)} detections is needed; got shape "
+                f"{tuple(scores_or_zero.shape)} with {int(scores_or_zero.isnan().sum())} NaN"
             )
-        # Without scores every detection counts at every threshold.
-        self.scores = given.double() if scores is not None else given.double() + math.inf
+        # Detections without scores count at every threshold.
+        self.scores = scores_or_zero.double() if scores is not None else scores_or_zero.double() + math.inf
         unknown = torch.full((len(bad),), math.nan, device="cpu")
-        own = unknown if detection_visibility is None else detection_visibility
-        self.detection_visibility_share = _shares(own, len(bad), "detection_visibility")
-        self.is_detection_hidden = _hidden(own, len(bad))
+        own_visibility = unknown if detection_visibility is None else detection_visibility
+        self.detection_visibility_share = _get_shares(own_visibility, len(bad), "detection_visibility")
+        self.is_detection_hidden = _get_hidden(own_visibility, len(bad))
 
 
-def _shares(visibility: BoxVisibility | Tensor, count: int, name: str) -> Tensor:
+def _get_shares(visibility: BoxVisibility | Tensor, count: int, name: str) -> Tensor:
     share = visibility.share if isinstance(visibility, BoxVisibility) else visibility
     check_tensor(share, name)
     share = share.detach().cpu().double()
@@ -84,8 +84,8 @@ def _shares(visibility: BoxVisibility | Tensor, count: int, name: str) -> Tensor
     return share
 
 
-def _hidden(visibility: BoxVisibility | Tensor, count: int) -> Tensor:
-    """(count,) whether the reference's places were asked, and saw nothing; which mere shares do not say."""
+def _get_hidden(visibility: BoxVisibility | Tensor, count: int) -> Tensor:
+    """(count,) bool: the object was sampled and hidden; False for shares, which do not contain this information."""
     return (
         visibility.hidden.cpu()
         if isinstance(visibility, BoxVisibility)
@@ -94,36 +94,36 @@ def _hidden(visibility: BoxVisibility | Tensor, count: int) -> Tensor:
 
 
 class RecallByVisibility(MergeableMetric):
-    """Recall and precision in bins of visibility and of distance, so that a miss and a blind spot can be told apart.
+    """Recall and precision in bins of visibility and distance, which separate misses from blind spots.
 
-    Detections are matched to objects by `torchcover.detection.match_detections`. An object's visibility is its share from
-    `measure_box_visibility`, and its distance that of its centre from the vehicle's origin, over ground. Bins are half-open
-    [lo, hi), the last ones closed by 1 and open to infinity. Objects of unknown visibility have two bins of their own:
-    those "hidden" from the reference's places too, and those "not sampled"; see `BoxVisibility.hidden`.
+    Detections are matched to objects by `torchcover.detection.match_detections`. The visibility of an object is its
+    share from `measure_box_visibility`, its distance that of its center from the vehicle origin, over ground. Bins are
+    half-open [lo, hi); the last ones are closed by 1 and unbounded. Objects of unknown visibility have two more bins:
+    "hidden" from the poses of the reference sensor, and "not sampled"; see `BoxVisibility.hidden`.
 
-    A false detection has no object, so precision goes by the visibility and distance of the detection's own box; see
-    `update`. All objects and detections count, whatever their category: give one category at a time for figures by
-    category.
+    A false detection has no object, so the bin of a detection follows from the visibility and distance of its own box;
+    see `update`. All categories count together: update one metric for each category for separate figures.
 
-    The state is a few counts, whatever the number of frames, which is `steps`; as every `MergeableMetric`, metrics with
-    the same parameters merge, and ranks are added up when `compute` is called.
+    The state consists of a few counts of constant size; metrics with equal parameters merge, and ranks are added when
+    `compute` is called, see `MergeableMetric`.
 
     Args:
-        match_by: "distance" of the centres over ground, or "iou", the overlap seen from above.
-        threshold: Of the match, in metres or as a share; 2 m, the third of nuScenes' four thresholds, or 0.5 if None.
+        match_by: "distance" of the centers over ground, or "iou", the overlap in bird's-eye view.
+        threshold: Threshold of the match, in meters or as a share; None: 2 m (third of the four
+            thresholds of nuScenes) or 0.5.
         visibility_borders: Borders between bins of visibility, ascending, within (0, 1).
-        distance_borders: Borders between bins of distance in metres, ascending, positive.
+        distance_borders: Borders between bins of distance in meters, ascending, positive.
         score_thresholds: Detections with lower scores do not count; recall and precision have a row for each.
-        kwargs: For `torchmetrics.Metric` (`sync_on_compute`, `dist_sync_fn`, ...).
+        kwargs: Arguments of `torchmetrics.Metric` (`sync_on_compute`, `dist_sync_fn`, ...).
 
     Raises:
-        ValueError: An unknown way to match, a threshold or borders out of range or order, no score threshold.
+        ValueError: An unknown `match_by`, a threshold or borders out of range or order, no score threshold.
 
     Example:
         >>> truth = Boxes.from_rows(torch.tensor([[9.0, 0, 1, 4, 2, 2, 0], [30.0, 0, 1, 4, 2, 2, 0]]))
         >>> metric = RecallByVisibility(visibility_borders=(0.5,), distance_borders=(20.0,))
         >>> metric.update(truth.rows[:1], truth, torch.tensor([0.9, 0.1]))
-        >>> curve = metric.compute().over("visibility")
+        >>> curve = metric.compute().compute_curve("visibility")
         >>> curve.bins, curve.recall.trials
         (('0-0.5', '0.5-1', 'hidden', 'not sampled'), tensor([[1, 1, 0, 0]]))
         >>> curve.recall.value
@@ -143,7 +143,7 @@ class RecallByVisibility(MergeableMetric):
         visibility_borders: Sequence[float] = (0.2, 0.4, 0.6, 0.8),
         distance_borders: Sequence[float] = (20.0, 40.0, 60.0),
         score_thresholds: Sequence[float] = (-math.inf,),
-        **kwargs: Any,  # noqa: ANN401  (whatever torchmetrics takes)
+        **kwargs: Any,  # noqa: ANN401  (arguments of torchmetrics)
     ) -> None:
         threshold = float({"distance": 2.0, "iou": 0.5}.get(match_by, 0.0) if threshold is None else threshold)
         borders = {
@@ -155,7 +155,7 @@ class RecallByVisibility(MergeableMetric):
         super().__init__(
             {"match_by": match_by, "threshold": threshold, **borders, "score_thresholds": scores}, **kwargs
         )
-        self._box_counts: tuple[int, int] | None = (0, 0)  # low and all; None once it has been warned of
+        self._box_counts: tuple[int, int] | None = (0, 0)  # low boxes, all boxes; None after the warning
         self.match_by = match_by
         self.threshold = threshold
         self.visibility_borders = borders["visibility_borders"]
@@ -177,90 +177,94 @@ class RecallByVisibility(MergeableMetric):
         """Add a frame, or lists with one entry for each frame.
 
         Args:
-            detections: (N, 7) x, y, z of the centre, length, width, height, yaw; further columns are ignored.
+            detections: (N, 7) x, y, z of the center, length, width, height, yaw; further columns are ignored.
             boxes: The K objects.
-            visibility: What `measure_box_visibility` said of them, or (K,) shares, NaN where they were not sampled.
-            scores: (N,) scores; without them, detections choose their objects in the order given and all count.
-            detection_visibility: What `measure_box_visibility` says of the detections' boxes, or (N,) shares. Without it,
-                precision is known over distance only: detections are in the bin of what was not sampled.
+            visibility: Result of `measure_box_visibility`, or (K,) shares, NaN where not sampled.
+            scores: (N,) scores; without them, detections choose objects in the given order and all count.
+            detection_visibility: Result of `measure_box_visibility` for the boxes of the detections, or (N,) shares.
+                Without it, precision is known over distance only: all detections are in the bin "not sampled".
 
         Raises:
             ValueError: Lists of different lengths, shapes that do not fit, NaN in detections or scores, a negative
                 size, shares outside [0, 1].
-            TypeError: Boxes that are none, as those of a frame in which nobody looked for objects.
+            TypeError: `boxes` are not `Boxes`, for example None.
         """
-        frames = [_as_list(given) for given in (detections, boxes, visibility)]
-        count = len(frames[0])
-        frames += [[None] * count if given is None else _as_list(given) for given in (scores, detection_visibility)]
-        if len({len(column) for column in frames}) > 1:
-            lengths = ", ".join(str(len(column)) for column in frames)
+        columns = [_to_list(detections), _to_list(boxes), _to_list(visibility)]
+        for optional in (scores, detection_visibility):
+            columns.append([None] * len(columns[0]) if optional is None else _to_list(optional))
+        lengths = [len(column) for column in columns]
+        if len(set(lengths)) > 1:
             raise ValueError(
-                f"one entry for each frame is needed in every list; got {lengths} entries (detections, boxes, "
-                "visibility, scores, detection_visibility)"
+                f"one entry for each frame is needed in every list; got {', '.join(map(str, lengths))} entries "
+                "(detections, boxes, visibility, scores, detection_visibility)"
             )
-        checked = [DetectedFrame(*frame) for frame in zip(*frames, strict=True)]
-        for frame in checked:
+        frames = [DetectedFrame(*frame) for frame in zip(*columns, strict=True)]
+        for frame in frames:
             self._add_frame(frame)
-        self._warn_of_low_boxes(torch.cat([frame.ground_truth for frame in checked]) if checked else None)
+        self._warn_of_low_boxes(torch.cat([frame.ground_truth for frame in frames]) if frames else None)
 
-    def _warn_of_low_boxes(self, truth: Tensor | None) -> None:
-        """Warn once if the centers of most objects so far are on the ground, as if z were that of the bottom."""
-        if truth is None or self._box_counts is None:
+    def _warn_of_low_boxes(self, ground_truth: Tensor | None) -> None:
+        """Warn once if the centers of most objects are on the ground, probably because z is that of the bottom."""
+        if ground_truth is None or self._box_counts is None:
             return
-        low = (truth[:, 2].abs() < LOW_CENTER * truth[:, 5]).sum()
-        self._box_counts = (self._box_counts[0] + int(low), self._box_counts[1] + len(truth))
-        if self._box_counts[1] >= MIN_BOXES and self._box_counts[0] > MOST_LOW * self._box_counts[1]:
+        low = (ground_truth[:, 2].abs() < LOW_CENTER_SHARE * ground_truth[:, 5]).sum()
+        self._box_counts = (self._box_counts[0] + int(low), self._box_counts[1] + len(ground_truth))
+        if self._box_counts[1] >= MIN_BOXES and self._box_counts[0] > MAX_LOW_SHARE * self._box_counts[1]:
             warnings.warn(
-                f"boxes: {self._box_counts[0]} of {self._box_counts[1]} have their center on the ground; z has to be "
-                "that of the center, not of the bottom: add half of the height",
+                f"boxes: {self._box_counts[0]} of {self._box_counts[1]} have their center on the ground; z must be "
+                "the center, not the bottom: add half of the height",
                 stacklevel=3,
             )
             self._box_counts = None
 
     @torch.no_grad()
     def _add_frame(self, frame: DetectedFrame) -> None:
-        chosen = match_detections(frame.detections, frame.scores, frame.ground_truth, self.match_by, self.threshold)
-        hit = chosen >= 0
-        # The score at which an object is found; NaN, at no threshold, if it is not.
-        found_at = torch.full((len(frame.ground_truth),), math.nan, dtype=torch.float64, device="cpu")
-        found_at[chosen[hit]] = frame.scores[hit]
-        object_bin = self._bin(frame.ground_truth, frame.visibility_share, frame.is_hidden)
-        detection_bin = self._bin(frame.detections, frame.detection_visibility_share, frame.is_detection_hidden)
-        counts = [frame.scores >= score for score in self.score_thresholds]
-        self.objects += self._counted([object_bin])[0]
-        self.detected_objects += self._counted([object_bin[found_at >= score] for score in self.score_thresholds])
-        self.detections += self._counted([detection_bin[some] for some in counts])
-        self.true_detections += self._counted([detection_bin[some & hit] for some in counts])
+        object_index = match_detections(
+            frame.detections, frame.scores, frame.ground_truth, self.match_by, self.threshold
+        )
+        is_match = object_index >= 0
+        # Score of the detection that matches an object; NaN, which reaches no threshold, without a match.
+        detected_score = torch.full((len(frame.ground_truth),), math.nan, dtype=torch.float64, device="cpu")
+        detected_score[object_index[is_match]] = frame.scores[is_match]
+        object_bin = self._find_bins(frame.ground_truth, frame.visibility_share, frame.is_hidden)
+        detection_bin = self._find_bins(frame.detections, frame.detection_visibility_share, frame.is_detection_hidden)
+        masks = [frame.scores >= score for score in self.score_thresholds]
+        self.objects += self._count_bins([object_bin])[0]
+        self.detected_objects += self._count_bins(
+            [object_bin[detected_score >= score] for score in self.score_thresholds]
+        )
+        self.detections += self._count_bins([detection_bin[mask] for mask in masks])
+        self.true_detections += self._count_bins([detection_bin[mask & is_match] for mask in masks])
         self.num_frames += 1
 
-    def _bin(self, rows: Tensor, share: Tensor, hidden: Tensor) -> Tensor:
+    def _find_bins(self, rows: Tensor, share: Tensor, hidden: Tensor) -> Tensor:
         distance = torch.linalg.vector_norm(rows[:, :2].double(), dim=1)
         column = torch.bucketize(
             distance, torch.tensor(self.distance_borders, dtype=torch.float64, device="cpu"), right=True
         )
-        line = torch.bucketize(
+        row = torch.bucketize(
             share, torch.tensor(self.visibility_borders, dtype=torch.float64, device="cpu"), right=True
         )
-        line[share.isnan()] = len(self.visibility_borders) + 2
-        line[hidden] = len(self.visibility_borders) + 1
-        return line * (len(self.distance_borders) + 1) + column
+        row[share.isnan()] = len(self.visibility_borders) + 2
+        row[hidden] = len(self.visibility_borders) + 1
+        return row * (len(self.distance_borders) + 1) + column
 
-    def _counted(self, lists: list[Tensor]) -> Tensor:
-        """(lists, V, D) how many entries of each list fall into each bin."""
+    def _count_bins(self, lists: list[Tensor]) -> Tensor:
+        """Count the entries of each list of bins: (lists, V, D)."""
         rows = [torch.bincount(bins, minlength=self.objects.numel()) for bins in lists]
         return torch.stack(rows).view(len(lists), *self.objects.shape).to(self.objects.device)
 
     def compute(self) -> DetectionCounts:
-        """The counts so far, which give recall and precision: `over("visibility")`, `over("distance")`, `overall()`."""
+        """Return the counts of all frames; their methods give recall and precision."""
         visibility, distance = (0.0, *self.visibility_borders, 1.0), (0.0, *self.distance_borders)
         return DetectionCounts(
             objects=self.objects.clone(),
             detected_objects=self.detected_objects.clone(),
             detections=self.detections.clone(),
             true_detections=self.true_detections.clone(),
-            visibility_bins=(*(f"{a:g}-{b:g}" for a, b in pairwise(visibility)), "hidden", "not sampled"),
+            visibility_bins=(*(f"{low:g}-{high:g}" for low, high in pairwise(visibility)), "hidden", "not sampled"),
             distance_bins=(
-                *(f"{a:g}-{b:g} m" for a, b in pairwise(distance)),
+                *(f"{low:g}-{high:g} m" for low, high in pairwise(distance)),
                 f"over {distance[-1]:g} m",
             ),
             score_thresholds=self.score_thresholds,
@@ -275,43 +279,43 @@ class RecallByVisibility(MergeableMetric):
         axis: Literal["visibility", "distance"] = "visibility",
         score_threshold: float | None = None,
     ) -> "tuple[Figure, Axes]":
-        """Draw recall over visibility or distance, with its 95 % Wilson intervals and the number of objects.
+        """Plot recall over visibility or distance, with its 95 % Wilson intervals and the number of objects.
 
         Args:
-            val: What `compute` or `forward` returned; the counts so far if not given.
-            ax: Where to; a new figure of pyplot's if not given.
-            axis: What the bins are of.
-            score_threshold: One of `score_thresholds`; the first if not given.
+            val: Result of `compute` or `forward`; default: the current counts.
+            ax: Target axes; default: a new pyplot figure.
+            axis: Axis of the bins.
+            score_threshold: Element of `score_thresholds`; default: the first.
 
         Raises:
-            TypeError: `val` is no `DetectionCounts`.
-            ValueError: No such score threshold.
+            TypeError: `val` is not a `DetectionCounts`.
+            ValueError: The score threshold was not counted.
         """
         counts = self.compute() if val is None else val
         if not isinstance(counts, DetectionCounts):
-            raise TypeError(f"val: DetectionCounts, as of compute(), are needed; got {type(counts).__name__}")
+            raise TypeError(f"val: the DetectionCounts of compute() are needed; got {type(counts).__name__}")
         score = counts.score_thresholds[0] if score_threshold is None else score_threshold
         if score not in counts.score_thresholds:
             raise ValueError(f"score_threshold: one of {counts.score_thresholds} is needed; got {score}")
         fig, ax = get_figure(ax)
         plot_recall(counts.compute_curve(axis), counts.score_thresholds.index(score), ax)
-        ax.set_xlabel(f"{axis} of the object; below, objects")
+        ax.set_xlabel(f"{axis} of the object; second line: number of objects")
         return fig, ax
 
 
 def _check_parameters(
-    by: str, threshold: float, borders: dict[str, tuple[float, ...]], scores: tuple[float, ...]
+    match_by: str, threshold: float, borders: dict[str, tuple[float, ...]], scores: tuple[float, ...]
 ) -> None:
-    if by not in ("distance", "iou"):
-        raise ValueError(f"by: 'distance' or 'iou' is needed; got {by!r}")
-    if not 0 < threshold < math.inf or (by == "iou" and threshold > 1):
-        raise ValueError(f"threshold: metres > 0, or a share in (0, 1] for 'iou', is needed; got {threshold}")
-    for (name, given), highest in zip(borders.items(), (1.0, math.inf), strict=True):
-        if not all(low < high for low, high in pairwise((0.0, *given, highest))):
-            raise ValueError(f"{name}: ascending numbers within (0, {highest:g}) are needed; got {given}")
+    if match_by not in ("distance", "iou"):
+        raise ValueError(f"match_by: 'distance' or 'iou' is needed; got {match_by!r}")
+    if not 0 < threshold < math.inf or (match_by == "iou" and threshold > 1):
+        raise ValueError(f"threshold: meters > 0, or a share in (0, 1] for 'iou', is needed; got {threshold}")
+    for (name, values), highest in zip(borders.items(), (1.0, math.inf), strict=True):
+        if not all(low < high for low, high in pairwise((0.0, *values, highest))):
+            raise ValueError(f"{name}: ascending numbers within (0, {highest:g}) are needed; got {values}")
     if not scores or any(math.isnan(score) for score in scores):
         raise ValueError(f"score_thresholds: at least one number is needed; got {scores}")
 
 
-def _as_list(given: T | Sequence[T]) -> list[Any]:
-    return list(given) if isinstance(given, (list, tuple)) else [given]
+def _to_list(values: T | Sequence[T]) -> list[Any]:
+    return list(values) if isinstance(values, (list, tuple)) else [values]

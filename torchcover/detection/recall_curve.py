@@ -1,4 +1,4 @@
-"""Counts of objects and detections as recall and precision, with their uncertainty."""
+"""Recall and precision with confidence intervals from counts of objects and detections."""
 
 import math
 from dataclasses import dataclass
@@ -10,15 +10,19 @@ from torch import Tensor
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# Two-sided 95 %.
+# 97.5 % quantile of the normal distribution, for two-sided 95 % intervals.
 NORMAL_QUANTILE = 1.959963984540054
 
 
 @dataclass(frozen=True, eq=False)
 class RatioWithInterval:
-    """A share of successes for each entry, in float64; NaN where nothing was counted.
+    """Success rates with 95 % Wilson intervals (Wilson 1927), in float64; NaN without trials.
 
-    `low` and `high` are the ends of the 95 % Wilson interval (Wilson 1927), `trials` int64.
+    Args:
+        value: Success rates.
+        low: Lower ends of the intervals.
+        high: Upper ends of the intervals.
+        trials: int64 numbers of trials.
     """
 
     value: Tensor
@@ -28,22 +32,34 @@ class RatioWithInterval:
 
     @classmethod
     def from_counts(cls, successes: Tensor, trials: Tensor) -> "RatioWithInterval":
-        """From counts. The interval takes trials as independent; the same object in frames 0.1 s apart is not."""
+        """Compute rates and intervals from counts.
+
+        The interval assumes independent trials; the same object in frames 0.1 s apart is not independent.
+
+        Args:
+            successes: int64 numbers of successes.
+            trials: int64 numbers of trials, broadcast to the shape of `successes`.
+
+        Returns:
+            Rates with intervals.
+        """
         trials = trials.expand_as(successes)
         n = trials.double().where(trials > 0, math.nan)
         p = successes / n
         pull = NORMAL_QUANTILE**2 / n
-        middle = (p + pull / 2) / (1 + pull)
-        half = (pull * (p * (1 - p) + pull / 4)).sqrt() / (1 + pull)
-        return cls(p, (middle - half).clamp(min=0.0), (middle + half).clamp(max=1.0), trials)
+        center = (p + pull / 2) / (1 + pull)
+        half_width = (pull * (p * (1 - p) + pull / 4)).sqrt() / (1 + pull)
+        return cls(p, (center - half_width).clamp(min=0.0), (center + half_width).clamp(max=1.0), trials)
 
 
 @dataclass(frozen=True, eq=False)
 class RecallCurve:
     """Recall and precision over bins, (S, B) for S score thresholds and B bins.
 
-    `bins`: what each bin holds, in words: "0.2-0.4", "hidden", "not sampled"; `recall`: objects found, of the objects
-    of the bin; `precision`: detections that found an object, of the detections of the bin.
+    Args:
+        bins: Names of the bins: "0.2-0.4", "hidden", "not sampled".
+        recall: Share of the objects of each bin that a detection matches.
+        precision: Share of the detections of each bin that match an object.
     """
 
     bins: tuple[str, ...]
@@ -52,20 +68,20 @@ class RecallCurve:
 
 
 class DetectionCounts:
-    """What was there and what was found, by visibility and distance: V bins, the last two unknown, and D bins.
+    """Counts of objects and detections in V bins of visibility (the last two are unknown) and D bins of distance.
 
     Args:
         objects: (V, D) int64 objects.
-        detected_objects: (S, V, D) those that a detection of at least the score threshold found.
-        detections: (S, V, D) detections of at least the score threshold, by the visibility of their own boxes.
-        true_detections: (S, V, D) those of them that found an object.
+        detected_objects: (S, V, D) objects that a detection with at least the score threshold matches.
+        detections: (S, V, D) detections with at least the score threshold, by the visibility of their own boxes.
+        true_detections: (S, V, D) detections of these that match an object.
         visibility_bins: Names of the V bins.
         distance_bins: Names of the D bins.
         score_thresholds: The S score thresholds.
-        num_frames: Number of frames that were counted.
+        num_frames: Number of frames.
     """
 
-    # No dataclass: torchmetrics would take it apart and squeeze its tensors.
+    # Not a dataclass: torchmetrics would convert it and squeeze its tensors.
     def __init__(
         self,
         *,
@@ -88,59 +104,72 @@ class DetectionCounts:
         self.num_frames = num_frames
 
     def compute_curve(self, axis: Literal["visibility", "distance"]) -> RecallCurve:
-        """Recall and precision over bins of visibility or of distance."""
-        bins, other = {"visibility": (self.visibility_bins, -1), "distance": (self.distance_bins, -2)}[axis]
+        """Compute recall and precision over the bins of one axis.
+
+        Args:
+            axis: "visibility" or "distance".
+
+        Returns:
+            Curve over the bins of this axis.
+        """
+        bins, summed_axis = {"visibility": (self.visibility_bins, -1), "distance": (self.distance_bins, -2)}[axis]
         counts = (self.detected_objects, self.objects, self.true_detections, self.detections)
-        found, objects, true_detections, detections = (count.sum(dim=other) for count in counts)
+        detected, objects, true_detections, detections = (count.sum(dim=summed_axis) for count in counts)
         return RecallCurve(
             bins,
-            RatioWithInterval.from_counts(found, objects),
+            RatioWithInterval.from_counts(detected, objects),
             RatioWithInterval.from_counts(true_detections, detections),
         )
 
     def compute_overall(self) -> RecallCurve:
-        """(S, 1) recall and precision of everything."""
+        """Compute (S, 1) recall and precision over all bins."""
         counts = (self.detected_objects, self.objects, self.true_detections, self.detections)
-        found, objects, true_detections, detections = (count.sum(dim=(-2, -1))[..., None] for count in counts)
+        detected, objects, true_detections, detections = (count.sum(dim=(-2, -1))[..., None] for count in counts)
         return RecallCurve(
             ("all",),
-            RatioWithInterval.from_counts(found, objects),
+            RatioWithInterval.from_counts(detected, objects),
             RatioWithInterval.from_counts(true_detections, detections),
         )
 
     def to_scalars(self) -> dict[str, float]:
-        """A flat dict for a logger.
+        """Flatten recall, precision and counts for a logger.
 
         Returns:
             `"recall/all"`, `"recall/visibility 0.2-0.4"`, `"objects/visibility 0.2-0.4"`,
-            `"precision/distance 0-20 m"`, `"detections/distance 0-20 m"` and so on; with several score thresholds
+            `"precision/distance 0-20 m"`, `"detections/distance 0-20 m"` and so on; several score thresholds give
             `"recall_score_0.5/all"`.
         """
-        flat = {}
+        scalars = {}
         curves = {
             "": self.compute_overall(),
             "visibility ": self.compute_curve("visibility"),
             "distance ": self.compute_curve("distance"),
         }
         for row, score in enumerate(self.score_thresholds):
-            at = f"_score_{score:g}" if len(self.score_thresholds) > 1 else ""
+            suffix = f"_score_{score:g}" if len(self.score_thresholds) > 1 else ""
             for axis, curve in curves.items():
                 for column, name in enumerate(curve.bins):
-                    flat[f"recall{at}/{axis}{name}"] = float(curve.recall.value[row, column])
-                    flat[f"precision{at}/{axis}{name}"] = float(curve.precision.value[row, column])
-                    flat[f"objects/{axis}{name}"] = float(curve.recall.trials[row, column])
-                    flat[f"detections{at}/{axis}{name}"] = float(curve.precision.trials[row, column])
-        return flat
+                    scalars[f"recall{suffix}/{axis}{name}"] = float(curve.recall.value[row, column])
+                    scalars[f"precision{suffix}/{axis}{name}"] = float(curve.precision.value[row, column])
+                    scalars[f"objects/{axis}{name}"] = float(curve.recall.trials[row, column])
+                    scalars[f"detections{suffix}/{axis}{name}"] = float(curve.precision.trials[row, column])
+        return scalars
 
 
 def plot_recall(curve: RecallCurve, threshold_index: int, ax: "Axes") -> None:
-    """Draw recall at one score threshold: a point and its interval for each bin that has objects."""
+    """Plot recall at one score threshold, a point with its interval for each bin with objects.
+
+    Args:
+        curve: Recall over bins.
+        threshold_index: Row of the curve.
+        ax: Target axes.
+    """
     value, low, high = (
         t[threshold_index].cpu().numpy() for t in (curve.recall.value, curve.recall.low, curve.recall.high)
     )
-    there = np.flatnonzero(curve.recall.trials[threshold_index].cpu().numpy())
-    interval = np.stack([value - low, high - value])[:, there].clip(min=0.0)  # of rounding
-    ax.errorbar(there, value[there], interval, fmt="o", capsize=3)
+    bins = np.flatnonzero(curve.recall.trials[threshold_index].cpu().numpy())
+    interval = np.stack([value - low, high - value])[:, bins].clip(min=0.0)  # rounding may give negative widths
+    ax.errorbar(bins, value[bins], interval, fmt="o", capsize=3)
     labels = [
         f"{name}\n{objects}"
         for name, objects in zip(curve.bins, curve.recall.trials[threshold_index].tolist(), strict=True)

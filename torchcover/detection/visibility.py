@@ -1,4 +1,4 @@
-"""How much of each object the rig could see."""
+"""Visibility of objects: share of the surface of each bounding box that a rig detects."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -13,22 +13,24 @@ from torchcover.devices import has_float64, move_tensor
 from torchcover.neighbors import blind_spot_radius, check_cloud, check_weights
 from torchcover.notebooks import format_short_repr
 
-# The sides of a box that face this height above the vehicle's origin can be seen; so many points across each.
-SEEN_FROM_M, SIDE_POINTS = 1.7, 12
+# Sides of a box that face a point at this height (typical roof of a car) above the vehicle origin count as visible.
+VIEWPOINT_HEIGHT_M = 1.7
+# Number of sample points along each axis of a side.
+POINTS_PER_SIDE_AXIS = 12
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class BoxVisibility:
-    """What the rig saw of each of K boxes, in float64. A box without a point of reference or rig is unknown: NaN.
+    """Visibility of each of K boxes, in float64; NaN for boxes without any reference or sensor point.
 
     Args:
-        share: (K,) share of what the reference saw in the box whose blind spot radius is within the threshold; of the
-            sides that face the vehicle where it saw nothing and the rig did.
-        mean_radius_m: (K,) mean blind spot radius of the same.
-        reference_points: (K,) int64 reference points in the box.
-        sampled_points: (K,) int64 points that the reference drew on the object, from `Boxes`.
-        sensor_points: (K,) int64 points of the rig in the box.
-        threshold_m: The threshold.
+        share: (K,) detected share of the surface in the box that the reference observed; for boxes in which only the
+            rig has points, detected share of the sides that face the vehicle.
+        mean_radius_m: (K,) mean blind spot radius of the same points.
+        reference_points: (K,) int64 index of reference points in the box.
+        sampled_points: (K,) int64 index of points that the reference sampled on the object, from `Boxes`.
+        sensor_points: (K,) int64 index of sensor points in the box.
+        threshold_m: Detection threshold.
     """
 
     share: Tensor
@@ -42,22 +44,22 @@ class BoxVisibility:
 
     @property
     def observed(self) -> Tensor:
-        """(K,) bool whether any point of the reference or of the rig fell into the box."""
+        """(K,) bool: the box contains reference points or sensor points."""
         return ~self.share.isnan()
 
     @property
     def hidden(self) -> Tensor:
-        """(K,) bool whether points were drawn on the object, and the reference's places saw none: unknown, too.
+        """(K,) bool: the reference sampled points on the object and none is visible from its poses.
 
-        What is neither known nor hidden was not sampled: nobody asked whether it can be seen.
+        Boxes that are neither observed nor hidden were not sampled, so their visibility is unknown.
         """
         return ~self.observed & (self.sampled_points > 0)
 
     @property
     def levels(self) -> Tensor:
-        """(K,) int64 levels of visibility as nuScenes names them: 1 to 40 %, 2 to 60 %, 3 to 80 %, 4; 0 if unknown.
+        """(K,) int64 visibility levels of nuScenes: 1 up to 40 %, 2 up to 60 %, 3 up to 80 %, 4; 0 if unknown.
 
-        There it is the share of an object's pixels in all cameras, here that of its surface with this rig.
+        nuScenes defines them by the visible pixels of all cameras, here they refer to the surface that the rig detects.
         """
         borders = self.share.new_tensor([0.4, 0.6, 0.8])
         return (torch.bucketize(self.share, borders, right=True) + 1).where(self.observed, 0)
@@ -66,16 +68,30 @@ class BoxVisibility:
         return len(self.share)
 
     def select(self, selection: Tensor) -> "BoxVisibility":
-        """Some of them, as `Boxes.select` does."""
-        return self._each(lambda tensor: tensor[selection.to(tensor.device)])
+        """Select the results of some of the boxes.
+
+        Args:
+            selection: (K,) bool mask, or int64 indices of boxes.
+
+        Returns:
+            Results of the selected boxes.
+        """
+        return self._transform_tensors(lambda tensor: tensor[selection.to(tensor.device)])
 
     def to(self, device: torch.device | str) -> "BoxVisibility":
-        """A copy on another device, in float32 where that has no float64."""
-        return self._each(lambda tensor: move_tensor(tensor, device))
+        """Copy the result to a device.
 
-    def _each(self, change: Callable[[Tensor], Tensor]) -> "BoxVisibility":
+        Args:
+            device: Target device.
+
+        Returns:
+            The copy; its tensors are float32 if the device does not support float64.
+        """
+        return self._transform_tensors(lambda tensor: move_tensor(tensor, device))
+
+    def _transform_tensors(self, transform: Callable[[Tensor], Tensor]) -> "BoxVisibility":
         names = ("share", "mean_radius_m", "reference_points", "sampled_points", "sensor_points")
-        changed: dict[str, Any] = {name: change(getattr(self, name)) for name in names}
+        changed: dict[str, Any] = {name: transform(getattr(self, name)) for name in names}
         return replace(self, **changed)
 
 
@@ -88,69 +104,67 @@ def measure_box_visibility(
     *,
     reference_weights: Tensor | None,
 ) -> BoxVisibility:
-    """Share of what the reference saw of each box that the rig saw too, and its mean blind spot radius.
+    """Compute the share of the surface of each box that the rig detects, and its mean blind spot radius.
 
         share[k]       = sum over q in box k of w(q) 1(r(q) <= threshold) / sum over q in box k of w(q)
         mean_radius[k] = sum over q in box k of w(q) r(q) / sum over q in box k of w(q)
 
-    with r(q) from `torchcover.blind_spot_radius`. With weights in square metres it is the share of the surface that the
-    rig covers, of that which the reference's places see. The nearest sensor point may lie outside the box: an object
-    right beside a wall that is seen counts as seen as far as the threshold reaches. `sensor_points` are those in the
-    box itself; see `find_points_in_boxes`.
+    with r(q) from `torchcover.blind_spot_radius`. With area weights it is the detected share of the surface that the
+    reference observes. The nearest sensor point may lie outside the box: an object next to a detected wall counts as
+    detected within the threshold. `sensor_points` counts the points in the box itself, see `find_points_in_boxes`.
 
-    A rig may hit what the reference has no point of. What can be seen of such a box is at most its sides that face the
-    vehicle (from 1.7 m above its origin), with their square metres: the share of these is a lower bound.
+    A box may contain sensor points but no reference points. Its sides that face the vehicle (a point 1.7 m above its
+    origin) then replace the reference: their detected share is a lower bound of the visibility.
 
-    The reference sensor is itself occluded: it looks from beside the ego, so a box that nothing can see from there, nor
-    the rig, is unknown, and of a box that is known the far side is missing. `SurfaceReference(object_points=...)` asks
-    about every object, so that such a box is `hidden`; other references leave it open.
+    The reference sensor is close to the ego vehicle and occluded as well: a box without reference and sensor points is
+    unknown, and the far side of observed boxes is missing. `SurfaceReference(object_points=...)` samples every object,
+    so that such a box is `hidden`; with other references it is not sampled.
 
     Args:
-        sensor: (N, 3) points of the rig in the vehicle frame in metres, all of them. N = 0: nothing was seen, so the
-            radius is infinite and the share 0.
+        sensor: (N, 3) all points of the rig in the vehicle frame in meters. N = 0: the radius is infinite, the share 0.
         reference: (M, 3) points of the reference sensor in the same frame. M = 0: every box is unknown.
-        boxes: K objects of the same instant; K = 0 gives an empty result.
-        threshold_m: Radius in metres up to which a point counts as seen.
-        reference_weights: (M,) weight of each reference point, positive: `frame.reference_weights`. None if they weigh
-            the same, as those of a frame that has none do.
+        boxes: K objects of the same frame; K = 0 gives an empty result.
+        threshold_m: Largest radius that counts as detected.
+        reference_weights: (M,) positive weight of each reference point: `frame.reference_weights`. None: equal weights.
 
     Returns:
         `BoxVisibility` on the device of `reference`.
 
     Raises:
-        ValueError: No reference, a negative threshold, NaN, weights that are not positive, or shapes that do not fit.
-        TypeError: A cloud is no floating-point tensor, or the boxes are none.
+        ValueError: `reference` is None, a negative threshold, NaN, weights that are not positive, or shapes
+            that do not fit.
+        TypeError: A cloud is not a floating-point tensor, or `boxes` are not `Boxes`.
 
     Example:
         >>> boxes = Boxes.from_rows(torch.tensor([[10.0, 0, 1, 4, 2, 2, 0], [30.0, 0, 1, 4, 2, 2, 0]]))
         >>> reference = torch.tensor([[8.0, 0.0, 0.5], [8.0, 0.0, 1.5]])
         >>> sensor = torch.tensor([[8.0, 0.0, 0.6]])
-        >>> seen = measure_box_visibility(sensor, reference, boxes, reference_weights=torch.tensor([1.0, 3.0]))
-        >>> seen.share, seen.reference_points
+        >>> visibility = measure_box_visibility(sensor, reference, boxes, reference_weights=torch.tensor([1.0, 3.0]))
+        >>> visibility.share, visibility.reference_points
         (tensor([0.2500,    nan], dtype=torch.float64), tensor([2, 0]))
     """
     check_boxes(boxes)
-    _check(sensor, reference, threshold_m, reference_weights)
+    _check_arguments(sensor, reference, threshold_m, reference_weights)
     if not has_float64(reference.device):
         weights = None if reference_weights is None else reference_weights.cpu()
-        there = measure_box_visibility(
+        result = measure_box_visibility(
             sensor.cpu(), reference.cpu(), boxes.to("cpu"), threshold_m, reference_weights=weights
         )
-        return there.to(reference.device)
+        return result.to(reference.device)
     sensor, boxes = sensor.to(reference.device), boxes.to(reference.device)
     box, point = find_points_in_boxes(reference, boxes)
-    asked, weights = reference[point], None if reference_weights is None else reference_weights[point]
+    queries, weights = reference[point], None if reference_weights is None else reference_weights[point]
     reference_points = torch.bincount(box, minlength=len(boxes))
     sensor_points = torch.bincount(find_points_in_boxes(sensor, boxes).box_indices, minlength=len(boxes))
-    if only := ((reference_points == 0) & (sensor_points > 0)).nonzero().squeeze(1).tolist():
-        sides, side_of, square_metres = _facing_sides(boxes, only)
-        weights = asked.new_ones(len(asked)) if weights is None else weights
-        asked, box = torch.cat([asked, sides.to(asked)]), torch.cat([box, side_of])
-        weights = torch.cat([weights.double(), square_metres])
-    # Only the reference may be cropped to the boxes.
-    radius = blind_spot_radius(sensor, asked).double()
+    if unobserved := ((reference_points == 0) & (sensor_points > 0)).nonzero().squeeze(1).tolist():
+        sides, side_box, area_m2 = _sample_facing_sides(boxes, unobserved)
+        weights = queries.new_ones(len(queries)) if weights is None else weights
+        queries, box = torch.cat([queries, sides.to(queries)]), torch.cat([box, side_box])
+        weights = torch.cat([weights.double(), area_m2])
+    # The sensor cloud is complete: the nearest point of a query may lie outside the boxes.
+    radius = blind_spot_radius(sensor, queries).double()
     return BoxVisibility(
-        # A GPU adds weights up in any order, so that even all of them may come to a trifle over the total.
+        # The order of sums on a GPU is random, so the share of a fully detected box may exceed 1 by rounding.
         share=compute_box_means((radius <= threshold_m).double(), box, len(boxes), weights).clamp(max=1.0),
         mean_radius_m=compute_box_means(radius, box, len(boxes), weights),
         reference_points=reference_points,
@@ -160,46 +174,64 @@ def measure_box_visibility(
     )
 
 
-def _facing_sides(boxes: Boxes, which: list[int]) -> tuple[Tensor, Tensor, Tensor]:
-    """Points on the sides of some boxes that face the vehicle, the number of the box of each, and its square metres."""
-    number = torch.tensor(which, device=boxes.yaw_rad.device)
-    centre_m, half_m, yaw_rad = (of.double()[number] for of in (boxes.center_m, boxes.size_m / 2, boxes.yaw_rad))
-    turn = torch.stack([yaw_rad.cos(), yaw_rad.sin()], dim=1)
-    along, across = turn, torch.stack([-turn[:, 1], turn[:, 0]], dim=1)
-    from_m = centre_m.new_tensor([0.0, 0.0, SEEN_FROM_M]) - centre_m
-    seen_from_m = torch.stack([(from_m[:, :2] * along).sum(1), (from_m[:, :2] * across).sum(1), from_m[:, 2]], dim=1)
-    steps = (torch.arange(SIDE_POINTS, device=number.device).double() + 0.5) * 2 / SIDE_POINTS - 1
-    first, second = (grid.reshape(-1) for grid in torch.meshgrid(steps, steps, indexing="ij"))
-    points, owners, areas = [], [], []
-    for axis, (one, other) in enumerate(((1, 2), (0, 2), (0, 1))):
-        facing = (seen_from_m[:, axis].abs() > half_m[:, axis]).nonzero().squeeze(1)
-        if axis == 2:  # what stands on the ground has no underside
-            facing = facing[seen_from_m[facing, 2] > 0]
-        local_m = centre_m.new_empty(len(facing), len(first), 3)
-        local_m[..., axis] = (half_m[facing, axis] * seen_from_m[facing, axis].sign())[:, None]
-        local_m[..., one], local_m[..., other] = half_m[facing, one, None] * first, half_m[facing, other, None] * second
+def _sample_facing_sides(boxes: Boxes, box_indices: list[int]) -> tuple[Tensor, Tensor, Tensor]:
+    """Sample points on the sides of some boxes that face the vehicle.
+
+    Returns:
+        (P, 3) points, (P,) index of the box and (P,) area in square meters of each point.
+    """
+    index = torch.tensor(box_indices, device=boxes.yaw_rad.device)
+    center_m, half_m = boxes.center_m.double()[index], (boxes.size_m / 2).double()[index]
+    yaw_rad = boxes.yaw_rad.double()[index]
+    heading = torch.stack([yaw_rad.cos(), yaw_rad.sin()], dim=1)
+    along, across = heading, torch.stack([-heading[:, 1], heading[:, 0]], dim=1)
+    viewpoint_m = center_m.new_tensor([0.0, 0.0, VIEWPOINT_HEIGHT_M]) - center_m
+    ahead_m, left_m = (viewpoint_m[:, :2] * along).sum(1), (viewpoint_m[:, :2] * across).sum(1)
+    local_viewpoint_m = torch.stack([ahead_m, left_m, viewpoint_m[:, 2]], dim=1)
+    offsets = (torch.arange(POINTS_PER_SIDE_AXIS, device=index.device).double() + 0.5) * 2 / POINTS_PER_SIDE_AXIS - 1
+    first, second = (grid.reshape(-1) for grid in torch.meshgrid(offsets, offsets, indexing="ij"))
+    points_m, indices, areas_m2 = [], [], []
+    for axis, (axis_u, axis_v) in enumerate(((1, 2), (0, 2), (0, 1))):
+        facing = (local_viewpoint_m[:, axis].abs() > half_m[:, axis]).nonzero().squeeze(1)
+        if axis == 2:  # the bottom of a box on the ground is not visible
+            facing = facing[local_viewpoint_m[facing, 2] > 0]
+        local_m = center_m.new_empty(len(facing), len(first), 3)
+        local_m[..., axis] = (half_m[facing, axis] * local_viewpoint_m[facing, axis].sign())[:, None]
+        local_m[..., axis_u], local_m[..., axis_v] = (
+            half_m[facing, axis_u, None] * first,
+            half_m[facing, axis_v, None] * second,
+        )
         flat_m = local_m[..., :1] * along[facing, None] + local_m[..., 1:2] * across[facing, None]
-        points.append((torch.cat([flat_m, local_m[..., 2:]], dim=2) + centre_m[facing, None]).reshape(-1, 3))
-        owners.append(number[facing].repeat_interleave(len(first)))
-        side_m2 = 4 * half_m[facing, one] * half_m[facing, other]
-        areas.append((side_m2 / len(first)).repeat_interleave(len(first)))
-    return torch.cat(points), torch.cat(owners), torch.cat(areas)
+        points_m.append((torch.cat([flat_m, local_m[..., 2:]], dim=2) + center_m[facing, None]).reshape(-1, 3))
+        indices.append(index[facing].repeat_interleave(len(first)))
+        side_m2 = 4 * half_m[facing, axis_u] * half_m[facing, axis_v]
+        areas_m2.append((side_m2 / len(first)).repeat_interleave(len(first)))
+    return torch.cat(points_m), torch.cat(indices), torch.cat(areas_m2)
 
 
 def compute_box_means(values: Tensor, box_indices: Tensor, num_boxes: int, weights: Tensor | None) -> Tensor:
-    """(K,) weighted mean over the points in each of K boxes, all alike without weights; NaN for a box without any.
+    """Compute the weighted mean of values over the points in each box.
+
+    Args:
+        values: (P,) values of the points.
+        box_indices: (P,) int64 box of each point.
+        num_boxes: Number of boxes K.
+        weights: (P,) weights; None: equal weights.
+
+    Returns:
+        (K,) means; NaN for boxes without points.
 
     Example:
         >>> compute_box_means(torch.tensor([1.0, 0.0]).double(), torch.tensor([1, 1]), 2, torch.tensor([1.0, 3.0]))
         tensor([   nan, 0.2500], dtype=torch.float64)
     """
     weight = torch.ones_like(values) if weights is None else weights.to(values)
-    total, whole = values.new_zeros(2, num_boxes).unbind()
-    total.index_add_(0, box_indices, values * weight)
-    return total / whole.index_add_(0, box_indices, weight)  # 0 / 0 is NaN
+    weighted_sum, weight_sum = values.new_zeros(2, num_boxes).unbind()
+    weighted_sum.index_add_(0, box_indices, values * weight)
+    return weighted_sum / weight_sum.index_add_(0, box_indices, weight)  # 0 / 0 is NaN
 
 
-def _check(sensor: Tensor, reference: Tensor, threshold: float, weights: Tensor | None) -> None:
+def _check_arguments(sensor: Tensor, reference: Tensor, threshold: float, weights: Tensor | None) -> None:
     if reference is None:
         raise ValueError(
             "reference: the frame has none, and visibility is measured against it; use frames of SimulatedFrames, or a "
@@ -208,9 +240,9 @@ def _check(sensor: Tensor, reference: Tensor, threshold: float, weights: Tensor 
     check_cloud(reference, "reference")
     check_cloud(sensor, "sensor")
     if not threshold >= 0:
-        raise ValueError(f"threshold: a distance >= 0 in metres is needed; got {threshold}")
+        raise ValueError(f"threshold: a distance >= 0 in meters is needed; got {threshold}")
     check_weights(weights, len(reference), "reference_weights")
 
 
-# `torch.load` gives them back with weights_only=True, its default.
+# Classes on this list load with `torch.load(weights_only=True)`, the default.
 torch.serialization.add_safe_globals([BoxVisibility])
