@@ -172,10 +172,12 @@ class ObjectFormat(NamedTuple):
 
 
 def _is_xml(path: Path) -> bool:
+    """Test for a CommonRoad scenario by its suffix."""
     return path.suffix == ".xml"
 
 
 def _is_csv(path: Path) -> bool:
+    """Test for a table of boxes by its suffix."""
     return path.suffix == ".csv"
 
 

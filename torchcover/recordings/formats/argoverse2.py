@@ -42,6 +42,7 @@ SIZE_COLUMNS = ("length_m", "width_m", "height_m")
 CUBOID_COLUMNS = ("timestamp_ns", "track_uuid", "category", *SIZE_COLUMNS, *POSE_COLUMNS)
 # Each LiDAR has 32 lasers; `laser_number` counts through both of them.
 LASERS = {"up_lidar": (0, 32), "down_lidar": (32, 64)}
+# Tables of a log; the second kind of annotations also holds the ego vehicle.
 POSES_FILE = "city_SE3_egovehicle.feather"
 ANNOTATION_FILES = ("annotations.feather", "annotations_with_ego.feather")
 

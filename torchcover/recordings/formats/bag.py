@@ -25,6 +25,7 @@ from torchcover.recordings.recording import NO_RETURN_M
 
 # Storage of ROS 2 bags and the suffix of its files.
 SUFFIXES = {"sqlite3": ".db3", "mcap": ".mcap"}
+# Message type of transforms between frames.
 TF_TYPE = "tf2_msgs/msg/TFMessage"
 # Former names of message types.
 RENAMED_TYPES = {"tf/msg/tfMessage": TF_TYPE}

@@ -22,12 +22,14 @@ from torchcover.recordings.formats.folder import BOX_FOLDER, POSES_FILE, REFEREN
 from torchcover.recordings.formats.frame_files import check_same_names, find_frame_files, find_frame_rows
 from torchcover.recordings.recording import GROUND_CLEARANCE_M, RecordingBase, Scan, check_times
 
+# Blueprints of sensors that are read.
 LIDAR_TYPES = ("sensor.lidar.ray_cast", "sensor.lidar.ray_cast_semantic")
 DEPTH_TYPE = "sensor.camera.depth"
 # Columns of tables of poses and boxes.
 POSE_COLUMNS = ("x", "y", "z", "roll", "pitch", "yaw")
 EXTENT_COLUMNS = ("extent_x", "extent_y", "extent_z")
 VELOCITY_COLUMNS = ("velocity_x", "velocity_y")
+# Possible names of the list of sensors, the preferred one first.
 SENSORS_FILES = ("sensors.json", "sensors.yaml")
 
 
@@ -378,6 +380,7 @@ class Carla(RecordingBase):
         mount = self._mounts[sensor]
         if sensor in self._extrinsics:
             mount = self._vehicle_T_actor @ self._extrinsics[sensor][number]
+        # Depth images give points in the camera frame, which LOOKING_FORWARD rotates to x forward.
         if sensor in self._cameras:
             with report_bad_file(path, "a depth image"):
                 points = self._cameras[sensor].unproject(read_depth(path))

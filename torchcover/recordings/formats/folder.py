@@ -21,6 +21,7 @@ from torchcover.recordings.formats.frame_files import (
 )
 from torchcover.recordings.recording import RecordingBase, Scan, check_times
 
+# Files and folders of a recording next to its clouds.
 SETTINGS_FILE = "frames.yaml"
 POSES_FILE = "poses.csv"
 REFERENCE = "reference"

@@ -149,9 +149,11 @@ class KittiRaw(RecordingBase):
         return check_times(np.asarray((times - times[0]) / second), len(self.frame_names), str(stamps))
 
     def _read_oxts(self, index: int) -> NDArray[np.float64]:
+        """Read the GPS/IMU record of a frame."""
         return read_oxts(self._get_oxts_path(self.frame_names[index]))
 
     def _get_oxts_path(self, name: str) -> Path:
+        """Get the file of the GPS/IMU record of a frame, which may be missing."""
         return self.path / "oxts" / "data" / f"{name}.txt"
 
     @cached_property

@@ -30,6 +30,7 @@ from torchcover.recordings.recording import Scan, SensorCalibrations, check_time
 # The ego frame is on the ground below the rear axle; the center of a Renault Zoe is 1.385 m in front of it. The rig
 # `nuscenes` names the source.
 vehicle_T_ego = build_transform(np.eye(3), [-1.385, 0.0, 0.0])
+# Sensor channel of the only LiDAR.
 CHANNEL = "LIDAR_TOP"
 
 
@@ -244,6 +245,7 @@ def _find_class(category: str) -> str | None:
 
 
 def _get_file_name(row: Mapping[str, Any]) -> str:
+    """Get the file name of a row, which sorts cameras by channel."""
     return str(row["filename"])
 
 

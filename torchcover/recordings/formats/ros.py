@@ -34,6 +34,7 @@ from torchcover.recordings.formats.ros_poses import (
 from torchcover.recordings.isolated_readers import METADATA, find_ros1_files
 from torchcover.recordings.recording import NO_RETURN_M, RecordingBase, Scan, SensorCalibrations, check_times
 
+# Topics of this type are sensors.
 CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"
 # base_footprint is on the ground; robots have base_link a wheel radius above it.
 VEHICLE_FRAMES = ("base_footprint", "base_link")
@@ -303,6 +304,7 @@ class RosBag(RecordingBase):
         self._stamps_ns = {sensor: times_ns[has_pose] for sensor, times_ns in self._stamps_ns.items()}
 
     def _warn(self, message: str) -> None:
+        """Warn with the path of the bag before the message."""
         warnings.warn(f"{self.path}: {message}", stacklevel=5)
 
     def _get_topic(self, sensor: str) -> str:

@@ -22,6 +22,7 @@ from torchcover.recordings.formats.bag import TF_TYPE, Bag, get_stamp_ns
 Edge = tuple[str, str]  # parent frame, child frame
 # Entries of two equal 4x4 transforms differ by rounding only.
 MOUNT_TOLERANCE = 1e-3
+# Message types with poses of the vehicle, besides transforms.
 ODOMETRY_TYPE = "nav_msgs/msg/Odometry"
 POSE_TYPE = "geometry_msgs/msg/PoseStamped"
 # Messages are logged at most this long after they were stamped.

@@ -24,8 +24,10 @@ from torchcover.recordings.objects import (
 )
 from torchcover.recordings.recording import check_seconds
 
+# Columns of tables in seconds, meters and degrees.
 TRAJECTORY_COLUMNS = ("t", "x", "y", "z", "roll", "pitch", "yaw")
 BOX_COLUMNS = ("t", "x", "y", "z", "length", "width", "height", "yaw")
+# Older versions have one tag for all obstacles, newer ones have two.
 OBSTACLE_TAGS = ("obstacle", "dynamicObstacle", "staticObstacle")
 
 
@@ -257,6 +259,7 @@ def _parse_shape(obstacle: Element, name: str) -> tuple[tuple[float, float, floa
     turn_rad = 0.0
     if len(shapes) == 1 and shapes[0].find("orientation") is not None:
         turn_rad = _parse_number(shapes[0], "orientation", f"id {name}")
+    # A single rotated shape keeps its rotation, so that its box is tight.
     c, s = math.cos(turn_rad), math.sin(turn_rad)
     corners = np.concatenate([_parse_corners(shape, name) for shape in shapes]) @ np.array([[c, -s], [s, c]])
     low, high = corners.min(axis=0), corners.max(axis=0)
