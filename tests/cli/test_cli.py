@@ -228,7 +228,7 @@ def test_frames_that_are_skipped_leave_their_place_in_time(torchcover, recording
 def test_too_few_steps_for_errors_are_told_and_a_recording_has_no_reference_sensor(torchcover, recording, tmp_path):
     _, printed, _ = torchcover("evaluate", "--frames", recording, "--out", tmp_path / "out")
     assert "Not enough frames for an answer: 4 form 4 blocks of time, intervals need about 9" in printed
-    assert "In brackets" not in printed
+    assert "Brackets: 95" not in printed
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert (summary["reference"]["sensor"], summary["target_error"]) == ("recorded", None)
     assert (summary["blocks"], summary["frames_per_block"]) == (4, 1)
