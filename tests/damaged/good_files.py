@@ -235,7 +235,7 @@ def track_files(folder):
     driven = fcd(together(drive(until=2.0), drive("b", start=90.0, until=2.0))).encode()
     yield Kind("fcd.xml", driven, lambda path: read_floating_car_data(path, TimeWindow(0.0, 1.0)))
     yield Kind("town.rou.xml", ROUTES, read_vehicle_types)
-    yield Kind("road.xodr", XODR.encode(), lambda path: convert_opendrive(path, Path(folder), leave_out_links=False))
+    yield Kind("road.xodr", XODR.encode(), lambda path: convert_opendrive(path, Path(folder), omit_missing_links=False))
 
 
 def in_folder(path):

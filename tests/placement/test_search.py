@@ -440,7 +440,7 @@ def test_each_choice_is_tried_once_and_the_search_ends_when_all_were():
 def test_a_real_search_does_not_depend_on_the_number_of_workers(tmp_path):
     (tmp_path / "lot.yaml").write_text(
         "name: lot\nego: {shape: {type: box, size_m: [4, 2, 1.5]}}\n"
-        "traffic: {type: parking, duration_s: 1.0, time_step_s: 0.2, crossings: 0, parked_share: 0.3}\n"
+        "traffic: {type: parking, duration_s: 1.0, time_step_s: 0.2, crossings_per_aisle: 0, parked_share: 0.3}\n"
     )
     of = SearchSpace.model_validate(
         {

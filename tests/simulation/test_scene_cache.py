@@ -18,7 +18,7 @@ from torchcover.simulation.traffic.fleet import load_bodies
 from torchcover.simulation.world import Actor, Scene
 
 EGO = {"shape": {"type": "box", "size_m": [4, 2, 1.5]}}
-LOT = {"type": "parking", "duration_s": 1.0, "time_step_s": 0.2, "crossings": 0, "parked_share": 0.1}
+LOT = {"type": "parking", "duration_s": 1.0, "time_step_s": 0.2, "crossings_per_aisle": 0, "parked_share": 0.1}
 
 
 def lot(ego=EGO, **keys):

@@ -31,7 +31,7 @@ from torchcover.simulation import Simulator
 
 def fails(drive, message, error=ValueError):
     with pytest.raises(error, match=message) as caught:
-        drive.world()
+        drive.build_scene()
     assert "\n" not in str(caught.value)
 
 
@@ -66,7 +66,7 @@ def test_recordings_without_objects_over_time(tmp_path):
     boxes.write_text(boxes.read_text().replace(",car,", ",,"))
     fails(scenario(folder), rf"{folder}: an object of f1 has no id", BadFileError)
     (folder / "poses.csv").unlink()
-    fails(scenario(folder), rf"{folder}: its vehicle has no poses with times", BadFileError)
+    fails(scenario(folder), rf"{folder}: the vehicle has no poses with times", BadFileError)
 
 
 def test_an_ego_that_is_not_there(tmp_path, table):
@@ -126,7 +126,7 @@ def test_tables_of_boxes(table, old, new, message):
         ("<length>4.5</length>", "", "id 1: <rectangle> needs a number as its <length>; got None"),
         ("<x>1424.000000</x>", "<x>nan</x>", "id 1: .*NaN"),
         ("<time><exact>1</exact></time>", "<time><exact>0</exact></time>", "id 1: .*must ascend"),
-        ("<point><x>1424.000000</x><y>2200.000000</y></point>", "<circle/>", "id 1: a state without the point"),
+        ("<point><x>1424.000000</x><y>2200.000000</y></point>", "<circle/>", "id 1: a state needs a point"),
         ('timeStepSize="0.2"', 'timeStepSize="0"', "timeStepSize: a positive number is needed"),
         ("commonRoad ", "OpenSCENARIO ", "mismatched tag"),
         ("<commonRoad", '<!DOCTYPE a [<!ENTITY b "c">]><commonRoad', "without entities"),

@@ -75,7 +75,7 @@ def test_the_ground_is_where_it_was(made):
     recording, _, world = made
     ground, low_m = SceneGeometry(world).ground, np.array([[0.0, -3.0, 0.0], [30.0, -6.0, 0.0]])
     ground_m = low_m + UPHILL * low_m[:, :1] * np.array([0.0, 0.0, 1.0])
-    placed_m = ground_m - recording.world_T_vehicle(0)[:3, 3]
+    placed_m = ground_m - recording.get_world_T_vehicle(0)[:3, 3]
     np.testing.assert_allclose(
         ground.compute_heights_m(placed_m + np.array([0.0, 0.0, 1.0]), np.eye(4)), 1.0, atol=0.05
     )
@@ -83,8 +83,8 @@ def test_the_ground_is_where_it_was(made):
 
 def test_the_wall_stands_and_nothing_stands_where_anything_drives(made):
     recording, _, world = made
-    first_m = recording.world_T_vehicle(0)[:3, 3]
-    corners_m = world.static[1].vertices_m + first_m - world.ego.trajectory.positions_m[0]
+    first_m = recording.get_world_T_vehicle(0)[:3, 3]
+    corners_m = world.static_meshes[1].vertices_m + first_m - world.ego.trajectory.positions_m[0]
     assert (np.abs(corners_m[:, 1] - WALL_M) < 1.3).all()  # nothing else
     x, z = np.meshgrid(np.arange(-10.0, 10.0, 0.5), np.arange(0.8, 4.0, 0.5))
     wall_m = np.stack([x.ravel(), np.full(x.size, WALL_M), z.ravel()], axis=1)
@@ -98,7 +98,7 @@ def test_who_moves_is_on_its_track(made):
     (car,) = world.actors
     times_s = car.trajectory.times_s
     assert times_s[-1] - times_s[0] > SECONDS / 2
-    placed_m = car.trajectory.positions_m + recording.world_T_vehicle(0)[:3, 3]
+    placed_m = car.trajectory.positions_m + recording.get_world_T_vehicle(0)[:3, 3]
     np.testing.assert_allclose(placed_m[:, 1], 4.0, atol=0.5)
     off_m = np.abs(placed_m[:, 0] - 16.0 - CAR_MPS * times_s)
     assert np.median(off_m) < 0.4
@@ -108,9 +108,9 @@ def test_who_moves_is_on_its_track(made):
 
 def test_the_vehicle_drives_as_it_did(made):
     recording, _, world = made
-    assert world.steps == len(recording.names)
-    moved = recording.world_T_vehicle(7)[:3, 3] - recording.world_T_vehicle(0)[:3, 3]
-    np.testing.assert_allclose(world.ego.trajectory.at(0.7)[:3, 3], moved, atol=1e-6)
+    assert world.num_time_steps == len(recording.frame_names)
+    moved = recording.get_world_T_vehicle(7)[:3, 3] - recording.get_world_T_vehicle(0)[:3, 3]
+    np.testing.assert_allclose(world.ego.trajectory.interpolate(0.7)[:3, 3], moved, atol=1e-6)
 
 
 def test_fewer_frames_make_a_shorter_world(drive):

@@ -148,7 +148,7 @@ def heights_of(mesh, places_m):
 def off_ground_m(world, others, heights=hill_m):
     """How far the ground is from where each of some stood, at all times."""
     places_m = np.concatenate([poses(one, heights)[one.first : one.last + 1, :3, 3] for one in others])
-    return heights_of(world.static[0], places_m[:, :2]) - places_m[:, 2]
+    return heights_of(world.static_meshes[0], places_m[:, :2]) - places_m[:, 2]
 
 
 def test_the_ground_is_below_the_tracks_within_centimetres(written):
@@ -372,7 +372,7 @@ def test_what_was_not_recorded_is_drawn_if_asked_for_and_stands_where_nobody_was
     bare, drawn = scenario(path).build_scene(0), scenario(path, built_share=1.0).build_scene(0)
     assert len(bare.static_meshes) == 1
     assert len(drawn.static_meshes) == 3
-    assert len(scenario(path, built_share=0.0, roadside=0.0).build_scene(0).static_meshes) == 1
+    assert len(scenario(path, built_share=0.0, roadside_density=0.0).build_scene(0).static_meshes) == 1
     np.testing.assert_array_equal(bare.static_meshes[0].vertices_m, drawn.static_meshes[0].vertices_m)
     houses_m = drawn.static_meshes[1].vertices_m[:, :2]
     assert len(houses_m) > 100
@@ -387,7 +387,9 @@ def test_what_was_not_recorded_is_drawn_if_asked_for_and_stands_where_nobody_was
     assert drawn.static_meshes[1].vertices_m[:, 2].min() < bare.static_meshes[0].vertices_m[:, 2].max()
 
 
-@pytest.mark.parametrize("keys", [{"roadside": 2.0}, {"built_share": 1.0, "ground": "road.ply"}, {"built_share": 2.0}])
+@pytest.mark.parametrize(
+    "keys", [{"roadside_density": 2.0}, {"built_share": 1.0, "ground": "road.ply"}, {"built_share": 2.0}]
+)
 def test_what_is_drawn_beside_tracks_is_said_as_a_whole(keys, written):
     with pytest.raises(ValueError, match="built_share"):
         scenario(written / "argoverse2", **keys)

@@ -32,18 +32,18 @@ ROUTES = """<routes><vType id="car" length="5"/>{more}<vehicle id="{name}" type=
 
 
 def drawn(network="grid", **options):
-    return SumoTraffic(random={"network": network, **LITTLE, **options}, duration_s=2.0, time_step_s=0.5)
+    return SumoTraffic(random={"layout": network, **LITTLE, **options}, duration_s=2.0, time_step_s=0.5)
 
 
 def fingerprint(world):
-    parts = [mesh.vertices_m for mesh in world.static]
+    parts = [mesh.vertices_m for mesh in world.static_meshes]
     for actor in (world.ego, *world.objects):
         parts += [actor.trajectory.positions_m, actor.trajectory.angles_deg, actor.trajectory.times_s]
     return hashlib.sha256(b"".join(part.tobytes() for part in parts)).hexdigest()
 
 
 def test_a_seed_gives_one_world_in_every_process():
-    program = "from tests.simulation.sumo.test_drawn import *; print(fingerprint(drawn().world(7)))"
+    program = "from tests.simulation.sumo.test_drawn import *; print(fingerprint(drawn().build_scene(7)))"
     environment = {**os.environ, "PYTHONHASHSEED": "12345"}
     there = subprocess.run(
         [sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True, cwd=ROOT
@@ -138,10 +138,10 @@ def test_losses_of_open_drive_are_reported(old, new, told, tmp_path):
     assert XODR.count(old) == 1
     (tmp_path / "road.xodr").write_text(XODR.replace(old, new))
     with pytest.warns(UserWarning, match=f"OpenDRIVE: left out, .*{told}"):
-        convert_opendrive(tmp_path / "road.xodr", tmp_path, leave_out_links=False)
+        convert_opendrive(tmp_path / "road.xodr", tmp_path, omit_missing_links=False)
     (tmp_path / "road.xodr").write_text(XODR.replace('junction="-1"', 'junction="-1" rule="LHT"'))
     with pytest.raises(BadFileError, match=r"road 1: left-hand traffic .* netconvert --lefthand"):
-        convert_opendrive(tmp_path / "road.xodr", tmp_path, leave_out_links=False)
+        convert_opendrive(tmp_path / "road.xodr", tmp_path, omit_missing_links=False)
 
 
 MANY = " ".join(f"a{number}='1'" for number in range(1001))  # attributes, of which SUMO compares each with each
@@ -152,11 +152,11 @@ def test_projections_of_open_drive_name_no_files_and_attributes_are_few(tmp_path
     reference = "<geoReference><![CDATA[{}]]></geoReference></header>"
     (tmp_path / "road.xodr").write_text(XODR.replace("<road", f"<road {MANY}", 1))
     with pytest.raises(BadFileError, match="<road> has 1005 attributes; at most 1000 are read"):
-        convert_opendrive(tmp_path / "road.xodr", tmp_path, leave_out_links=False)
+        convert_opendrive(tmp_path / "road.xodr", tmp_path, omit_missing_links=False)
     for words, told in (("+proj=utm +geoidgrids=/a/pipe", "'.*/a/pipe' names a file"), ("+proj=utm +zone=32", None)):
         (tmp_path / "road.xodr").write_text(XODR.replace('"4"/>', f'"4">{reference.format(words)}', 1))
         with nullcontext() if told is None else pytest.raises(BadFileError, match=f"the projection {told}; remove"):
-            convert_opendrive(tmp_path / "road.xodr", tmp_path, leave_out_links=False)
+            convert_opendrive(tmp_path / "road.xodr", tmp_path, omit_missing_links=False)
 
 
 def test_links_of_open_drive_that_lead_nowhere_are_named_and_may_be_left_out(tmp_path):
@@ -169,10 +169,10 @@ def test_links_of_open_drive_that_lead_nowhere_are_named_and_may_be_left_out(tmp
     made = SumoTraffic(
         net=tmp_path / "road.xodr", routes=(tmp_path / "r.xml",), ego_id="me", begin_s=0.0, duration_s=2.0
     )
-    told = "road 1, predecessor road 7; junction 8, connection 0, connectingRoad .none.; `leave_out_links: true`"
+    told = "road 1, predecessor road 7; junction 8, connection 0, connectingRoad .none.; `omit_missing_links: true`"
     with pytest.raises(BadFileError, match=f"road.xodr: SUMO's netconvert fails: .*{told}"):
         made.build_scene(0)
-    assert made.model_copy(update={"leave_out_links": True}).build_scene(0).ego.trajectory.is_moving
+    assert made.model_copy(update={"omit_missing_links": True}).build_scene(0).ego.trajectory.is_moving
 
 
 @pytest.mark.parametrize(
@@ -213,7 +213,7 @@ def road(tmp_path_factory):
     """A network with one street, the edge -1."""
     folder = tmp_path_factory.mktemp("road")
     (folder / "road.xodr").write_text(XODR)
-    return simulating.convert_opendrive(folder / "road.xodr", folder, leave_out_links=False)
+    return simulating.convert_opendrive(folder / "road.xodr", folder, omit_missing_links=False)
 
 
 @pytest.mark.parametrize(
@@ -289,7 +289,7 @@ def test_a_program_writes_no_files_talks_without_end_and_may_run_out_of_memory(s
     program.parent.mkdir()
     program.write_text(f"#!/bin/sh\n{script.format(new=new)}")
     program.chmod(0o700)
-    monkeypatch.setattr(simulating, "home", lambda: tmp_path)
+    monkeypatch.setattr(simulating, "find_sumo_home", lambda: tmp_path)
     with pytest.raises(ValueError, match=message):
         list(simulating.stream_output("sumo"))
     assert new.read_text() == ""
@@ -321,8 +321,8 @@ def test_an_empty_town_is_a_world_a_hundred_times_as_much_is_refused_and_who_is_
     for key in LITTLE:
         with pytest.raises(ValueError, match=rf"random\.{key}\s+Input should be less than or equal to"):
             drawn(**{key: 1400.0})
-    monkeypatch.setattr(traffic, "possible", lambda bodies: bodies[:1])
-    bare = {"built_share": 0.0, "parked_share": 0.0, "roadside": 0.0}
+    monkeypatch.setattr(traffic, "drop_colliding_users", lambda bodies: bodies[:1])
+    bare = {"built_share": 0.0, "parked_share": 0.0, "roadside_density": 0.0}
     with pytest.warns(UserWarning, match=r"the simulation has \d of \d road users where another one is"):
         world = drawn(**dict.fromkeys(LITTLE, 0.0)).model_copy(update=bare).build_scene(0)
     assert not world.objects

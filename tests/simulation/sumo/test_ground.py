@@ -116,4 +116,4 @@ def test_a_bridge_has_a_deck_and_the_ground_goes_below(tmp_path):
 
 def test_only_what_is_near_the_way_is_there(tmp_path):
     near = vicinity(tmp_path, street(), street("far", y=400.0), street("beyond", y=270.0))
-    assert {lane.edge for lane in near.lanes} == {"east", "beyond"}
+    assert {lane.edge_id for lane in near.lanes} == {"east", "beyond"}

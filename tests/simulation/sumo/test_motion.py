@@ -114,7 +114,7 @@ def test_who_is_where_another_one_is_goes_and_of_two_the_one_that_meets_more():
 def test_who_is_on_a_bridge_meets_nobody_below_it():
     below, above = user(straight()), user(np.column_stack([np.full(51, 50.0), straight(x_m=-50.0)[:, 0]]), yaw_deg=90.0)
     lifted = above._replace(
-        track=above.track._replace(places_m=above.track.front_positions_m + np.array([0.0, 0.0, 6.0]))
+        track=above.track._replace(front_positions_m=above.track.front_positions_m + np.array([0.0, 0.0, 6.0]))
     )
     assert [len(drop_colliding_users(compute_motions([below, other], 10.0, ORIGIN))) for other in (above, lifted)] == [
         1,
@@ -152,7 +152,7 @@ def test_long_vehicles_swing_out_and_none_comes_over_a_kerb(corner):
 
 
 def semi_trailer(places_m):
-    return user(places_m, kind="truck")._replace(length_m=16.5, sizes_m=((6.65, 2.55), (13.6, 2.55)))
+    return user(places_m, kind="truck")._replace(length_m=16.5, part_sizes_m=((6.65, 2.55), (13.6, 2.55)))
 
 
 def test_a_trailer_follows_its_kingpin_and_both_parts_count(corner):
@@ -168,7 +168,9 @@ def test_a_trailer_follows_its_kingpin_and_both_parts_count(corner):
     # Only the trailer comes over the place where that one stands.
     where = len(rear) // 2
     inside_m = rear[where, :2] + (size_m[1] / 2 - 0.2) * np.array([-np.sin(rear[where, 2]), np.cos(rear[where, 2])])
-    alone = motion._replace(user=truck._replace(kind="van", sizes_m=truck.part_sizes_m[:1]), rear=None)
+    alone = motion._replace(
+        road_user=truck._replace(kind="van", part_sizes_m=truck.part_sizes_m[:1]), trailer_poses=None
+    )
     (rests,) = compute_motions([user(np.tile(inside_m, (101, 1)), on_foot=True, size_m=(0.3, 0.5))], 20.0, ORIGIN)
     (far,) = compute_motions([user(straight(0.1, 20.0, y_m=-50.0))], 20.0, ORIGIN)
     assert drop_colliding_users([far, motion]) == [far, motion]

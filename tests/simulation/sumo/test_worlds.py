@@ -39,7 +39,7 @@ def test_coordinates_of_utm_size_change_nothing(tmp_path):
         folder.mkdir()
         steps = together(drive(shift=shift), drive("b", y=3.0, start=70.0, shift=shift))
         worlds.append(made(folder, street(z=(0.0, 8.0), shift=shift), steps=steps, ego_id="ego").build_scene(3))
-    for one, other in zip(worlds[0].static, worlds[1].static, strict=True):
+    for one, other in zip(worlds[0].static_meshes, worlds[1].static_meshes, strict=True):
         np.testing.assert_allclose(one.vertices_m, other.vertices_m, atol=1e-6)
     for one, other in zip((worlds[0].ego, *worlds[0].actors), (worlds[1].ego, *worlds[1].actors), strict=True):
         np.testing.assert_allclose(one.trajectory.positions_m, other.trajectory.positions_m, atol=1e-6)
@@ -182,7 +182,7 @@ def test_open_country_has_no_houses(tmp_path):
     world = made(tmp_path, built_share=0.0, ego_id="ego").build_scene(0)
     assert len(world.static_meshes) == 3
     assert world.static_meshes[2].vertices_m[:, 2].max() < 12.0
-    assert len(made(tmp_path, built_share=0.0, roadside=0.0, ego_id="ego").build_scene(0).static_meshes) == 2
+    assert len(made(tmp_path, built_share=0.0, roadside_density=0.0, ego_id="ego").build_scene(0).static_meshes) == 2
 
 
 def test_cars_are_parked_in_bays_only(tmp_path):
@@ -235,8 +235,11 @@ def test_without_an_ego_there_is_no_world(options, message, tmp_path):
         ({"type": "sumo"}, "give a net and its routes, a net and its fcd, or random"),
         ({"type": "sumo", "net": "a.net.xml"}, "give a net and its routes"),
         ({"type": "sumo", "random": {}, "ego_id": "a"}, "random draws all traffic; leave out ego_id"),
-        ({"type": "sumo", "net": "a.net.xml", "random": {"lanes": 1}}, "random: lanes are for streets that are drawn"),
-        ({"type": "sumo", "random": {"network": "star"}}, "'rand', 'grid' or 'spider'"),
+        (
+            {"type": "sumo", "net": "a.net.xml", "random": {"max_lanes_per_direction": 1}},
+            "random: max_lanes_per_direction are for streets that are drawn",
+        ),
+        ({"type": "sumo", "random": {"layout": "star"}}, "'rand', 'grid' or 'spider'"),
         ({"type": "somo"}, "type: traffic is one of 'urban', 'highway', 'parking', 'sumo', 'tracks'; got 'somo'"),
         ({}, "type: traffic is one of"),
     ],

@@ -56,14 +56,16 @@ def test_a_circle_is_a_circle():
 def test_it_is_as_long_as_its_stations_and_heads_where_it_goes(street):
     # Gauss's rule is right where Simpson's, with a tenth of a knot, is.
     step = 1e-3
-    before, after = (street.poses(STATIONS_M + shift, 0.0) for shift in (-step, step))
+    before, after = (street.compute_poses(STATIONS_M + shift, 0.0) for shift in (-step, step))
     moved = (after - before)[:, :2] / (2 * step)
     np.testing.assert_allclose(np.linalg.norm(moved, axis=1), 1.0, atol=1e-8)
-    heading = street.headings(STATIONS_M)
+    heading = street.compute_headings_rad(STATIONS_M)
     np.testing.assert_allclose(moved, np.stack([np.cos(heading), np.sin(heading)], axis=1), atol=1e-6)
-    curvature = (street.headings(STATIONS_M + step) - street.headings(STATIONS_M - step)) / (2 * step)
-    np.testing.assert_allclose(curvature, street.curvatures(STATIONS_M), atol=1e-5)
-    assert np.allclose(street.poses(0.0, 0.0), 0.0, atol=1e-9)
+    curvature = (street.compute_headings_rad(STATIONS_M + step) - street.compute_headings_rad(STATIONS_M - step)) / (
+        2 * step
+    )
+    np.testing.assert_allclose(curvature, street.compute_curvatures_per_m(STATIONS_M), atol=1e-5)
+    assert np.allclose(street.compute_poses(0.0, 0.0), 0.0, atol=1e-9)
 
 
 @pytest.mark.parametrize("way", [1, -1])
@@ -80,7 +82,7 @@ def test_beside_it_one_goes_as_far_as_one_gets(street, left_m, way):
     np.testing.assert_allclose(
         line.convert_stations_to_distances_m(line.convert_distances_to_stations_m(places)), places, atol=0.02
     )
-    there = street.poses(line.convert_distances_to_stations_m(places), left_m)[:, :2]
+    there = street.compute_poses(line.convert_distances_to_stations_m(places), left_m)[:, :2]
     np.testing.assert_allclose(poses[:, :2], there, atol=0.02)
 
 
@@ -121,8 +123,8 @@ def test_territories_are_apart(street):
     owned = territory.is_inside(station, left)
     assert owned.any()
     assert not owned.all()
-    places = street.poses(station, left)[:, :2]
-    fine = street.poses(np.arange(-400.0, 1300.0, 0.5), 0.0)[:, :2]
+    places = street.compute_poses(station, left)[:, :2]
+    fine = street.compute_poses(np.arange(-400.0, 1300.0, 0.5), 0.0)[:, :2]
     nearest = np.array([np.linalg.norm(fine - place, axis=1).min() for place in places])
     assert (nearest[owned] > np.abs(left[owned]) - 1.5).all()
     assert (nearest[~owned] < np.abs(left[~owned])).all()
@@ -243,9 +245,9 @@ def test_beside_streets_there_is_pavement_and_between_pavements_no_bare_ground(s
 @pytest.mark.parametrize("kind", ["hilly", "motorway"])
 def test_what_is_built_in_the_hills_is_closed_and_stands_on_the_ground(kind, world):
     w = world(kind, 0)
-    for mesh in w.static[1:]:
+    for mesh in w.static_meshes[1:]:
         assert trimesh.Trimesh(mesh.vertices_m, mesh.faces, process=False).is_volume
-    ground = RayCaster(w.static[:1])
+    ground = RayCaster(w.static_meshes[:1])
 
     def height(places):
         starts = np.column_stack([places, np.full(len(places), 90.0)]).astype(np.float32)
@@ -254,7 +256,7 @@ def test_what_is_built_in_the_hills_is_closed_and_stands_on_the_ground(kind, wor
         assert (hits.body_indices >= 0).all()
         return 90.0 - hits.range_m
 
-    for actor in (w.ego, *w.actors, *w.parked):
+    for actor in (w.ego, *w.actors, *w.static_actors):
         positions = actor.trajectory.positions_m[::20]
         near = np.linalg.norm(positions[:, :2] - w.ego.trajectory.positions_m[0, :2], axis=1) < 200.0
         above = positions[near, 2] - height(positions[near, :2])
@@ -272,7 +274,7 @@ def test_what_is_built_in_the_hills_is_closed_and_stands_on_the_ground(kind, wor
 def test_a_city_without_bends_is_straight_and_nobody_comes_from_nowhere(world):
     w = world("straight", 0)
     assert np.ptp(w.ego.trajectory.positions_m[:, 1:]) == -w.ego.trajectory.positions_m[0, 1]
-    assert not any(actor.trajectory.transient for actor in w.actors)
+    assert not any(actor.trajectory.is_transient for actor in w.actors)
 
 
 def test_the_ego_turns_at_junctions(world):

@@ -92,34 +92,39 @@ def test_a_coarse_time_step_gives_the_same_run():
 
 def twin(lanes, agents, lights, times_s):
     """(T, N) places, worked out for one agent after the other in the words of the rules."""
-    place, speed = [agent.place_m for agent in agents], LaneSimulation(lanes, agents, lights).speeds_mps.tolist()
+    place, speed = (
+        [agent.lane_position_m for agent in agents],
+        LaneSimulation(lanes, agents, lights).speeds_mps.tolist(),
+    )
     found = [list(place)]
     for time, after in pairwise(times_s):
-        left, gates, ahead = lights.green_left_s(time), [], []
+        left, gates, ahead = lights.compute_remaining_green_s(time), [], []
         for n, agent in enumerate(agents):
             rear = place[n] - agent.length_m / 2
-            gates.append(next((gate for gate in lanes[agent.lane].gates if gate.exit_m >= rear), None))
-            lap = lanes[agent.lane].line.length_m if lanes[agent.lane].line.closed else np.inf
+            gates.append(next((gate for gate in lanes[agent.lane_index].passages if gate.exit_m >= rear), None))
+            lap = (
+                lanes[agent.lane_index].centerline.length_m if lanes[agent.lane_index].centerline.is_closed else np.inf
+            )
             others = [(m, place[m] + (lap if place[m] < place[n] else 0.0)) for m in range(len(agents)) if m != n]
-            others = [(m, at) for m, at in others if agents[m].lane == agent.lane]
+            others = [(m, at) for m, at in others if agents[m].lane_index == agent.lane_index]
             ahead.append(min(others, key=lambda other: other[1], default=(n, np.inf)))
 
         to_line = [
-            np.inf if gate is None else gate.enter_m - at - agent.length_m / 2
+            np.inf if gate is None else gate.stop_line_m - at - agent.length_m / 2
             for gate, at, agent in zip(gates, place, agents, strict=True)
         ]
         committed = [v**2 > 2 * BRAKING_FOR_A_LIGHT_MPS2 * way for v, way in zip(speed, to_line, strict=True)]
-        inside = {(gates[n].junction, gates[n].phase) for n in range(len(agents)) if committed[n]}
+        inside = {(gates[n].junction_index, gates[n].phase) for n in range(len(agents)) if committed[n]}
         moved = []
         for n, agent in enumerate(agents):
             (m, at), gate, driver = ahead[n], gates[n], agent.driver
             gap, line = at - place[n] - (agent.length_m + agents[m].length_m) / 2, np.inf
             if gate is not None and not committed[n]:
                 back = at - agents[m].length_m / 2
-                jam = gate.enter_m < back < gate.exit_m + agent.length_m + driver.standstill_gap_m
+                jam = gate.stop_line_m < back < gate.exit_m + agent.length_m + driver.standstill_gap_m
                 jam = jam and speed[m] < QUEUE_SPEED * driver.desired_speed_mps
-                free = left[gate.junction, gate.phase] > gate.green_needed_s
-                if jam or not free or (gate.junction, 1 - gate.phase) in inside:
+                free = left[gate.junction_index, gate.phase] > gate.min_green_s
+                if jam or not free or (gate.junction_index, 1 - gate.phase) in inside:
                     line = to_line[n]
             stop = line + driver.standstill_gap_m - STOP_BEFORE_LINE_M
             closing = speed[n] - speed[m] if np.isfinite(at) else 0.0

@@ -26,10 +26,10 @@ def slope(places_m):
     return 0.05 * places_m[:, 0] + 0.02 * places_m[:, 1]
 
 
-def stood(times, zone="built", heights_m=slope, pavements=(), seed=0):
+def stood(times, zone="built", compute_heights_m=slope, sidewalk_areas=(), seed=0):
     sides = [StreetSide("kerb", shifted(3.3)), StreetSide(zone, shifted(5.3))]
     return place_scenery(
-        sides, [STREET], [STREET.buffer(1.9)], pavements, heights_m, times, np.random.default_rng(seed)
+        sides, [STREET], [STREET.buffer(1.9)], sidewalk_areas, compute_heights_m, times, np.random.default_rng(seed)
     )
 
 
@@ -97,7 +97,9 @@ def test_lines_may_be_short_and_their_corners_coincide():
 
 
 def test_what_stands_on_pavement_is_a_kerb_higher_and_nothing_stands_across_its_edge():
-    flat = stood(1.0, heights_m=lambda places_m: np.zeros(len(places_m)), pavements=[shapely.box(-50, -80, 60, 40)])
+    flat = stood(
+        1.0, compute_heights_m=lambda places_m: np.zeros(len(places_m)), sidewalk_areas=[shapely.box(-50, -80, 60, 40)]
+    )
     for solid in solids((*flat[0], *flat[1])):
         x, foot_m = solid.vertices[:, 0], solid.vertices[:, 2].min()
         if foot_m < 0.5:

@@ -69,7 +69,7 @@ class Movers:
             own = actor.trajectory
             place = np.minimum(np.searchsorted(own.times_s, times_s - 1e-6), len(own.times_s) - 1)
             there = np.isclose(own.times_s[place], times_s, rtol=0.0, atol=1e-6)
-            assert own.transient or there.all()
+            assert own.is_transient or there.all()
             self.poses[there, k, :3] = own.positions_m[place[there]]
             self.poses[there, k, 3] = np.deg2rad(own.angles_deg[place[there], 0])
         self.lower = np.stack([actor.mesh.vertices_m.min(axis=0) for actor in actors])
@@ -116,8 +116,8 @@ def among(solids):
 
 def at_rest(world, bends):
     """All that stands on the ground and never moves; the blocks of streets that bend apart."""
-    parked = [actor.mesh.moved(actor.trajectory.at(0.0)) for actor in world.parked]
-    return Solids.of_static([*world.static[1 + bends :], *parked], world.static[1:2] if bends else ())
+    parked = [actor.mesh.transform(actor.trajectory.interpolate(0.0)) for actor in world.static_actors]
+    return Solids.of_static([*world.static_meshes[1 + bends :], *parked], world.static_meshes[1:2] if bends else ())
 
 
 def test_the_checker_finds_what_overlaps_and_only_that():

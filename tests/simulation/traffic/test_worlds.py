@@ -18,7 +18,7 @@ def leader_distance(world):
     yaw = np.deg2rad(ego.angles_deg[:, 0])
     nearest = np.full(len(yaw), np.inf)
     for actor in world.actors:
-        x, y, _ = (actor.trajectory.positions_at(ego.times_s) - ego.positions_m).T
+        x, y, _ = (actor.trajectory.interpolate_positions_m(ego.times_s) - ego.positions_m).T
         ahead, left = np.cos(yaw) * x + np.sin(yaw) * y, np.cos(yaw) * y - np.sin(yaw) * x
         on_way = (ahead > 0) & (np.abs(left) < 1.5) & (actor.category != "pedestrian")
         nearest = np.where(on_way, np.minimum(nearest, ahead), nearest)
@@ -33,7 +33,7 @@ def speeds(actor):
 @pytest.mark.parametrize("kind", WORLDS)
 def test_the_same_seed_gives_the_same_world_and_another_seed_another(kind, bodies):
     model = {"urban": UrbanTraffic, "highway": HighwayTraffic, "parking": ParkingTraffic}.get(kind, UrbanTraffic)
-    options = {"lanes": 2} if kind == "narrow" else {}
+    options = {"num_lanes": 2} if kind == "narrow" else {}
     first, again = (model(duration_s=3.0, **options).build_scene(seed, bodies=bodies) for seed in (5, 5))
     other = model(duration_s=3.0, **options).build_scene(6, bodies=bodies)
     for one, two in zip(first.static_meshes, again.static_meshes, strict=True):
@@ -54,12 +54,12 @@ def test_a_world_is_complete(kind, world):
     assert len({id(actor.mesh) for actor in w.actors}) == len({actor.name.split()[0] for actor in w.actors})
     for actor in [w.ego, *w.actors]:
         # On a cross street one may come from beyond its end, or go there.
-        assert actor.trajectory.transient or actor.trajectory.times_s[0] == 0.0
-        assert actor.trajectory.transient or actor.trajectory.times_s[-1] == pytest.approx(w.duration_s)
+        assert actor.trajectory.is_transient or actor.trajectory.times_s[0] == 0.0
+        assert actor.trajectory.is_transient or actor.trajectory.times_s[-1] == pytest.approx(w.duration_s)
         np.testing.assert_allclose(np.diff(actor.trajectory.times_s), w.time_step_s)
         # Nobody jumps, either.
         assert speeds(actor).max() < 40.0
-    assert sum(len(mesh.faces) for mesh in w.static) < 90_000
+    assert sum(len(mesh.faces) for mesh in w.static_meshes) < 90_000
     assert {actor.category for actor in w.actors} >= {"car"}
 
 
@@ -80,10 +80,10 @@ def test_the_ego_stays_on_the_road_and_tilts_a_little(kind, world):
 
 @pytest.mark.parametrize(("kind", "known"), [("straight", 4), ("winding", 4), ("parking", 3)])
 def test_what_is_known_of_faces_is_what_would_be_found(kind, known, world):
-    static = [mesh for mesh in world(kind, 0).static if mesh.outward is not None]
+    static = [mesh for mesh in world(kind, 0).static_meshes if mesh.is_outward is not None]
     assert len(static) == known  # the ground, pavements, houses, and what is smaller
     for mesh in static:
-        np.testing.assert_array_equal(mesh.outward, find_outward_faces(mesh._replace(outward=None)))
+        np.testing.assert_array_equal(mesh.is_outward, find_outward_faces(mesh._replace(is_outward=None)))
 
 
 @pytest.mark.parametrize("kind", [*WORLDS, "hilly", "motorway"])
@@ -91,14 +91,14 @@ def test_rays_always_hit_the_ground(kind, world):
     w = world(kind, 0)
     generator = np.random.default_rng(0)
     for time_s in (0.0, w.duration_s / 2, w.duration_s):
-        pose = w.ego.trajectory.at(time_s)
+        pose = w.ego.trajectory.interpolate(time_s)
         yaw = np.arctan2(pose[1, 0], pose[0, 0])
         ahead, left = generator.uniform(-60.0, 160.0, 50_000), generator.uniform(-40.0, 40.0, 50_000)
         offset = np.stack([np.cos(yaw) * ahead - np.sin(yaw) * left, np.sin(yaw) * ahead + np.cos(yaw) * left])
         origin = np.array([0.0, 0.0, 100.0])
         to_ground = np.concatenate([offset, np.full((1, 50_000), -100.0)])
         directions = (to_ground / np.linalg.norm(to_ground, axis=0)).astype(np.float32)
-        static = [Mesh(mesh.vertices_m - pose[:3, 3], mesh.faces) for mesh in w.static]
+        static = [Mesh(mesh.vertices_m - pose[:3, 3], mesh.faces) for mesh in w.static_meshes]
         limit = np.full(50_000, 1000.0, dtype=np.float32)
         hits = RayCaster(static).cast(origin, directions, limit)
         assert (hits.body_indices >= 0).all()
@@ -126,7 +126,7 @@ def test_nobody_floats_and_nobody_sinks(kind, world):
 
 def test_the_city_drives_on_the_right_and_walks_on_pavements(world):
     w = world("straight", 0)
-    kerb = float(np.abs(w.static[1].vertices_m[:, 1]).min())
+    kerb = float(np.abs(w.static_meshes[1].vertices_m[:, 1]).min())
     middles = junction_middles(w)
     for actor in w.actors:
         x, y, z = actor.trajectory.positions_m.T
@@ -146,7 +146,7 @@ def test_the_city_drives_on_the_right_and_walks_on_pavements(world):
 
 def junction_middles(world):
     """x of the gaps between blocks, from the blocks' own corners."""
-    edges = np.unique(np.round(world.static[1].vertices_m[:, 0], 6))
+    edges = np.unique(np.round(world.static_meshes[1].vertices_m[:, 0], 6))
     return (edges[1:-1:2] + edges[2::2]) / 2
 
 
@@ -203,7 +203,7 @@ def test_people_cross_the_aisles_of_the_lot_and_cars_are_slow(world):
 def test_a_lot_is_surrounded_by_what_stands_beside_streets_and_that_keeps_off_it(bodies):
     full, bare = (
         ParkingTraffic(duration_s=1.0, **keys).build_scene(0, bodies=bodies)
-        for keys in ({}, {"built_share": 0, "roadside": 0})
+        for keys in ({}, {"built_share": 0, "roadside_density": 0})
     )
     *same, houses, others = full.static_meshes
     assert len(bare.static_meshes) == len(same)
@@ -223,20 +223,20 @@ def test_a_lot_is_surrounded_by_what_stands_beside_streets_and_that_keeps_off_it
         (UrbanTraffic, {"time_step_s": 0.5, "duration_s": 0.2}),
         (HighwayTraffic, {"traffic_per_km": 0, "ego_lane": 1}),
         (HighwayTraffic, {"traffic_per_km": 200, "ego_lane": 3, "time_step_s": 1.5}),
-        (ParkingTraffic, {"cars": 0, "crossings": 0, "parked_share": 0}),
-        (ParkingTraffic, {"cars": 6, "crossings": 8, "parked_share": 1}),
+        (ParkingTraffic, {"num_moving_cars": 0, "crossings_per_aisle": 0, "parked_share": 0}),
+        (ParkingTraffic, {"num_moving_cars": 6, "crossings_per_aisle": 8, "parked_share": 1}),
     ],
 )
 def test_extreme_parameters_still_make_a_world(model, options, bodies):
-    w = model(**{"duration_s": 4.0, **options}).world(0, bodies=bodies)
-    assert w.static
-    assert w.ego.trajectory.moves
+    w = model(**{"duration_s": 4.0, **options}).build_scene(0, bodies=bodies)
+    assert w.static_meshes
+    assert w.ego.trajectory.is_moving
 
 
 @pytest.mark.parametrize(
     ("model", "options"),
     [
-        (UrbanTraffic, {"lanes": 3}),
+        (UrbanTraffic, {"num_lanes": 3}),
         (UrbanTraffic, {"parked_share": 1.5}),
         (UrbanTraffic, {"cross_traffic_share": 1.5}),
         (UrbanTraffic, {"traffic_per_km": -1}),

@@ -185,9 +185,9 @@ def _keep_off(
         for number in met:
             pushed = (of == number) & (push_m != 0.0)
             wanted_m = push_m[pushed] + np.copysign(ROOM_M, push_m[pushed])
-            along_m, lag_m = _along_m(ways_m[number]), users[number].lag_m
+            along_m, lag_m = _along_m(ways_m[number]), users[number].trailing_distance_m
             middle_m = along_m[when[pushed]] - np.where(rear[pushed], lag_m, 0.0)
-            away = np.abs(along_m[:, None] - middle_m) / (SWING_M + SWING_LENGTHS * users[number].sizes_m[0][0])
+            away = np.abs(along_m[:, None] - middle_m) / (SWING_M + SWING_LENGTHS * users[number].part_sizes_m[0][0])
             bumps_m = wanted_m * np.where(away < 1, (1 + np.cos(np.pi * away)) / 2, 0.0)
             aside_m[number] += bumps_m.max(axis=1).clip(min=0.0) + bumps_m.min(axis=1).clip(max=0.0)
             moved_m[number] = ways_m[number] + aside_m[number][:, None] * left[number]

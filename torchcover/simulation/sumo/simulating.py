@@ -290,7 +290,7 @@ def convert_opendrive(path: Path, folder: Path, *, omit_missing_links: bool) -> 
             f"; and {len(lost) - SHOWN} more" * (len(lost) > SHOWN)
         )
         raise ValueError(
-            f"{error}; links lead to what is not there: {told}; `leave_out_links: true` goes on without"
+            f"{error}; links lead to what is not there: {told}; `omit_missing_links: true` goes on without"
         ) from error
     network.write_bytes(written[: written.rindex(b">") + 1])  # "Success." follows
     converted = parse_xml(network)

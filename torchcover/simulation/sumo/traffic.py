@@ -99,7 +99,8 @@ class SumoTraffic(ProceduralTraffic):
             if given:
                 raise ValueError(f"random draws all traffic; leave out {', '.join(given)}, or random")
             of_streets = sorted(
-                {"network", "lanes", "speed_mps", "bend", "hill_height_std_m"} & self.random.model_fields_set
+                {"layout", "max_lanes_per_direction", "speed_limit_mps", "max_bend_ratio", "hill_height_std_m"}
+                & self.random.model_fields_set
             )
             if self.net is not None and of_streets:
                 raise ValueError(f"random: {', '.join(of_streets)} are for streets that are drawn; there is a net")
