@@ -1,4 +1,4 @@
-"""Recordings in memory, of a world that is known exactly."""
+"""Recordings in memory, of a scene that is known exactly."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,9 +15,9 @@ CAR_SIZE_M = (4.0, 2.0, 1.5)
 
 @dataclass
 class Drive:
-    """A straight drive past a wall, behind a car that is faster. Points are those of the wall and of the car's sides.
+    """Straight drive past a wall, behind a faster car. Points lie on the wall and on the rear of the car.
 
-    Sensor `left` sees the wall where x is negative as seen from the vehicle, `right` all of it and the car.
+    Sensor `left` observes the wall at negative x of the vehicle frame, `right` the whole wall and the car.
     """
 
     steps: int = 5

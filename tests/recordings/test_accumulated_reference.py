@@ -1,4 +1,4 @@
-"""A reference made of the recording itself: what moves, what stands, and whose points they are."""
+"""Accumulated references: static surfaces, moving objects, and points that are excluded."""
 
 import pickle
 
@@ -19,11 +19,11 @@ def distances_m(points_m, to_m):
     return torch.cdist(torch.as_tensor(points_m).double(), torch.as_tensor(to_m).double()).min(dim=1).values
 
 
-def standing(drive, index):
+def transform_wall(drive, index):
     return transform_points(invert(drive.get_world_T_vehicle(index)), drive.wall_m)
 
 
-def moving(drive, index):
+def transform_car(drive, index):
     return transform_points(invert(drive.get_world_T_vehicle(index)) @ drive.world_T_car(index), drive.back_m)
 
 
@@ -33,14 +33,14 @@ def test_points_lie_on_their_surfaces_at_the_frame(origin_m, index):
     drive = Drive(origin_m=origin_m)
     frames = RecordedFrames(drive, reference=AccumulatedReference(10.0, voxel_m=0.05))
     reference = frames[index].reference
-    wall_m, car_m = standing(drive, index), moving(drive, index)
+    wall_m, car_m = transform_wall(drive, index), transform_car(drive, index)
     assert len(reference) == len(wall_m) + len(car_m)  # each once, however often it was seen
     assert distances_m(reference, np.concatenate([wall_m, car_m])).max() < 1e-4
     assert distances_m(car_m, reference).max() < 1e-4
 
 
 class TightlyDrawn(Drive):
-    """The boxes end 8 cm before the surfaces."""
+    """Drive whose boxes end 8 cm before the surfaces."""
 
     def read_boxes(self, index):
         rows = super().read_boxes(index).rows
@@ -51,11 +51,11 @@ class TightlyDrawn(Drive):
 def test_points_beside_a_box_move_with_it():
     drive = TightlyDrawn()
     reference = RecordedFrames(drive, reference=AccumulatedReference(10.0, voxel_m=0.05))[2].reference
-    assert distances_m(reference, np.concatenate([standing(drive, 2), moving(drive, 2)])).max() < 1e-4
+    assert distances_m(reference, np.concatenate([transform_wall(drive, 2), transform_car(drive, 2)])).max() < 1e-4
 
 
 class Parked(Drive):
-    """A part of the wall is labelled, too."""
+    """Drive in which a part of the wall is labeled too."""
 
     def read_boxes(self, index):
         moving, size_m = super().read_boxes(index), (6.0, 1.0, 3.2)
@@ -76,7 +76,7 @@ def test_static_boxes_change_nothing():
 
 
 class OnARoad(Drive):
-    """Nothing but a flat road."""
+    """Drive on a flat road without objects."""
 
     def __post_init__(self):
         super().__post_init__()
@@ -93,7 +93,7 @@ def test_ground_tolerance_grows_with_distance():
 
 
 class Slim(Drive):
-    """What moves is no wider than somebody on foot, and is hit three times."""
+    """Drive whose moving object has the size of a pedestrian and three points."""
 
     def __post_init__(self):
         super().__post_init__()
@@ -108,9 +108,11 @@ class Slim(Drive):
 def test_sides_of_a_box_limit_its_area():
     drive = Slim()
     frame = RecordedFrames(drive, reference=AccumulatedReference(10.0, voxel_m=0.05))[2]
-    own = distances_m(frame.reference, moving(drive, 2)) < 1e-3
+    own = distances_m(frame.reference, transform_car(drive, 2)) < 1e-3
     assert int(own.sum()) == 3
-    assert 0.5 < float(frame.reference_weights[own].sum()) <= 1.1 * 1.5 + 0.5 * 0.6  # by how many places see it
+    assert (
+        0.5 < float(frame.reference_weights[own].sum()) <= 1.1 * 1.5 + 0.5 * 0.6
+    )  # depends on how many viewpoints see it
 
 
 def test_unnamed_objects_are_excluded_and_counted():
@@ -123,7 +125,7 @@ def test_unnamed_objects_are_excluded_and_counted():
 def test_evaluated_sensors_are_excluded_at_the_frame():
     drive = Drive()
     alone = RecordedFrames(drive, rigs={"left": ("left",)}, reference=AccumulatedReference(0.0, voxel_m=0.05))
-    both = len(standing(drive, 1)) + len(moving(drive, 1))
+    both = len(transform_wall(drive, 1)) + len(transform_car(drive, 1))
     assert len(alone[1].reference) == both  # of the right one
     assert alone.reference_record["evaluated_sensors"] == []
     later = RecordedFrames(drive, rigs={"left": ("left",)}, reference=AccumulatedReference(1.0))
@@ -209,13 +211,13 @@ def test_a_pose_that_jumps_ends_the_window():
 def test_a_drive_of_one_or_two_sweeps(steps):
     drive = Drive(steps=steps, labelled=False)
     frames = RecordedFrames(drive, rigs={"left": ("left",)}, reference=AccumulatedReference(2.0, min_motion_m=1.0))
-    wall_m = np.concatenate([standing(drive, 0), moving(drive, 0)])
+    wall_m = np.concatenate([transform_wall(drive, 0), transform_car(drive, 0)])
     assert distances_m(frames[0].reference, wall_m).max() < 0.3  # one sweep alone tells no velocity
-    assert distances_m(standing(drive, 0), frames[0].reference).max() < 0.1
+    assert distances_m(transform_wall(drive, 0), frames[0].reference).max() < 0.1
 
 
 class Standing(Drive):
-    """The vehicle stands all the time."""
+    """Drive with a stationary vehicle."""
 
     def get_world_T_vehicle(self, index):
         return super().get_world_T_vehicle(0)
@@ -224,9 +226,9 @@ class Standing(Drive):
 def test_moving_objects_are_found_by_stationary_vehicles():
     drive = Standing(steps=12, labelled=False)
     frame = RecordedFrames(drive, reference=AccumulatedReference(10.0, voxel_m=0.05, min_motion_m=0.0))[6]
-    here_m = np.concatenate([standing(drive, 6), moving(drive, 6)])
+    here_m = np.concatenate([transform_wall(drive, 6), transform_car(drive, 6)])
     assert distances_m(frame.reference, here_m).max() < 0.5
-    assert distances_m(standing(drive, 6), frame.reference).max() < 1e-3
+    assert distances_m(transform_wall(drive, 6), frame.reference).max() < 1e-3
 
 
 def test_memory_does_not_grow_with_the_drive():

@@ -1,4 +1,4 @@
-"""Each check reports its fault, and none reports a recording without faults."""
+"""Each check reports its error, and none reports a valid recording."""
 
 import re
 import warnings
@@ -22,9 +22,9 @@ SIZE_M = (4.0, 1.8, 1.5)
 
 @dataclass
 class Street:
-    """A LiDAR above a street: ground with a slope and noise, walls, cars on its right, in the frame of the sensor.
+    """LiDAR above a street: ground with a slope and noise, walls, cars on its right, in the frame of the sensor.
 
-    `reference` has its own draw of the same surfaces. The rest are mistakes.
+    `reference` samples the same surfaces independently. The fields describe errors.
     """
 
     mount: np.ndarray = None
@@ -87,18 +87,20 @@ class Street:
         return Boxes.from_rows(torch.column_stack([x, y, z, size_m, torch.zeros(len(x))]))
 
 
-def doubts(street, **options):
+def find_warnings(street, **options):
     return RecordedFrames(street, **options).check(None)
 
 
 def test_valid_recordings_have_no_warnings():
-    assert doubts(Street()) == []
-    assert doubts(Street(), reference=AccumulatedReference(1.0)) == []
-    assert doubts(Street(slope=(0.12, 0.0))) == []  # a hill
-    assert doubts(Street(steps=1)) == []
-    assert doubts(Street(both_sides=True)) == doubts(Street(both_sides=True, flipped=True)) == []  # none can tell
-    assert doubts(Street(same=True, halved=True)) == []  # half of the lasers against all
-    assert doubts(Street(turned_deg=180.0)) == []  # it reverses
+    assert find_warnings(Street()) == []
+    assert find_warnings(Street(), reference=AccumulatedReference(1.0)) == []
+    assert find_warnings(Street(slope=(0.12, 0.0))) == []  # a hill
+    assert find_warnings(Street(steps=1)) == []
+    assert (
+        find_warnings(Street(both_sides=True)) == find_warnings(Street(both_sides=True, flipped=True)) == []
+    )  # none can tell
+    assert find_warnings(Street(same=True, halved=True)) == []  # half of the lasers against all
+    assert find_warnings(Street(turned_deg=180.0)) == []  # it reverses
     for drive in (
         Drive(),
         Drive(steps=8),
@@ -106,7 +108,7 @@ def test_valid_recordings_have_no_warnings():
         Drive(labelled=False),
         Drive(origin_m=(5e5, 5e6, 100.0)),
     ):
-        assert doubts(drive, reference=AccumulatedReference(0.8)) == []
+        assert find_warnings(drive, reference=AccumulatedReference(0.8)) == []
 
 
 @pytest.mark.parametrize(
@@ -125,24 +127,27 @@ def test_valid_recordings_have_no_warnings():
     ],
 )
 def test_each_error_is_reported(mistake, says):
-    found = doubts(Street(**mistake))
+    found = find_warnings(Street(**mistake))
     assert found
-    for doubt in found:  # and nothing else is
-        assert doubt.startswith("street: ")
-        assert re.search(says, doubt)
+    for message in found:  # and there is no other one
+        assert message.startswith("street: ")
+        assert re.search(says, message)
 
 
 def test_windows_with_one_frame_are_reported():
-    (doubt,) = doubts(Street(step_s=100.0), reference=AccumulatedReference(2.0))
-    assert "frames are 100 s apart, and a window of 2 s" in doubt
+    (message,) = find_warnings(Street(step_s=100.0), reference=AccumulatedReference(2.0))
+    assert "frames are 100 s apart, and a window of 2 s" in message
 
 
 @pytest.mark.parametrize(("steps", "lasts"), [(1, "0 s, 1 frames"), (2, "0.1 s, 2 frames")])
 def test_drives_shorter_than_the_window_are_reported(steps, lasts):
-    (doubt,) = doubts(Drive(steps=steps), reference=AccumulatedReference(2.0))
-    assert f"it lasts {lasts}, and its reference is accumulated over 2 s" in doubt
+    (message,) = find_warnings(Drive(steps=steps), reference=AccumulatedReference(2.0))
+    assert f"it lasts {lasts}, and its reference is accumulated over 2 s" in message
     assert (
-        doubts(Drive(steps=steps), reference=AccumulatedReference(0.0, sensors=("left",)), rigs={"b": ("right",)}) == []
+        find_warnings(
+            Drive(steps=steps), reference=AccumulatedReference(0.0, sensors=("left",)), rigs={"b": ("right",)}
+        )
+        == []
     )
 
 
@@ -151,8 +156,8 @@ def test_empty_clouds_are_reported():
     scan = street.read_scan
     off = Scan(np.empty((0, 3)), MOUNT, "off")
     street.read_scan = lambda sensor, index: off if sensor == "lidar" and index >= 3 else scan(sensor, index)
-    (doubt,) = doubts(street)
-    assert "lidar has no point in 2 of 5 frames" in doubt
+    (message,) = find_warnings(street)
+    assert "lidar has no point in 2 of 5 frames" in message
 
 
 def test_ground_is_connected_below_the_vehicle():
@@ -174,9 +179,9 @@ def test_unreadable_frames_are_skipped():
     street = Street(mount=np.eye(4))
     scan = street.read_scan
     street.read_scan = lambda sensor, index: scan(sensor, index) if index == 5 else Path("gone").read_bytes()
-    assert len(doubts(street)) == 1
+    assert len(find_warnings(street)) == 1
     street.read_scan = lambda sensor, index: Path("gone").read_bytes()
-    assert doubts(street) == []
+    assert find_warnings(street) == []
 
 
 def test_evaluation_warns_before_it_begins():
@@ -187,7 +192,7 @@ def test_evaluation_warns_before_it_begins():
 
 
 class Striped(Drive):
-    """A sensor that sees stripes of a wall, 3 m of each 6 m; the vehicle stands for `standing` instants, then moves."""
+    """Sensor that observes stripes of a wall, 3 m of each 6 m; stationary for `standing` frames, then moving."""
 
     standing = 0
 
@@ -205,7 +210,7 @@ class Striped(Drive):
         return replace(scan, points_m=scan.points_m[points_m[:, 0] % 6.0 < 3.0])
 
     def share_near_stripes(self, index):
-        """The share of the wall 0 to 20 m ahead whose middle is within 0.4 m of a point of the scan."""
+        """Compute the share of the wall 0 to 20 m ahead within 0.4 m of a point of the scan."""
         wall_m = transform_points(invert(self.get_world_T_vehicle(index)), self.wall_m)
         wall_m = wall_m[(wall_m[:, 0] >= 0) & (wall_m[:, 0] < 20)]
         seen = self.read_scan("right", index)
@@ -219,25 +224,29 @@ def test_stationary_vehicles_have_no_own_reference():
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             result = torchcover.evaluate(frames=frames, cell_m=2.0)
-        told = [str(warning.message) for warning in caught if "the vehicle moves less" in str(warning.message)]
-        return result.coverage.scalars()["detection_0.4m/20m/obstacle"], result.run.counts["reference_stationary"], told
+        messages = [str(warning.message) for warning in caught if "the vehicle moves less" in str(warning.message)]
+        return (
+            result.coverage.scalars()["detection_0.4m/20m/obstacle"],
+            result.run.counts["reference_stationary"],
+            messages,
+        )
 
     drive = Striped(steps=30)
     right = np.mean([drive.share_near_stripes(index) for index in range(30)])
-    moving, standing, told = measure(drive)
+    moving, standing, messages = measure(drive)
     assert abs(moving - right) < 0.03 < 1 - right
-    assert (standing, told) == (0, [])
+    assert (standing, messages) == (0, [])
 
     drive.standing = 30
-    value, standing, told = measure(drive)
+    value, standing, messages = measure(drive)
     assert np.isnan(value)
     assert standing == 30
-    assert "less than 2 m within 2 s in 30 of 30 frames, so there is no coverage" in told[0]
+    assert "less than 2 m within 2 s in 30 of 30 frames, so there is no coverage" in messages[0]
     assert measure(drive, sensors=("left",))[1:] == (0, [])  # another sensor is the reference
 
     drive = Striped(steps=60)
     drive.standing = 30
-    value, standing, told = measure(drive)
+    value, standing, messages = measure(drive)
     assert abs(value - right) < 0.03
     assert 20 <= standing < 30  # some windows reach into the drive
-    assert f"in {standing} of 60 frames, which do not count" in told[0]
+    assert f"in {standing} of 60 frames, which do not count" in messages[0]

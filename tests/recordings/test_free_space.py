@@ -1,4 +1,4 @@
-"""What rays refute, what is hidden and what moves, in scenes that are known exactly; loops against arrays."""
+"""Free space, visibility and moving clusters in scenes that are known exactly; compiled kernels against arrays."""
 
 import numpy as np
 import pytest
@@ -16,32 +16,40 @@ from torchcover.recordings.visibility import estimate_surface_areas_m2, estimate
 CAR = BoundingBox((-2.4, -0.95, 0.0), (2.4, 0.95, 1.7))
 
 
-def upright(x_m, half_m=6.0, step_m=0.05, low_m=-2.0, high_m=2.0):
+def make_wall(x_m, half_m=6.0, step_m=0.05, low_m=-2.0, high_m=2.0):
     """A wall across the x axis."""
     y, z = np.meshgrid(np.arange(-half_m, half_m, step_m), np.arange(low_m, high_m, step_m))
     return np.stack([np.full(y.size, x_m), y.ravel(), z.ravel()], axis=1)
 
 
-def votes_of(image, points_m):
+def count_votes(image, points_m):
     votes = np.zeros(len(points_m), np.int16)
     image.add_votes(np.ascontiguousarray(points_m, dtype=np.float64), votes)
     return votes.tolist()
 
 
 def test_points_before_a_wall_are_contradicted():
-    image = RangeImage.from_points(upright(20.0), np.eye(4))
+    image = RangeImage.from_points(make_wall(20.0), np.eye(4))
     free_m = (20.0 - 0.4) / 1.12
     places_m = [[free_m - 0.05, 0.0, 0.0], [free_m + 0.05, 0.0, 0.0], [19.9, 0.0, 0.0], [25.0, 0.0, 0.0]]
-    # Behind, beside and above where nothing came back: nobody knows.
-    assert votes_of(image, [*places_m, [10.0, 8.0, 0.0], [-10.0, 0.0, 0.0], [10.0, 0.0, 5.0]]) == [1, 0, 0, 0, 0, 0, 0]
+    # Points behind the wall, beside it and above it are not contradicted.
+    assert count_votes(image, [*places_m, [10.0, 8.0, 0.0], [-10.0, 0.0, 0.0], [10.0, 0.0, 5.0]]) == [
+        1,
+        0,
+        0,
+        0,
+        0,
+        0,
+        0,
+    ]
 
 
 def test_rays_past_an_edge_contradict_no_edge():
-    near_m = upright(8.0, half_m=1.0, step_m=0.02)
+    near_m = make_wall(8.0, half_m=1.0, step_m=0.02)
     near_m = near_m[near_m[:, 1] < 0]
-    image = RangeImage.from_points(np.concatenate([near_m, upright(30.0, half_m=15.0, high_m=6.0)]), np.eye(4))
+    image = RangeImage.from_points(np.concatenate([near_m, make_wall(30.0, half_m=15.0, high_m=6.0)]), np.eye(4))
     one_bin_m = 8.0 * np.deg2rad(0.2)
-    assert votes_of(image, [[8.0, -0.5, 0.0], [8.0, 0.9 * one_bin_m, 0.0], [8.0, 4 * one_bin_m, 0.0]]) == [0, 0, 1]
+    assert count_votes(image, [[8.0, -0.5, 0.0], [8.0, 0.9 * one_bin_m, 0.0], [8.0, 4 * one_bin_m, 0.0]]) == [0, 0, 1]
 
 
 @pytest.mark.parametrize("rows_deg", [0.2, 0.4, 2.0])
@@ -53,10 +61,10 @@ def test_flat_ground_is_never_contradicted(rows_deg):
     sensor_m = np.stack([np.cos(azimuth) * np.cos(elevation), np.sin(azimuth) * np.cos(elevation), np.sin(elevation)])
     image = RangeImage.from_points(sensor_m.reshape(3, -1).T * range_m[:, None], np.eye(4))
     x_m, y_m = np.random.default_rng(0).uniform(-60.0, 60.0, (2, 3000))
-    votes = votes_of(image, np.stack([x_m, y_m, np.full(3000, -1.8)], axis=1))
+    votes = count_votes(image, np.stack([x_m, y_m, np.full(3000, -1.8)], axis=1))
     assert sum(votes) < 0.002 * len(votes)
     standing = [[15.0, 0.0, -1.0]]  # 0.8 m above it, before the ground 25 m away
-    assert votes_of(image, standing) == [1]
+    assert count_votes(image, standing) == [1]
 
 
 def test_votes_do_not_depend_on_earlier_windows():
@@ -124,7 +132,7 @@ def test_compiled_kernels_equal_array_kernels():
 
 
 def test_occluded_points_are_not_visible():
-    wall_m = upright(6.0, half_m=4.0, step_m=0.1, low_m=0.0, high_m=4.0)
+    wall_m = make_wall(6.0, half_m=4.0, step_m=0.1, low_m=0.0, high_m=4.0)
     behind_m = [[9.0, 0.0, 1.0], [30.0, 5.0, 1.0]]
     beside_m, above_m, close_m = [[9.0, 12.0, 1.0], [9.0, 0.0, 9.0]], [[0.0, 30.0, 1.0]], [[6.3, 0.0, 1.0]]
     points_m = np.concatenate([wall_m, behind_m, beside_m, above_m, close_m])
@@ -152,7 +160,7 @@ def test_areas_add_up_to_the_surface():
 def test_moving_objects_are_placed_at_the_frame(velocity_mps):
     generator = np.random.default_rng(0)
     times_s = np.array([-0.3, -0.2, -0.1, 0.1, 0.2, 0.3])
-    box_m = np.concatenate([upright(0.0, 0.9, 0.15, 0.3, 1.4), upright(0.0, 2.0, 0.15, 0.3, 1.4)[:, [1, 0, 2]]])
+    box_m = np.concatenate([make_wall(0.0, 0.9, 0.15, 0.3, 1.4), make_wall(0.0, 2.0, 0.15, 0.3, 1.4)[:, [1, 0, 2]]])
     scans_m = []
     for time_s in times_s:
         own = box_m[generator.random(len(box_m)) < 0.7]
@@ -160,18 +168,18 @@ def test_moving_objects_are_placed_at_the_frame(velocity_mps):
         scans_m.append(
             np.concatenate([own + np.array([*velocity_mps, 0.0]) * time_s + np.array([30.0, 8.0, 0.0]), clutter])
         )
-    found = max(find_moving_clusters(scans_m, times_s), key=lambda one: len(one.points_m))
+    found = max(find_moving_clusters(scans_m, times_s), key=lambda cluster: len(cluster.points_m))
     assert np.linalg.norm(found.velocity_mps - velocity_mps) < 0.5
     apart_m = np.linalg.norm((found.points_m - [30.0, 8.0, 0.0])[:, None] - box_m, axis=2).min(axis=1)
     assert np.median(apart_m) < 0.1
     assert apart_m.max() < 1.0
     assert len(found.points_m) > 0.6 * 6 * len(box_m)
-    # Of two sensors, each of which sees a half of the places, or of three, one of which sees nothing.
+    # The scans of two sensors with a half of the points each, or of three sensors, one without points.
     for halves in ([scan_m[:, 1] < 8.0 for scan_m in scans_m], [scan_m[:, 1] < 99.0 for scan_m in scans_m]):
         parts = [
             scan_m[half == one] for one in (True, False, None) for scan_m, half in zip(scans_m, halves, strict=True)
         ]
-        same = max(find_moving_clusters(parts, np.tile(times_s, 3)), key=lambda one: len(one.points_m))
+        same = max(find_moving_clusters(parts, np.tile(times_s, 3)), key=lambda cluster: len(cluster.points_m))
         np.testing.assert_array_equal(same.velocity_mps, found.velocity_mps)
         assert len(same.points_m) == len(found.points_m)
 

@@ -1,4 +1,4 @@
-"""Scans that a drive's poses should bring together: each way to read them wrongly is found, with what mends it."""
+"""Scans that poses should align: each wrong convention is reported with its remedy."""
 
 import pickle
 import re
@@ -38,7 +38,7 @@ AWAY_M = np.array([300.0, -40.0, 7.0])
 
 @dataclass
 class Yard:
-    """A LiDAR that drives in an S between crates on flat ground, and speeds up. What it is told of it may be wrong."""
+    """LiDAR that drives in an S between crates on flat ground and accelerates; `fault` makes the recording wrong."""
 
     fault: str = ""
     steps: int = 12
@@ -102,12 +102,12 @@ class Yard:
         return Boxes.from_rows(torch.zeros((0, 7))) if self.fault == "unlabelled" else None
 
 
-def doubts(yard):
+def find_warnings(yard):
     stretches = list(read_pose_segments(yard, len(yard.key_frames)))
     return check_frozen_poses(stretches) or check_pose_conventions(yard, stretches, "lidar") or ""
 
 
-def jumped(yard):
+def check_jumps(yard):
     return check_pose_discontinuities(yard, list(read_pose_segments(yard, len(yard.key_frames))))
 
 
@@ -123,10 +123,10 @@ def jumped(yard):
     ],
 )
 def test_right_poses_have_no_warning(right):
-    assert not doubts(right)
+    assert not find_warnings(right)
 
 
-MENDED = {
+REMEDIES = {
     "xyzw": "--set recording.quaternion_order=xyzw",
     "inverse": "--set recording.pose_convention=vehicle_T_world",
     "yx": "--set recording.pose_convention=swapped_xy",
@@ -136,23 +136,22 @@ MENDED = {
 }
 
 
-@pytest.mark.parametrize("fault", MENDED)
+@pytest.mark.parametrize("fault", REMEDIES)
 def test_reported_remedies_correct_the_error(fault):
-    doubt = doubts(Yard(fault))
-    assert MENDED[fault] in doubt
-    name, value = MENDED[fault].removeprefix("--set recording.").split("=")
+    message = find_warnings(Yard(fault))
+    assert REMEDIES[fault] in message
+    name, value = REMEDIES[fault].removeprefix("--set recording.").split("=")
     corrections = RecordingSettings(**{name: parse_yaml(value)})
-    mended = correct_recording(Yard(fault), corrections)
-    assert corrections.command_line_options in (MENDED[fault], "--set recording.time_offset_s=0.1")
-    assert not doubts(mended)
-    off = [
-        invert(Yard().true(step)) @ pickle.loads(pickle.dumps(mended)).get_world_T_vehicle(step) for step in range(10)
-    ]
-    # The last poses, and those between two, are not there: where the vehicle went on evenly they would be right.
+    corrected = correct_recording(Yard(fault), corrections)
+    assert corrections.command_line_options in (REMEDIES[fault], "--set recording.time_offset_s=0.1")
+    assert not find_warnings(corrected)
+    poses = [pickle.loads(pickle.dumps(corrected)).get_world_T_vehicle(step) for step in range(10)]
+    off = [invert(Yard().true(step)) @ pose for step, pose in enumerate(poses)]
+    # Interpolated and extrapolated poses are exact only for constant velocity.
     exact = fault not in ("late", "held")
     assert max(np.linalg.norm(each[:3, 3]) for each in off) < (1e-9 if exact else 0.05)
     assert max(np.abs(convert_rotation_to_euler(each[:3, :3])).max() for each in off) < (1e-9 if exact else 0.5)
-    points_m = transform_points(MOUNT, mended.read_scan("lidar", 3).points_m)
+    points_m = transform_points(MOUNT, corrected.read_scan("lidar", 3).points_m)
     assert np.abs(points_m - transform_points(MOUNT, Yard().read_scan("lidar", 3).points_m)).max() < 1e-9
 
 
@@ -161,19 +160,19 @@ def test_reported_remedies_correct_the_error(fault):
     [("same", "repeats the same scan while the vehicle moves")],
 )
 def test_errors_without_remedy_are_reported(fault, says):
-    doubt = doubts(Yard(fault))
-    assert re.search(says, doubt)
+    message = find_warnings(Yard(fault))
+    assert re.search(says, message)
 
 
 @pytest.mark.parametrize("unit", ["mm", "cm"])
 def test_wrong_units_are_reported_and_corrected(unit):
     frames = RecordedFrames(Yard(unit), reference=AccumulatedReference(1.0))
-    (doubt,) = frames.check()
-    assert f"(--set recording.units={unit})" in doubt
-    mended = RecordedFrames(correct_recording(frames.recording, RecordingSettings(units=unit)))
-    assert mended.check() == []
-    assert f"Corrections of the recording: --set recording.units={unit}." in mended.reference_record["notes"]
-    assert mended.content != frames.content
+    (message,) = frames.check()
+    assert f"(--set recording.units={unit})" in message
+    corrected = RecordedFrames(correct_recording(frames.recording, RecordingSettings(units=unit)))
+    assert corrected.check() == []
+    assert f"Corrections of the recording: --set recording.units={unit}." in corrected.reference_record["notes"]
+    assert corrected.content != frames.content
 
 
 def test_clouds_in_feet_are_converted():
@@ -186,8 +185,8 @@ def test_clouds_in_feet_are_converted():
 
 
 def test_missing_labels_are_reported():
-    (doubt,) = RecordedFrames(Yard("unlabelled")).check()
-    assert "labels, and none in 12 frames" in doubt
+    (message,) = RecordedFrames(Yard("unlabelled")).check()
+    assert "labels, and none in 12 frames" in message
 
 
 @pytest.mark.parametrize(("jump_m", "turn_deg"), [((0.8, 0.4, 0.0), 0.0), ((0.0, 0.0, 0.0), 4.0)])
@@ -203,10 +202,10 @@ def test_jumps_are_reported_and_separate_scan_pairs(jump_m, turn_deg):
                 @ build_transform(convert_euler_to_rotation(turn_deg, 0.0, 0.0), np.zeros(3))
             )
 
-    assert "poses jump 1 times in 12 frames that were checked, first at f6" in jumped(Jumping())
-    assert not doubts(Jumping())
-    assert jumped(Yard(pose_noise=0.05)) is None
-    assert jumped(Yard(speed_mps=0.0)) is None
+    assert "poses jump 1 times in 12 frames that were checked, first at f6" in check_jumps(Jumping())
+    assert not find_warnings(Jumping())
+    assert check_jumps(Yard(pose_noise=0.05)) is None
+    assert check_jumps(Yard(speed_mps=0.0)) is None
 
 
 def test_invalid_time_offsets_are_refused():
@@ -221,7 +220,7 @@ def test_invalid_time_offsets_are_refused():
 
 
 def test_noisy_poses_have_no_time_offset():
-    """Many lags are better, with worse ones in between."""
+    """Several time offsets match better, with worse ones in between."""
 
     class Noisy(NamedTuple):
         better_s: float
