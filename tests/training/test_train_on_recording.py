@@ -67,7 +67,7 @@ def test_a_small_run_on_a_drive_of_kitti_logs_and_ends_with_table_and_figure(
     monkeypatch.setenv("COLUMNS", "200")
     example.main()
     said = capsys.readouterr().out
-    assert "Reference: accumulated from velodyne over 0.6 s" in said
+    assert "Reference: points of velodyne, accumulated over 0.6 s" in said
     assert "also built the reference: surfaces that they never observe are missing" in said
     (line,) = (line for line in said.splitlines() if "not sampled" in line)
     assert "│ 0 " in line  # the car is in the reference, whose scans show other rows of it
