@@ -20,7 +20,7 @@ from torchcover.report import (
 from torchcover.report.records import COLUMNS, build_records
 
 KEYS = ("radius_m", "detection_0.4m")
-SURFACE, CELLS = "Means over the square metres that the reference sees.", "Means over the known cells only"
+SURFACE, CELLS = "Numbers are means over observed cells only", "Means over the known cells only"
 WALL = Region("wall", (0.0, 2.0), (0.0, 1.0))
 NOTHING = Region("nothing", (2.0, 3.0), (0.0, 1.0))
 
@@ -58,7 +58,7 @@ def test_a_row_has_the_mean_over_the_surface_and_how_much_of_it_there_is():
     assert (wall[surface], nothing[surface]) == ("2.0", "0")
 
 
-@pytest.mark.parametrize("measure", ["area", "known"])
+@pytest.mark.parametrize("measure", ["area", "cells"])
 def test_a_column_says_in_words_what_it_says_in_files(measure, table, trio, regions):
     table = table if measure == "area" else CoverageTable.from_coverages({"few": trio["few"]}, regions)
     assert len({column.key for column in COLUMNS}) == len(COLUMNS)

@@ -345,7 +345,7 @@ def test_a_page_is_one_file_that_asks_for_nothing(named):
 
 def test_a_page_without_maps_or_sensors(tmp_path):
     text = render_page(Page("rig", "lead", rigs=[PageRig("rig")]))
-    assert "Its sensors are unknown" in text
+    assert "Sensors unknown" in text
     if CHROMIUM is None:
         pytest.skip("no Chromium here: nobody looks at the page")
     dom, console = browsed(text, tmp_path / "page.html")
@@ -439,7 +439,7 @@ def test_cells_taken_together_have_their_mean_by_weight_and_the_page_says_so():
     assert coarse.values[5, 10] == pytest.approx(np.average(known.values[four], weights=known.weights[four]))
     assert np.isnan(coarse.values[:, 350:]).all()
     assert "standard errors of single cells are omitted; some maps merge 2 x 2 cells" in notes[-1]
-    assert re.search(r"show \d x \d cells as one, so that", render_page(Page("rig", "lead", maps=noisy(1))))
+    assert re.search(r"merge \d x \d cells, to keep", render_page(Page("rig", "lead", maps=noisy(1))))
 
 
 def test_words_between_backticks_are_code_everywhere():

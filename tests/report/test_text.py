@@ -85,7 +85,7 @@ def test_trouble_is_told_in_words_with_its_count():
     coverage.update([ORIGIN, torch.zeros(0, 3), ORIGIN], [reference, reference, torch.zeros(0, 3)])
     text = text_of(coverage.compute(), NEAR)
     assert "1 of 3 frames had no sensor points" in text
-    assert "1 of 3 steps had no reference point" in text
+    assert "1 of 3 frames had no reference points" in text
     assert "3 of 4 reference points count as 0.5 m far, the limit" in text
     assert "2 of 6 reference points lie outside the grid: left out." in text
     assert "z = 0" not in text
@@ -143,7 +143,7 @@ def test_a_region_that_one_block_alone_has_probed_has_a_number_without_error():
 def test_too_few_steps_for_an_error_are_told_once_and_never_as_0(steps, blocks, needed):
     text = text_of(over_steps(steps), NEAR)
     assert "[" not in text
-    assert text.count(f"Not enough frames for confidence intervals: {blocks}, about {needed} are needed.") == 1
+    assert text.count(f"Not enough frames for confidence intervals: got {blocks}, about {needed} are needed.") == 1
 
 
 def test_without_blocks_nothing_is_said_about_errors():
@@ -241,7 +241,7 @@ def test_a_table_of_words_that_fits_is_not_folded(capsys):
 
 def test_with_many_sensors_each_has_a_row_and_eighty_columns_are_enough():
     sensors = [f"sensor_number_{at}" for at in range(8)]
-    coverage = metric(thresholds_m=(0.4,), num_blocks=16, sensors=sensors)
+    coverage = metric(thresholds_m=(0.4,), num_blocks=16, sensor_names=sensors)
     for index in range(16):
         generator = torch.Generator().manual_seed(index)
         size_m = torch.tensor([4.0, 2.0, 0.2])

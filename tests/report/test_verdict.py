@@ -25,7 +25,7 @@ def with_bodies(table, shares, best=None, places=30):
         number = row.summary.numbers[key]._replace(value=share, count=places)
         if len(shares) == 1 and share in (0.0, 1.0):  # all blocks say so
             number = number._replace(error=math.nan, low=math.nan, high=math.nan)
-        summary = replace(row.summary, region="front_3m", height="child_110cm", numbers={key: number})
+        summary = replace(row.summary, region="front_3m", band="child_110cm", numbers={key: number})
         bodies[rig] = (Row(rig, Region("front_3m", (2.0, 5.0), (-1.0, 1.0)), summary,
                            frozenset({key} if rig == best else ()), {}),)  # fmt: skip
     return replace(table, bodies=bodies)
@@ -57,8 +57,7 @@ def test_without_errors_nothing_is_told(pair, blind, trios, regions):
         assert summarize_findings(CoverageTable.from_coverages(coverages, AHEAD)) == ()
     (sentence,) = summarize_findings(CoverageTable.from_coverages(trios(4), AHEAD))
     assert sentence == (
-        "Not enough frames for an answer: 4 form 4 blocks of time, intervals need about 9, which are 9 frames "
-        "(`--num-frames`)."
+        "Not enough frames for an answer: 4 frames form 4 blocks, 9 are needed (about 9 frames (`--num-frames`)."
     )
     assert summarize_findings(CoverageTable.from_coverages(pair, regions[1:])) == ()
 
@@ -79,7 +78,7 @@ def test_the_advised_number_of_frames_gives_intervals(points, frames):
     table = table_of(frames)
     (sentence,) = summarize_findings(table)
     assert sentence.startswith(f"Not enough frames for an answer: {frames} frames form {-(-frames // 3)} block")
-    advised = int(re.search(r"which are (\d+) frames", sentence)[1])
+    advised = int(re.search(r"about (\d+) frames", sentence)[1])
     assert not table.has_intervals
     assert 24 < advised <= 40
     for row in table_of(advised).rows["one"]:
@@ -114,7 +113,7 @@ def test_few_places_that_all_say_the_same_are_no_answer(trio):
 
 
 @pytest.mark.parametrize(("alone", "blocks", "sentence"), [
-    (lambda index: 30 + index % 2, 16, "Single point of failure: roof; without it detection within 0.01 m is "),
+    (lambda index: 30 + index % 2, 16, "Single point of failure: roof; without it, detection within 0.01 m in near ground changes from "),
     (lambda index: 5 + index % 2, 16, "No single point of failure: no failure of a sensor changes a number significantly by 10 % or more"),
     (lambda index: 40 * (index < 3), 16, "No single point of failure: no failure of a sensor changes a number significantly by 10 % or more"),
     (lambda index: 30 + index % 2, 4, "Largest effect of a failure: without roof, detection within 0.01 m in "),
