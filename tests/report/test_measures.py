@@ -20,7 +20,8 @@ from torchcover.report import (
 from torchcover.report.records import COLUMNS, build_records
 
 KEYS = ("radius_m", "detection_0.4m")
-SURFACE, CELLS = "Numbers are means over observed cells only", "Means over the known cells only"
+SURFACE = "Numbers are means over the surface area that the reference observes."
+CELLS = "Numbers are means over observed cells only"
 WALL = Region("wall", (0.0, 2.0), (0.0, 1.0))
 NOTHING = Region("nothing", (2.0, 3.0), (0.0, 1.0))
 

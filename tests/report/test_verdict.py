@@ -28,7 +28,7 @@ def with_bodies(table, shares, best=None, places=30):
         summary = replace(row.summary, region="front_3m", band="child_110cm", numbers={key: number})
         bodies[rig] = (Row(rig, Region("front_3m", (2.0, 5.0), (-1.0, 1.0)), summary,
                            frozenset({key} if rig == best else ()), {}),)  # fmt: skip
-    return replace(table, bodies=bodies)
+    return replace(table, target_rows=bodies)
 
 
 def test_of_one_rig_the_farthest_region_ahead_is_told_with_its_interval(trio):
@@ -89,7 +89,7 @@ def test_the_advised_number_of_frames_gives_intervals(points, frames):
         f"(a point within 0.4 m): of {visible_m2:,.1f} m² of visible ground" in summarize_findings(table_of(advised))[0]
     )
     short = replace(table, block_ends=(3, 6, 7))
-    assert summarize_findings(short)[0].endswith("and this source has 3 in all.")
+    assert summarize_findings(short)[0].endswith("and the source has 3.")
 
 
 @pytest.mark.parametrize(("shares", "best", "sentence"), [
