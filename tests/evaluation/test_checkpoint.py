@@ -20,7 +20,7 @@ from torchcover.data import BadFrameError, FrameDataset
 from torchcover.evaluation import Checkpoint, checkpoint
 from torchcover.evaluation.checkpoint import read_header, read_state, write_checkpoint
 from torchcover.evaluation.config import DESCRIPTIONS
-from torchcover.evaluation.task import TOLD_OTHERWISE
+from torchcover.evaluation.task import NOT_IN_IDENTITY
 from torchcover.files import BadFileError
 
 STEPS = 16
@@ -233,7 +233,7 @@ def test_a_checkpoint_of_another_run_is_refused_by_what_differs(frame_of, path, 
 
 
 def test_all_options_decide_about_a_run_but_those_that_it_names():
-    assert set(DESCRIPTIONS) > TOLD_OTHERWISE
+    assert set(DESCRIPTIONS) > NOT_IN_IDENTITY
 
 
 def test_without_resume_it_starts_anew(frame_of, path):

@@ -74,7 +74,7 @@ def test_a_target_error_does_not_go_round_and_round(drive):
     result = torchcover.evaluate(RIG, drive(70), target_error="0.0001%", **FEW)
     assert (result.run.num_frames, result.target_error_lines[0]) == (
         70,
-        "Target error not reached in 70 steps; the largest of each region:",
+        "Target error not reached in 70 frames; the largest error of each region:",
     )
 
 

@@ -97,7 +97,7 @@ def test_the_paper_measures_with_ideal_sensors():
         ({"sensor_model": "perfect"}, "`ideal` or `real` is needed"),
         ({"sensor_model": "real", "rigs": "front_roof_32"}, "no LiDAR of the rig 'front_roof_32'"),
         ({"weather": "fog_10m"}, "is 'fog_100m' or"),
-        ({"weather": [Weather(), Weather(visibility_m=9.0)]}, "two are called alike, weather, weather"),
+        ({"weather": [Weather(), Weather(visibility_m=9.0)]}, "two have the same name, weather, weather"),
     ],
 )
 def test_what_cannot_be_is_told(given, told):

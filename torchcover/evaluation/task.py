@@ -1,13 +1,14 @@
-"""What there is to measure: which rigs, what they are called, in which frames."""
+"""Tasks of `evaluate`: the rigs with their names, the frames in which they are measured, grid and regions."""
 
 import hashlib
 import json
 import math
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Generic, NamedTuple, TypeVar
+from typing import Generic, Literal, NamedTuple, TypeVar
 
 import numpy as np
 import torch
@@ -41,44 +42,54 @@ AnyRig = Rig | str | Path
 AnyScenario = Scenario | str | Path
 SourceT = TypeVar("SourceT", bound=FrameSource, covariant=True)
 
-# Steps that follow each other are alike, and every minute is another city.
-EVERY_S_IN_TRAFFIC = 10.0
-# Of the reference where only detections are asked for. Fewer save rays, but take more steps, and worlds, to an error.
-FEW_RAYS = 2048
-# Where warnings point to: the call of `evaluate`, beyond its own function, the one around that, and ours.
+# Stack level of warnings that point to the call of `evaluate`.
 CALLER = 4
-# Options that frames, what is asked and observers say by what they are, and those that change no result.
-TOLD_OTHERWISE = {
-    "scenario",
-    "seed",
-    "vehicle",
-    "reference",
-    "num_rays",
-    "frame_interval_s",
-    "regions",
-    "cell_m",
-    "band_frame",
-}
-TOLD_OTHERWISE |= {
-    "sensor_model",
-    "weather",
-    "metrics",
-    "num_frames",
-    "device",
-    "num_workers",
-    "no_cache",
-    "skip_bad_frames",
-}
-TOLD_OTHERWISE |= {"recording", "rerun"}
-# Of an identity, what is longer is told by its hash.
-MAX_TOLD = 40
+# Settings that are not part of the identity of a run: frames, query plan and observers describe their effect, or they do
+# not change the result.
+NOT_IN_IDENTITY = frozenset(
+    [
+        *(
+            "scenario",
+            "seed",
+            "vehicle",
+            "reference",
+            "num_rays",
+            "frame_interval_s",
+            "regions",
+            "cell_m",
+            "band_frame",
+        ),
+        *("sensor_model", "weather", "metrics", "num_frames", "device", "num_workers", "no_cache", "skip_bad_frames"),
+        *("recording", "rerun"),
+    ]
+)
+
+
+@dataclass(frozen=True)
+class TaskParams:
+    """Defaults of a simulated run.
+
+    Args:
+        traffic_frame_interval_s: Seconds between frames in traffic: consecutive frames are correlated, and every minute
+            starts in another city.
+        only_detection_rays: Rays of the surface reference for detection rates alone. Fewer rays would save time per
+            frame, but need more frames and scenes for the same standard error.
+    """
+
+    traffic_frame_interval_s: float = 10.0
+    only_detection_rays: int = 2048
 
 
 class Task(NamedTuple, Generic[SourceT]):
-    """Which rigs are measured in which frames, under the names that they have in tables and files.
+    """Rigs and the frames in which they are measured.
 
-    `rig_sources` is what the user called each rig, None if it was not named; `sensors` its sensors, where they are known;
-    `num_frames` how many frames to use at most.
+    Args:
+        frames: Source of the frames.
+        rig_sources: Name of each rig in tables and files -> name or path that the user gave; None if not named.
+        sensors: Name of each rig -> its sensors, where they are known.
+        description: Source of the frames for `summary.json`.
+        query_plan: Grid, height bands and regions.
+        num_frames: Maximum number of frames; None for all.
     """
 
     frames: SourceT
@@ -90,47 +101,49 @@ class Task(NamedTuple, Generic[SourceT]):
 
     @property
     def rigs(self) -> tuple[str, ...]:
-        """What the rigs are called in tables and files."""
+        """Names of the rigs in tables and files."""
         return tuple(self.rig_sources)
 
     def get_sensor_names(self) -> Mapping[str, Sequence[str]]:
-        """Name of each rig -> names of its sensors. ValueError: it is unknown which points are of which sensor."""
-        known = self.frames.sensor_names
-        if unknown := [rig for rig in self.rigs if rig not in known]:
+        """Return the names of the sensors of each rig.
+
+        Raises:
+            ValueError: The frames do not tell which points belong to which sensor of a rig.
+        """
+        sensor_names = self.frames.sensor_names
+        if unknown := [rig for rig in self.rigs if rig not in sensor_names]:
             raise ValueError(f"redundancy: unknown which points of {', '.join(unknown)} are of which sensor")
-        return known
+        return sensor_names
 
 
 def build_task(settings: Settings) -> Task[FrameSource]:
-    """Simulate a scenario, or read a recording.
+    """Prepare the simulation of a scenario, or a recording.
+
+    Args:
+        settings: Settings of `evaluate`.
 
     Raises:
-        ValueError: No rig, a scenario and a recording, settings for the other of the two, a rig that is not there.
-        FileNotFoundError: An unknown name or file.
-        TypeError: Frames that do not say whose they are.
+        ValueError: No rig, both a scenario and a recording, settings of the other kind, an unknown rig of a recording.
+        FileNotFoundError: Unknown name or file.
+        TypeError: The frames are not a `FrameSource`.
 
     Warns:
-        UserWarning: What looks wrong; see `FrameSource.doubts`.
+        UserWarning: Problems that `FrameSource.check` finds.
     """
     for rig in settings.rigs:
         if not isinstance(rig, Rig) and Path(rig).suffix == ".npz":
             raise ValueError(f"{rig} is measured already: read it by Coverage.load, or compare it with others")
-    frames = settings.frames
-    if frames is None:
-        is_first = settings.ranks is None or settings.ranks.rank == 0
-        with show_wait("preparing the scene", is_shown=settings.progress and is_first):  # meshes may be large
+    if settings.frames is None:
+        is_first_rank = settings.ranks is None or settings.ranks.rank == 0
+        # Large meshes may take long to load.
+        with show_wait("preparing the scene", is_shown=settings.progress and is_first_rank):
             return build_simulation_task(settings)
     if settings.scenario is not None:
         raise ValueError("scenario and frames exclude each other: simulate a scenario or read a recording")
     settings.check_recording()
-    if isinstance(frames, str | Path):
-        recording = open_recording(frames)
-        if settings.vehicle is not None:
-            recording.ego_box = build_ego_box(recording, settings.vehicle)
-        source: FrameSource = RecordedFrames(recording, use_ground_model=settings.band_frame != "vehicle")
-    else:
-        source = frames
-    if missing := [name for name in vars(FrameSource) if not name.startswith("_") and not hasattr(source, name)]:
+    source = _open_frames(settings.frames, settings)
+    members = [name for name in vars(FrameSource) if not name.startswith("_")]
+    if missing := [name for name in members if not hasattr(source, name)]:
         raise TypeError(
             f"frames: a recording's path or a torchcover.data.FrameSource is needed; got {type(source).__name__}, "
             f"which has no {', '.join(missing)}; for a list of frames, or a dataset, feed observers: "
@@ -138,197 +151,281 @@ def build_task(settings: Settings) -> Task[FrameSource]:
         )
     if settings.skip_bad_frames and isinstance(source, RecordedFrames):
         source.skip_unreadable_sweeps()
-    for doubt in source.check(settings.num_frames):
-        warnings.warn(doubt, stacklevel=CALLER)
-    return _recording(source, settings)
+    for problem in source.check(settings.num_frames):
+        warnings.warn(problem, stacklevel=CALLER)
+    return _build_recording_task(source, settings)
 
 
-def build_simulation_task(settings: Settings, *, needs_boxes: bool = False) -> Task[SimulatedFrames]:
-    """Simulate a scenario.
+def _open_frames(frames: FrameSource | str | Path, settings: Settings) -> FrameSource:
+    if not isinstance(frames, str | Path):
+        return frames
+    recording = open_recording(frames)
+    if settings.vehicle is not None:
+        recording.ego_box = build_ego_box(recording, settings.vehicle)
+    return RecordedFrames(recording, use_ground_model=settings.band_frame != "vehicle")
+
+
+def build_simulation_task(
+    settings: Settings, *, needs_boxes: bool = False, params: TaskParams = TaskParams()
+) -> Task[SimulatedFrames]:
+    """Prepare the simulation of a scenario.
 
     Args:
-        settings: Of `evaluate`.
-        needs_boxes: Whether frames are to have objects, even if no metric is about them.
+        settings: Settings of `evaluate`.
+        needs_boxes: Whether frames have bounding boxes of objects even if no metric needs them.
+        params: Defaults.
 
     Raises:
-        ValueError, FileNotFoundError: As `build_task`.
+        ValueError: No rig, or settings that contradict each other.
+        FileNotFoundError: Unknown name or file.
     """
-    rigs, scenario = settings.rigs, settings.single_scenario
-    if not rigs:
+    if not settings.rigs:
         raise ValueError("which rig? Give a built-in name (see `torchcover list`) or a YAML file, or a recording")
-    names = make_rig_names(rigs)
-    sensor_model = settings.sensor_model or ("ideal" if settings.reference == "paper" else None)
-    carried = {name: load_rig(rig).apply_sensor_model(sensor_model) for name, rig in zip(names, rigs, strict=True)}
-    given = {name: format_rig_source(rig) for name, rig in zip(names, rigs, strict=True)}
-    if settings.weather:
-        carried, given = _in_weather(carried, given, settings.weather)
-    loaded_world = scenario if isinstance(scenario, Scenario) else Scenario.load(scenario)
-    world = set_ego(loaded_world, carried, settings.vehicle)
-    band_frame = settings.band_frame or ("vehicle" if settings.reference == "paper" else DEFAULT_BAND_FRAME)
-    asked = (settings.regions or RegionsOfInterest()).build_query_plan(
-        world.compute_ego_box().outline_m, settings.cell_m, band_frame, _within(world, carried)
+    is_paper_reference = settings.reference == "paper"
+    rigs, rig_sources = _load_rigs(settings, "ideal" if is_paper_reference else None)
+    loaded_scenario = settings.single_scenario
+    if not isinstance(loaded_scenario, Scenario):
+        loaded_scenario = Scenario.load(loaded_scenario)
+    scenario = set_ego(loaded_scenario, rigs, settings.vehicle)
+    query_plan = (settings.regions or RegionsOfInterest()).build_query_plan(
+        scenario.compute_ego_box().outline_m,
+        settings.cell_m,
+        settings.band_frame or ("vehicle" if is_paper_reference else DEFAULT_BAND_FRAME),
+        _find_limits(scenario, rigs),
     )
-    few = settings.only_detection and settings.reference in (None, DEFAULT_REFERENCE)
-    rays = FEW_RAYS if few and settings.num_rays is None else settings.num_rays
-    most = DEFAULT_STEPS if settings.target_error is None else MAX_STEPS
+    num_rays = settings.num_rays
+    if num_rays is None and settings.only_detection and settings.reference in (None, DEFAULT_REFERENCE):
+        num_rays = params.only_detection_rays
+    num_frames = settings.num_frames
+    if num_frames is None:
+        num_frames = DEFAULT_STEPS if settings.target_error is None else MAX_STEPS
     frames = SimulatedFrames(
-        world,
-        rigs=carried,
-        num_frames=most if settings.num_frames is None else settings.num_frames,
+        scenario,
+        rigs=rigs,
+        num_frames=num_frames,
         seed=settings.seed,
-        frame_interval_s=compute_frame_interval_s(world, settings.frame_interval_s),
-        reference_sensor=create_reference_sensor(settings.reference, rays, asked),
+        frame_interval_s=compute_frame_interval_s(scenario, settings.frame_interval_s, params),
+        reference_sensor=create_reference_sensor(settings.reference, num_rays, query_plan),
         boxes=needs_boxes or settings.needs_boxes,
         search_radius_m=max(settings.thresholds_m) if settings.only_detection else None,
-        max_cached_bytes=0.0,  # steps come in order: no world is needed again
+        max_cached_bytes=0.0,  # frames are made in order, so that no scene is needed again
         no_cache=settings.no_cache,
         device=find_ray_device(settings),
     )
     frames.simulator.check_run(frames.num_frames)
-    # A path says more than the name within the file.
-    description = {**frames.description, "scenario": world.name if loaded_world is scenario else str(scenario)}
-    description |= {"config": settings.config_record} if settings.config_record else {}
-    return Task(frames, given, frames.sensors, description, asked, _most_steps(frames, settings))
+    # A path identifies a scenario better than the name in its file.
+    given_scenario = settings.single_scenario
+    name = scenario.name if isinstance(given_scenario, Scenario) else str(given_scenario)
+    description: dict[str, object] = {**frames.description, "scenario": name}
+    if settings.config_record:
+        description["config"] = settings.config_record
+    return Task(frames, rig_sources, frames.sensors, description, query_plan, _limit_frames(frames, settings))
+
+
+def _load_rigs(
+    settings: Settings, usual_sensor_model: Literal["ideal", "real"] | None
+) -> tuple[dict[str, Rig], dict[str, str]]:
+    """Load the rigs with their sensor model and weather; return them and their sources by name."""
+    sensor_model = settings.sensor_model or usual_sensor_model
+    rigs, rig_sources = {}, {}
+    for name, rig in zip(make_rig_names(settings.rigs), settings.rigs, strict=True):
+        rigs[name] = load_rig(rig).apply_sensor_model(sensor_model)
+        rig_sources[name] = format_rig_source(rig)
+    if settings.weather:
+        return _set_weather(rigs, rig_sources, settings.weather)
+    return rigs, rig_sources
 
 
 def find_ray_device(settings: Settings) -> str | None:
-    """The GPU that casts rays, if that of the run can: workers are forked, and cast by Embree."""
+    """Find the GPU that casts rays; None for Embree on the CPU, which forked workers need.
+
+    Args:
+        settings: Settings of `evaluate`.
+    """
     device = settings.ranks.get_device(settings.device) if settings.ranks else settings.device
-    on_a_gpu = device.startswith("cuda") and not settings.num_workers and find_spec("warp")
-    return str(get_device(device)) if on_a_gpu else None
+    uses_gpu = device.startswith("cuda") and not settings.num_workers and find_spec("warp")
+    return str(get_device(device)) if uses_gpu else None
 
 
 def get_device(name: str) -> torch.device:
-    """The device of this name. ValueError: it cannot be used here."""
+    """Return the device of a name.
+
+    Args:
+        name: Name as in torch, such as "cpu" or "cuda:1".
+
+    Raises:
+        ValueError: The device cannot be used here.
+    """
     try:
         device = torch.device(name)
-        torch.zeros(1, device=device, dtype=torch.float64).item()  # the device `meta` has no values
+        torch.zeros(1, device=device, dtype=torch.float64).item()  # fails on the device `meta`, which has no values
     except (RuntimeError, AssertionError, TypeError, ImportError) as error:
-        said = str(error).splitlines()[0].partition(". ")[0]  # some go on for pages
-        raise ValueError(f"device {name}: cannot be used here ({said}); try cpu") from error
+        reason = str(error).splitlines()[0].partition(". ")[0]  # some messages have many pages
+        raise ValueError(f"device {name}: cannot be used here ({reason}); try cpu") from error
     return device
 
 
-def _in_weather(
-    carried: Mapping[str, Rig], given: Mapping[str, str], weather: Sequence[Weather]
+def _set_weather(
+    rigs: Mapping[str, Rig], rig_sources: Mapping[str, str], weather: Sequence[Weather]
 ) -> tuple[dict[str, Rig], dict[str, str]]:
-    """Each rig in each weather, which its name tells if there are several; and what the user called them."""
-    if len(weather) == 1:
-        return {name: rig.model_copy(update={"weather": weather[0]}) for name, rig in carried.items()}, dict(given)
-    if len({one.name for one in weather}) < len(weather):
-        raise ValueError(
-            f"weather: two are called alike, {', '.join(one.name for one in weather)}; name each another way"
-        )
-    each = {f"{name}, {one.name}": (name, one) for name in carried for one in weather}
-    in_each = {both: carried[name].model_copy(update={"weather": one}) for both, (name, one) in each.items()}
-    return in_each, {both: given[name] for both, (name, _) in each.items()}
+    """Put each rig into each weather; names contain the weather if there are several."""
+    weather_names = [one_weather.name for one_weather in weather]
+    if len(set(weather_names)) < len(weather):
+        raise ValueError(f"weather: two have the same name, {', '.join(weather_names)}; name each another way")
+    weather_rigs, weather_sources = {}, {}
+    for name, rig in rigs.items():
+        for one_weather in weather:
+            full_name = name if len(weather) == 1 else f"{name}, {one_weather.name}"
+            weather_rigs[full_name] = rig.model_copy(update={"weather": one_weather})
+            weather_sources[full_name] = rig_sources[name]
+    return weather_rigs, weather_sources
 
 
-def _most_steps(frames: SimulatedFrames, settings: Settings) -> int | None:
-    """Where a target error ends a run at the latest: what repeats and moves has no more to say than its instants."""
-    distinct = frames.simulator.num_distinct_frames
-    if settings.num_frames is not None or settings.target_error is None or distinct in (None, 1):
+def _limit_frames(frames: SimulatedFrames, settings: Settings) -> int | None:
+    """Limit a run with a target error to the distinct frames of a scenario that moves and repeats."""
+    num_distinct_frames = frames.simulator.num_distinct_frames
+    has_target = settings.num_frames is None and settings.target_error is not None
+    if not has_target or num_distinct_frames in (None, 1):
         return None
-    return max(DEFAULT_STEPS, distinct)
+    return max(DEFAULT_STEPS, num_distinct_frames)
 
 
-def _recording(frames: FrameSource, settings: Settings) -> Task[FrameSource]:
-    rigs = settings.rigs
-    names = make_rig_names(rigs or list(frames.rigs))
-    only_one = len(names) == len(frames.rigs) == 1  # which goes by any name
-    chosen = RigSubset(frames, dict(zip(names, frames.rigs if only_one else names, strict=True)))
-    named = dict(zip(names, rigs, strict=True)) if rigs else {}
-    given = {name: format_rig_source(named[name]) if named else None for name in names}
-    # A name that is in the recording may be a name only; any other has to be that of a rig.
-    documents = {name: rig for name, rig in named.items() if is_rig_document(rig) or name not in frames.rigs}
-    sensors = {**chosen.sensors, **{name: load_rig(rig).sensors for name, rig in documents.items()}}
+def _build_recording_task(frames: FrameSource, settings: Settings) -> Task[FrameSource]:
+    names = make_rig_names(settings.rigs or list(frames.rigs))
+    is_single = len(names) == len(frames.rigs) == 1  # the only rig of a recording may have any name
+    recorded_names = frames.rigs if is_single else names
+    subset = RigSubset(frames, dict(zip(names, recorded_names, strict=True)))
+    given_rigs: dict[str, AnyRig] = dict(zip(names, settings.rigs, strict=True)) if settings.rigs else {}
+    rig_sources: dict[str, str | None] = dict.fromkeys(names)
+    sensors = dict(subset.sensors)
+    for name, rig in given_rigs.items():
+        rig_sources[name] = format_rig_source(rig)
+        # A name of the recording need not be a rig; any other name must be.
+        if is_rig_document(rig) or name not in frames.rigs:
+            sensors[name] = load_rig(rig).sensors
     band_frame = settings.band_frame or ("ground" if frames.has_heights() else "vehicle")
-    asked = (settings.regions or RegionsOfInterest()).build_query_plan(
-        frames.ego_outline_m, settings.cell_m, band_frame
-    )
-    description = {**frames.description, **({"config": settings.config_record} if settings.config_record else {})}
-    return Task(chosen, given, sensors, description, asked, settings.num_frames)
+    regions = settings.regions or RegionsOfInterest()
+    query_plan = regions.build_query_plan(frames.ego_outline_m, settings.cell_m, band_frame)
+    description = dict(frames.description)
+    if settings.config_record:
+        description["config"] = settings.config_record
+    return Task(subset, rig_sources, sensors, description, query_plan, settings.num_frames)
 
 
-def _within(world: Scenario, rigs: Mapping[str, Rig]) -> Region | None:
-    """The room that the ego is in, or what its sensors reach; None if both are large."""
-    reach_m = max(
-        world.compute_max_range_m(sensor, rig.weather) + float(np.linalg.norm(sensor.mount.to_matrix()[:2, 3]))
-        for rig in rigs.values()
-        for sensor in rig.sensors
-    )
-    room = world.find_room_bounds_m()
-    if reach_m > ROOM_M:
+def _find_limits(scenario: Scenario, rigs: Mapping[str, Rig]) -> Region | None:
+    """Find the room around the ego vehicle or the range of its sensors; None if both are large."""
+    ranges_m = []
+    for rig in rigs.values():
+        for sensor in rig.sensors:
+            distance_m = float(np.linalg.norm(sensor.mount.to_matrix()[:2, 3]))
+            ranges_m.append(scenario.compute_max_range_m(sensor, rig.weather) + distance_m)
+    range_m = max(ranges_m)
+    room = scenario.find_room_bounds_m()
+    if range_m > ROOM_M:
         return Region("room", *room) if room else None
-    (x0, x1), (y0, y1) = room or ((-reach_m, reach_m), (-reach_m, reach_m))
-    within = (max(x0, -reach_m), min(x1, reach_m)), (max(y0, -reach_m), min(y1, reach_m))
-    return Region("room" if within == room else "range", *within)
+    (x_min_m, x_max_m), (y_min_m, y_max_m) = room or ((-range_m, range_m), (-range_m, range_m))
+    limits = (max(x_min_m, -range_m), min(x_max_m, range_m)), (max(y_min_m, -range_m), min(y_max_m, range_m))
+    return Region("room" if limits == room else "range", *limits)
 
 
-def compute_frame_interval_s(scenario: Scenario, frame_interval_s: float | None) -> float:
-    """Time between two steps: what was given, else 10 s in traffic, else what spreads the steps over the scenario.
+def compute_frame_interval_s(
+    scenario: Scenario, frame_interval_s: float | None, params: TaskParams = TaskParams()
+) -> float:
+    """Compute the time between two frames.
 
-    That is the golden share of its instants, round and round: any number of steps lies evenly over all of it, and no
-    instant comes again before all have been seen.
+    Without a given value it is 10 s in traffic. Otherwise it is a multiple of the time step that is coprime to the number
+    of time steps and close to the golden ratio. Any number of frames is then spread evenly over the scenario, and no
+    time step is repeated before all have been used.
+
+    Args:
+        scenario: The scenario.
+        frame_interval_s: Value that the user gave.
+        params: Defaults.
     """
     if frame_interval_s is not None:
         return frame_interval_s
-    if scenario.num_distinct_time_steps is None:
-        return EVERY_S_IN_TRAFFIC
-    share = (math.sqrt(5) - 1) / 2 * scenario.num_distinct_time_steps
-    each_once = (
-        steps
-        for steps in range(1, scenario.num_distinct_time_steps + 1)
-        if math.gcd(steps, scenario.num_distinct_time_steps) == 1
-    )
-    return min(each_once, key=lambda steps: abs(steps - share)) * scenario.effective_time_step_s
+    num_time_steps = scenario.num_distinct_time_steps
+    if num_time_steps is None:
+        return params.traffic_frame_interval_s
+    golden = (math.sqrt(5) - 1) / 2 * num_time_steps
+    coprime = [stride for stride in range(1, num_time_steps + 1) if math.gcd(stride, num_time_steps) == 1]
+    return min(coprime, key=lambda stride: abs(stride - golden)) * scenario.effective_time_step_s
 
 
 def make_rig_names(rigs: Sequence[AnyRig]) -> list[str]:
-    """What the columns are called: the rigs' names; numbered where two would be the same."""
-    return make_unique_names([_name(rig) for rig in rigs])
+    """Make the names of rigs in tables and files, numbered where two would be equal.
+
+    Args:
+        rigs: Rigs, names or paths.
+    """
+    return make_unique_names([_get_name(rig) for rig in rigs])
 
 
 def make_unique_names(stems: Sequence[str]) -> list[str]:
-    """Names of which no two are the same, for no file system; numbered where they would be.
+    """Make names unique, also on file systems that ignore case, by numbers.
+
+    Args:
+        stems: Names.
 
     Example:
-        >>> distinct(["roof", "Roof", "grille"])
+        >>> make_unique_names(["roof", "Roof", "grille"])
         ['roof', 'Roof_2', 'grille']
     """
     names: list[str] = []
     for stem in stems:
+        used_names = {name.lower() for name in names}
         name, number = stem, 2
-        while name.lower() in (other.lower() for other in names):
+        while name.lower() in used_names:
             name, number = f"{stem}_{number}", number + 1
         names.append(name)
     return names
 
 
 def load_rig(rig: AnyRig) -> Rig:
-    """The rig itself. FileNotFoundError: no such file or built-in name. ValueError: the file is not a rig."""
+    """Load a rig.
+
+    Args:
+        rig: A rig, built-in name or YAML file.
+
+    Raises:
+        FileNotFoundError: Unknown file or built-in name.
+        ValueError: The file is not a rig.
+    """
     return rig if isinstance(rig, Rig) else Rig.load(rig)
 
 
 def load_named_rig(rig: AnyRig) -> Rig:
-    """The rig itself, under the name that tables and files of every command have for it.
+    """Load a rig under the name that tables and files of every command have for it.
 
-    FileNotFoundError: as `loaded`. ValueError: as `loaded`.
+    Args:
+        rig: A rig, built-in name or YAML file.
+
+    Raises:
+        FileNotFoundError: Unknown file or built-in name.
+        ValueError: The file is not a rig.
     """
-    return load_rig(rig).model_copy(update={"name": _name(rig)})
+    return load_rig(rig).model_copy(update={"name": _get_name(rig)})
 
 
 def is_rig_document(rig: AnyRig) -> bool:
-    """Whether there is more to it than a name: a rig, the path of one, or the name of a built-in one."""
+    """Test whether a rig is more than a name of a recording: a `Rig`, a YAML file or a built-in name.
+
+    Args:
+        rig: A rig, name or path.
+    """
     return isinstance(rig, Rig) or _is_file(rig) or str(rig) in list_builtin_names("rigs")
 
 
 def format_rig_source(rig: AnyRig) -> str:
-    """What the user called it."""
+    """Format the name or path that the user gave for a rig.
+
+    Args:
+        rig: A rig, name or path.
+    """
     return rig.name if isinstance(rig, Rig) else str(rig)
 
 
-def _name(rig: AnyRig) -> str:
+def _get_name(rig: AnyRig) -> str:
     return load_rig(rig).name if isinstance(rig, Rig) or _is_file(rig) else str(rig)
 
 
@@ -339,34 +436,37 @@ def _is_file(rig: str | Path) -> bool:
 def build_run_identity(
     task: Task[FrameSource], settings: Settings, others: Mapping[str, AnyObserver], num_ranks: int = 1
 ) -> dict[str, str]:
-    """All that the result of a run depends on, by name: not the steps, of which there may be more later, nor who works.
+    """Describe everything that the sums of a run depend on; checkpoints of another identity are refused.
 
-    Ranks share the run, each with its own part of it. What is a document or a table is told by its hash.
+    The number of frames is not part of it, as a run may continue with more frames.
+
+    Args:
+        task: Frames, rigs and regions.
+        settings: Settings of `evaluate`.
+        others: Observers besides coverage.
+        num_ranks: Number of ranks, each of which has its own share of the frames.
+
+    Returns:
+        Name -> JSON text; a hash replaces long texts.
     """
     kinds = {name: f"{type(one).__module__}.{type(one).__qualname__}" for name, one in others.items()}
-    everything = {
+    grid = task.query_plan.grid
+    identity = {
         "torchcover": __version__,
         **task.frames.content,
         "rigs": task.rigs,
-        **_asked(task.query_plan),
-        **{name: getattr(settings, name) for name in DESCRIPTIONS if name not in TOLD_OTHERWISE},
-        "observers": kinds,
-        "ranks": num_ranks,
-    }
-    return {name: _told(value) for name, value in everything.items()}
-
-
-def _asked(asked: QueryPlan) -> dict[str, object]:
-    grid = asked.grid
-    return {
         "cell_m": grid.cell_m,
         "grid": [grid.x_m, grid.y_m],
         "heights": list(grid.heights.items()),
         "band_frame": grid.band_frame,
-        "regions": [[region.name, region.x_m, region.y_m, region.corners_m] for region in asked.regions],
+        "regions": [[region.name, region.x_m, region.y_m, region.corners_m] for region in task.query_plan.regions],
+        **{name: getattr(settings, name) for name in DESCRIPTIONS if name not in NOT_IN_IDENTITY},
+        "observers": kinds,
+        "ranks": num_ranks,
     }
+    return {name: _encode(value) for name, value in identity.items()}
 
 
-def _told(value: object) -> str:
+def _encode(value: object, max_length: int = 40) -> str:
     text = json.dumps(value, sort_keys=True, default=repr)
-    return text if len(text) <= MAX_TOLD else f"#{hashlib.sha256(text.encode()).hexdigest()}"
+    return text if len(text) <= max_length else f"#{hashlib.sha256(text.encode()).hexdigest()}"
