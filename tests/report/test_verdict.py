@@ -93,11 +93,11 @@ def test_the_advised_number_of_frames_gives_intervals(points, frames):
 
 
 @pytest.mark.parametrize(("shares", "best", "sentence"), [
-    ({"many": 0.997}, None, "Free places within 3 m where a child is seen (detection within 0.4 m): in front 99 % ["),
-    ({"many": 0.0}, None, "Free places within 3 m where a child is seen (detection within 0.4 m): in front 0 %."),
-    ({"many": 1.0}, None, "Free places within 3 m where a child is seen (detection within 0.4 m): in front 100 %."),
-    ({"few": 0.004, "many": 1.0}, "many", "a child is seen (detection within 0.4 m): in front many 100 %, few 1 %."),
-    ({"few": 0.5, "many": 0.6}, None, "where a child is seen (detection within 0.4 m), no rig has more than"),
+    ({"many": 0.997}, None, "Free positions within 3 m where a child is detected (detection within 0.4 m): in front 99 % ["),
+    ({"many": 0.0}, None, "Free positions within 3 m where a child is detected (detection within 0.4 m): in front 0 %."),
+    ({"many": 1.0}, None, "Free positions within 3 m where a child is detected (detection within 0.4 m): in front 100 %."),
+    ({"few": 0.004, "many": 1.0}, "many", "a child is detected (detection within 0.4 m): in front many 100 %, few 1 %."),
+    ({"few": 0.5, "many": 0.6}, None, "where a child is detected (detection within 0.4 m): no rig has significantly more than"),
 ])  # fmt: skip
 def test_bodies_come_first(trio, shares, best, sentence):
     table = with_bodies(CoverageTable.from_coverages({name: trio[name] for name in shares}, AHEAD), shares, best)
@@ -109,7 +109,7 @@ def test_few_places_that_all_say_the_same_are_no_answer(trio):
     table = CoverageTable.from_coverages({"many": trio["many"]}, AHEAD)
     for places, told in ((29, False), (30, True)):
         words = " ".join(summarize_findings(with_bodies(table, {"many": 1.0}, places=places)))
-        assert ("where a child is seen (detection within 0.4 m): in front 100 %" in words) == told
+        assert ("where a child is detected (detection within 0.4 m): in front 100 %" in words) == told
 
 
 @pytest.mark.parametrize(("alone", "blocks", "sentence"), [
