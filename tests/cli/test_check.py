@@ -5,17 +5,17 @@ from xml.etree import ElementTree
 
 import pytest
 
-AHEAD = "{target: adult, at: {points_m: [[5, 0]]}, points: 5, name: '<a> & b'}"
-MUCH = "{target: adult, at: {points_m: [[5, 0]]}, points: 99999}"
-INSIDE = "{target: dog, at: {points_m: [[0, 0]]}, points: 5}"
+AHEAD = "{target: adult, positions: {points_m: [[5, 0]]}, points: 5, name: '<a> & b'}"
+MUCH = "{target: adult, positions: {points_m: [[5, 0]]}, points: 99999}"
+INSIDE = "{target: dog, positions: {points_m: [[0, 0]]}, points: 5}"
 
 
 @pytest.mark.parametrize(
     ("requirements", "code", "states"),
     [
-        ([AHEAD], 0, ["kept"]),
-        ([AHEAD, INSIDE], 1, ["kept", "not checked"]),
-        ([AHEAD, INSIDE, MUCH], 1, ["kept", "not checked", "not kept"]),
+        ([AHEAD], 0, ["met"]),
+        ([AHEAD, INSIDE], 1, ["met", "not decided"]),
+        ([AHEAD, INSIDE, MUCH], 1, ["met", "not decided", "not met"]),
     ],
 )
 def test_the_exit_code_is_the_verdict_on_all(torchcover, worlds, requirements, code, states):
@@ -25,28 +25,28 @@ def test_the_exit_code_is_the_verdict_on_all(torchcover, worlds, requirements, c
     assert all(state in printed for state in states)
     out = worlds / "out" / "check"
     record = json.loads((out / "summary.json").read_text())
-    assert (record["encounters"], list(record["files"])) == (not code, ["junit.xml"])
+    assert (record["met"], list(record["files"])) == (not code, ["junit.xml"])
     assert [one["state"] for one in record["rigs"]["low"]] == states
     assert record["rigs"]["low"][0]["margin"] == record["rigs"]["low"][0]["value"] - 5
     (suite,) = ElementTree.parse(out / "junit.xml").getroot()
-    tags = {"kept": [], "not kept": ["failure"], "not checked": ["error"]}
+    tags = {"met": [], "not met": ["failure"], "not decided": ["error"]}
     assert [[child.tag for child in case] for case in suite] == [tags[state] for state in states]
     assert suite[0].get("name") == "<a> & b: adult, points_m [[5.0, 0.0]]: points >= 5"
     told = {case[0].get("message"): case[0].text for case in suite if len(case)}
-    unknown = "worst: -; margin: -; not kept: 0; not checked: 1; of: 1; no room: 0; the worst is: {}"
+    unknown = "worst: -; margin: -; not met: 0; not decided: 1; of: 1; no room: 0; the worst is: {}"
     where = "x = 0.00, y = 0.00 m, no room"
-    assert (told.get(unknown.format(where)) == where) == ("not checked" in states)
+    assert (told.get(unknown.format(where)) == where) == ("not decided" in states)
     assert record["scenarios"] == {"target": str(worlds / "yard.yaml")}
-    assert suite.get("failures") == str(states.count("not kept"))
+    assert suite.get("failures") == str(states.count("not met"))
     assert "no homologation" in " ".join(printed.split())
 
 
 @pytest.mark.parametrize(
     ("text", "arguments", "message"),
     [
-        ("requirements: [{target: moon, at: {within_m: 1}, points: 5}]", [], "no target is called 'moon'"),
-        ("requirements: [{target: dog, at: {within_m: 1}, pionts: 5}]", [], "pionts: unknown key"),
-        ("requirements: [{target: dog, at: {within_m: 1}, points: 5, by: rof}]", [], "no sensor is called 'rof'"),
+        ("requirements: [{target: moon, positions: {within_m: 1}, points: 5}]", [], "no target is called 'moon'"),
+        ("requirements: [{target: dog, positions: {within_m: 1}, pionts: 5}]", [], "pionts: unknown key"),
+        ("requirements: [{target: dog, positions: {within_m: 1}, points: 5, counted_sensors: rof}]", [], "no sensor is called 'rof'"),
         ("{}", [], "requirements: Field required"),
         (f"requirements: [{AHEAD}]", ["--requirements", "crosing_like"], "is 'crossing_like' meant?"),
         (f"requirements: [{AHEAD}]", ["--requirements", "none.yaml"], "none.yaml: no such file"),

@@ -40,7 +40,7 @@ def test_a_rig_is_drawn_on_the_ego_of_a_scenario(torchcover, worlds, drawn):
     assert [sensor.name for sensor in sensors] == ["front", "rear"]
     assert sensors[1].vertical_fov_deg == pytest.approx((-30.0, 0.0))
     assert (sensors[1].horizontal_fov_deg, sensors[1].range_m) == (90.0, 60.0)
-    assert sensors[1].contains(np.array([[-1.0, 0.0, -0.1], [1.0, 0.0, -0.1]])).tolist() == [True, False]
+    assert sensors[1].mask_directions(np.array([[-1.0, 0.0, -0.1], [1.0, 0.0, -0.1]])).tolist() == [True, False]
 
 
 def test_a_scenario_is_drawn_in_the_frame_of_the_ego(torchcover, worlds, drawn):

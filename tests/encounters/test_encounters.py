@@ -74,7 +74,7 @@ def test_the_sight_opens_when_the_line_past_the_corner_of_a_wall_meets_the_walke
         mounted(scanner),
         crossing(speed_kmh, walker, obstacles=walls),
         Criterion(points=1, consecutive_scans=1),
-        phases=1,
+        num_start_offsets=1,
     )
     # Seconds before the ego's front is at the walker's way, which the line past (-1.01, -1.6) meets at y = ..
     before_s = np.linspace(0.3, 1.39, 100_001)
@@ -237,7 +237,7 @@ def test_points_are_those_of_a_simulation_with_the_other_in_the_world():
 def test_the_answer_is_that_of_looking_all_the_time():
     case, criterion = crossing(obstacles=HIDDEN), Criterion(points=12, pixels=150)
     small = mounted(ahead(dropout=0.3), ahead("noisy", rate_hz=20, range_noise_m=0.3), CAMERA)
-    found = sighted(small, case, criterion, phases=4, seed=3)
+    found = sighted(small, case, criterion, num_start_offsets=4, seed=3)
     staged = StagedEncounter(case, small.ego_solid)
     looks, sensors = EncounterPointCounter(small, staged, 3), small.rig.sensors
     for k, sensor in enumerate(sensors):
@@ -261,25 +261,25 @@ def test_lidars_count_together_at_the_looks_of_the_slower_and_a_loss_is_never_a_
     assert group_sensors([0.1, None, 0.05, 0.1, None, 0.2], range(6)) == [(1,), (4,), (0, 3, 2), (2,), (5, 0, 3, 2)]
     assert group_sensors([2, None, 1], [2]) == [(2,)]
     few = lidar("few", columns=180, channels=8, vertical_fov_deg=[-20, 0])
-    found = sighted(mounted(few, few | {"name": "same"}), crossing(), Criterion(points=6), phases=3)
+    found = sighted(mounted(few, few | {"name": "same"}), crossing(), Criterion(points=6), num_start_offsets=3)
     assert (found.ttc_without_sensor_s <= found.ttc_s).all()
     assert (found.ttc_without_sensor_s == found.sensor_ttc_s[::-1]).all()
     assert (found.ttc_s > found.sensor_ttc_s[0]).any()
     for rate_hz in (10.001, 13, 20):
         faster = sighted(
-            mounted(few, few | {"name": "fast", "rate_hz": rate_hz}), crossing(), Criterion(points=6), phases=3
+            mounted(few, few | {"name": "fast", "rate_hz": rate_hz}), crossing(), Criterion(points=6), num_start_offsets=3
         )
         assert (faster.ttc_s >= found.ttc_s).all()
 
 
 def test_a_sensor_that_is_slower_than_the_encounter_is_too_late():
     with pytest.warns(UserWarning, match=r"3 looks of sensor 'top' take 3 s, .* ends after 0.98"):
-        found = sighted(mounted(lidar(rate_hz=1)), crossing(), Criterion(), phases=2)
+        found = sighted(mounted(lidar(rate_hz=1)), crossing(), Criterion(), num_start_offsets=2)
     assert not found.ttc_s.any()
     assert found.ttc_s.max() < found.censoring_ttc_s
     unseen = crossing(20.0, {"approach_distance_m": None, "speed_kmh": 0}, seconds=2)
     with pytest.warns(UserWarning, match="too late, whatever it sees"):
-        found = sighted(mounted(lidar(rate_hz=1)), unseen, Criterion(), phases=2)
+        found = sighted(mounted(lidar(rate_hz=1)), unseen, Criterion(), num_start_offsets=2)
     assert not found.ttc_s.any()
     assert found.ttc_s.max() < found.censoring_ttc_s
 
@@ -287,7 +287,7 @@ def test_a_sensor_that_is_slower_than_the_encounter_is_too_late():
 def test_fog_hides_what_is_beyond_and_it_is_said_what_was_there_from_the_beginning():
     far = crossing(72.0, {"approach_distance_m": None, "speed_kmh": 0}, seconds=3)
     sensor = lidar(channels=60, vertical_fov_deg=[-4, 0], columns=7200, max_range_m=80)
-    found = [sighted(mounted(sensor), case, Criterion(points=1), phases=2) for case in (
+    found = [sighted(mounted(sensor), case, Criterion(points=1), num_start_offsets=2) for case in (
         far, far.model_copy(update={"weather": crossing(weather="fog_50m").weather}))]  # fmt: skip
     assert found[0].ttc_s.min() >= found[0].censoring_ttc_s
     assert found[0].ttc_s.min() > 2.5

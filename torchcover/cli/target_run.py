@@ -92,5 +92,5 @@ def _print(seen: TargetMap) -> None:
     )
     worst = build_positions_table(seen.find_worst_positions(), "The places with the fewest points, 1 m apart")
     print_page_tables([build_sides_table(seen), worst])
-    if unknown := seen.counts["share_unknown"]:
+    if unknown := seen.counts["surface_share_unobserved"]:
         console.print(f"{unknown:,} places show no surface to any random place: their share is unknown.")
