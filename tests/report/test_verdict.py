@@ -57,7 +57,7 @@ def test_without_errors_nothing_is_told(pair, blind, trios, regions):
         assert summarize_findings(CoverageTable.from_coverages(coverages, AHEAD)) == ()
     (sentence,) = summarize_findings(CoverageTable.from_coverages(trios(4), AHEAD))
     assert sentence == (
-        "Not enough frames for an answer: 4 frames form 4 blocks, 9 are needed (about 9 frames (`--num-frames`)."
+        "Not enough frames for an answer: 4 frames form 4 blocks, 9 are needed (about 9 frames; `--num-frames`)."
     )
     assert summarize_findings(CoverageTable.from_coverages(pair, regions[1:])) == ()
 
