@@ -53,7 +53,7 @@ def test_plain_folder_preserves_written_frames(both, tmp_path):
     assert len(again) == 3
     for written, read in zip(both, again, strict=True):
         assert len(read.sensor) == len(written.sensor) > 100
-        torch.testing.assert_close(in_order(read.sensor), in_order(written.landed()), rtol=0, atol=1e-12)
+        torch.testing.assert_close(in_order(read.sensor), in_order(written.get_measured_points()), rtol=0, atol=1e-12)
         assert torch.equal(read.reference, written.reference)
         assert torch.equal(read.reference_weights, written.reference_weights)
         assert torch.equal(read.boxes.rows, written.boxes.rows)
@@ -84,8 +84,8 @@ def test_poses_are_of_the_ego_and_cities_separate(both, tmp_path):
     write_recording(both, tmp_path)
     recording = open_recording(tmp_path)
     for index in range(3):
-        scene, step = both.simulator.scene_of(index)
-        expected = scene.world.ego.trajectory.at(step * scene.world.time_step_s)
+        geometry, step = both.simulator.get_scene_geometry(index)
+        expected = geometry.scene.ego.trajectory.interpolate(step * geometry.scene.time_step_s)
         np.testing.assert_allclose(recording.get_world_T_vehicle(index), expected, atol=1e-12)
     apart_s, cities = np.diff(recording.times_s), np.diff(recording.block_indices)
     assert set(cities) == {0, 1}
@@ -163,7 +163,7 @@ def test_without_boxes_none_are_written(tmp_path):
 
 
 def test_unsupported_recordings_are_refused_before_the_first_frame(both, tmp_path, monkeypatch):
-    monkeypatch.setattr(both.simulator, "step", lambda index: pytest.fail("a step was simulated"))
+    monkeypatch.setattr(both.simulator, "simulate_frame", lambda index: pytest.fail("a step was simulated"))
     with pytest.raises(ValueError, match=r"format 'bag': recordings are written as folder or kitti"):
         write_recording(both, tmp_path, "bag")
     with pytest.raises(ValueError, match=r"format kitti: a rig of one LiDAR is needed; both has z front, a rear"):
