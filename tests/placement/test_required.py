@@ -30,7 +30,7 @@ def child(**changes):
 def lot(tmp_path_factory):
     """Its file: a space names its worlds."""
     path = tmp_path_factory.mktemp("scenes") / "lot.yaml"
-    traffic = {"type": "parking", "duration_s": 1.0, "time_step_s": 0.2, "crossings": 0, "parked_share": 0.3}
+    traffic = {"type": "parking", "duration_s": 1.0, "time_step_s": 0.2, "crossings_per_aisle": 0, "parked_share": 0.3}
     path.write_text(json.dumps({"name": "lot", "ego": EGO, "traffic": traffic}))
     return str(path)
 

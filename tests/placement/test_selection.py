@@ -33,7 +33,7 @@ SPACE = {
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     path = tmp_path_factory.mktemp("choice")
-    traffic = {"type": "parking", "duration_s": 1.0, "time_step_s": 0.2, "crossings": 0, "parked_share": 0.3}
+    traffic = {"type": "parking", "duration_s": 1.0, "time_step_s": 0.2, "crossings_per_aisle": 0, "parked_share": 0.3}
     (path / "lot.yaml").write_text(yaml.safe_dump({"name": "lot", "ego": EGO, "traffic": traffic}))
     return path
 
