@@ -52,13 +52,13 @@ def test_three_rigs_have_ranks_and_taus_in_every_file(torchcover, worlds):
     assert all(tau["low"] == "" for tau in taus)  # two instants are too few to draw again
     assert {"metrics.csv", "metrics_rank_correlation.csv"} <= set(summary["files"])
     page = (out / "report.html").read_text()
-    assert "Metrics of others" in page
+    assert "Published metrics" in page
     assert "tau-b" in page
 
 
 def test_two_rigs_have_no_tau_and_are_told_why(torchcover, worlds):
     _, printed, _, out = run(torchcover, worlds, "low", "both", options=["--set", "metrics=point_density"])
-    assert "needs three rigs or more" in " ".join(printed.split())
+    assert "needs at least three rigs" in " ".join(printed.split())
     assert json.loads((out / "summary.json").read_text())["metrics"]["tau"] == []
 
 

@@ -347,7 +347,7 @@ def test_frames_without_boxes_are_refused_with_the_way_to_them(name):
 
 def test_square_metres_that_are_missing_are_refused():
     frame = replace(CASES["k-cover"].frames[0]["frame"], reference_weights=None)
-    with pytest.raises(ValueError, match="square metres"):
+    with pytest.raises(ValueError, match="the areas of its reference points"):
         CASES["k-cover"].make().update(frame)
     CASES["k-cover"].make(has_area_weights=False).update(frame)
     CASES["object coverage"].make().update(frame)

@@ -1,6 +1,6 @@
-"""Coverage metrics that others published, on the same frames: `PUBLISHED` has them by name.
+"""Published coverage metrics on the same frames; `PUBLISHED` lists them by name.
 
-Nothing imports this package: `evaluate(metrics=...)` loads it by its name.
+No other package imports this one: `evaluate(metrics=...)` loads it by its name.
 """
 
 import lazy_loader

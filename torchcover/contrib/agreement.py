@@ -1,4 +1,4 @@
-"""Whether metrics rank sensor placements as detectors do, and how much that can mean."""
+"""Rank correlation of metrics with detectors over sensor placements, with confidence intervals and p-values."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -20,28 +20,29 @@ from torchcover.contrib.ranks import (
 from torchcover.files import guard_reader, read_csv
 from torchcover.geometry.arrays import Float64, Int64
 
-# What the best of several metrics that mean nothing exceeds in one of twenty orders.
+# Quantile of the strongest correlation of meaningless metrics that serves as threshold of chance.
 BY_CHANCE = 0.95
-# Of a table of published results.
+# Text columns of a table of published results.
 COLUMNS = ("placement", "quantity", "model", "class")
 
 
 @dataclass(frozen=True, eq=False)
 class PlacementRatings:
-    """What several judges, detectors or trainings of one, say of the same placements.
+    """Ratings of placements by several raters (detectors, or trainings of one detector).
 
     Args:
-        name: What they say: "car mAP".
+        name: Name of the rating: "car mAP".
         placements: Names of the n placements.
-        raters: Names of the J judges.
-        values: (J, n) what each says of each; more is better.
+        raters: Names of the J raters.
+        values: (J, n) ratings; higher is better.
 
     Raises:
         ValueError: Values of another shape, or that are not finite.
 
     Example:
-        >>> judged = Judged("AP", ("a", "b", "c"), ("net", "other"), np.array([[1.0, 2.0, 3.0], [2.0, 1.0, 3.0]]))
-        >>> judged.mean.tolist(), judged.ceiling
+        >>> values = np.array([[1.0, 2.0, 3.0], [2.0, 1.0, 3.0]])
+        >>> judged = PlacementRatings("AP", ("a", "b", "c"), ("net", "other"), values)
+        >>> judged.mean.tolist(), judged.inter_rater_correlation
         ([1.5, 1.5, 3.0], 0.5)
     """
 
@@ -59,23 +60,29 @@ class PlacementRatings:
 
     @property
     def mean(self) -> Float64:
-        """(n,) mean over the judges."""
+        """(n,) mean over the raters."""
         return np.asarray(self.values.mean(axis=0))
 
     @property
     def inter_rater_correlation(self) -> float:
-        """Mean Spearman correlation of each two judges: what they agree on; NaN for a single one.
+        """Mean Spearman correlation of all pairs of raters; NaN for a single rater.
 
-        A metric cannot be expected to follow them more closely than they follow each other.
+        It limits the correlation that a metric can be expected to reach.
         """
         pairs = [compute_spearman(self.values[a], self.values[b]) for a, b in combinations(range(len(self.raters)), 2)]
         return float(np.mean(pairs)) if pairs else float("nan")
 
     def select(self, placements: Sequence[str]) -> Self:
-        """Of some of the placements, in another order.
+        """Select some of the placements.
+
+        Args:
+            placements: Names in the desired order.
+
+        Returns:
+            Ratings of these placements.
 
         Raises:
-            ValueError: One that they say nothing of.
+            ValueError: A placement without ratings.
         """
         if missing := [name for name in placements if name not in self.placements]:
             raise ValueError(f"{self.name}: nothing is known of {', '.join(missing)}")
@@ -85,10 +92,16 @@ class PlacementRatings:
 
 @guard_reader("a table of published results")
 def read_results(path: Path) -> Mapping[tuple[str, str], PlacementRatings]:
-    """The results of a table in CSV with the columns placement, quantity, model, class and value.
+    """Read a CSV table with the columns placement, quantity, model, class and value.
+
+    Args:
+        path: Path of the table.
+
+    Returns:
+        (quantity, class) -> ratings of all placements by all models.
 
     Raises:
-        BadFileError: Not such a table, a number that is there twice or missing.
+        BadFileError: Another content, or a repeated or missing value.
     """
     table = read_csv(path, number_columns=("value",), text_columns=COLUMNS)
     found: dict[tuple[str, str], dict[tuple[str, str], float]] = {}
@@ -119,15 +132,23 @@ class RankCorrelation(NamedTuple):
 
     @classmethod
     def from_samples(cls, value: float, sampled_values: Float64) -> Self:
-        """Of a number, and what it is in draws."""
+        """Compute the interval from bootstrap values.
+
+        Args:
+            value: Rank correlation.
+            sampled_values: (R,) bootstrap values.
+
+        Returns:
+            Correlation with its interval.
+        """
         return cls(value, *compute_bootstrap_interval95(value, sampled_values))
 
     @property
     def text(self) -> str:
-        """Both.
+        """Correlation and interval as text.
 
         Example:
-            >>> Relation(0.857, 0.5, 0.95).words
+            >>> RankCorrelation(0.857, 0.5, 0.95).text
             '+0.86 [+0.50, +0.95]'
         """
         return "-" if math.isnan(self.value) else f"{self.value:+.2f} [{self.low:+.2f}, {self.high:+.2f}]"
@@ -135,14 +156,14 @@ class RankCorrelation(NamedTuple):
 
 @dataclass(frozen=True)
 class MetricCorrelation:
-    """How one metric ranks the placements.
+    """Rank correlation of one metric with the ratings.
 
     Args:
-        metric: Its name.
-        spearman: Spearman's rank correlation with the mean of the judges.
-        kendall: Kendall's tau-b with it.
-        p_value: Probability of a Spearman correlation as strong, of either sign, by chance; of this metric alone.
-        resamples_scenes: Whether the intervals are over worlds too, or over judges only.
+        metric: Name of the metric.
+        spearman: Spearman's rank correlation with the mean of the raters.
+        kendall: Kendall's tau-b with the mean of the raters.
+        p_value: Two-sided probability of a Spearman correlation as strong by chance, for this metric alone.
+        resamples_scenes: True if the intervals are over scenes and raters, False if over raters only.
     """
 
     metric: str
@@ -154,14 +175,14 @@ class MetricCorrelation:
 
 @dataclass(frozen=True)
 class MetricAgreement:
-    """How metrics rank placements, compared with what judges say of them.
+    """Rank correlations of several metrics with the ratings of placements.
 
     Args:
-        ratings: What the judges say.
-        correlations: A row for each metric.
+        ratings: Ratings of the placements.
+        correlations: One entry for each metric.
         best_metric: The metric with the strongest Spearman correlation, of either sign; None if none has one.
-        best_p_value: Probability that the best of so many metrics that mean nothing is as strong.
-        chance_threshold: What the best of them exceeds in one of twenty orders.
+        best_p_value: Probability that the best of the same number of meaningless metrics is as strong.
+        chance_threshold: 95 % quantile of the strongest correlation of meaningless metrics.
     """
 
     ratings: PlacementRatings
@@ -172,7 +193,7 @@ class MetricAgreement:
 
     @property
     def metric_count(self) -> int:
-        """How many metrics have a rank correlation."""
+        """Number of metrics with a rank correlation."""
         return sum(not math.isnan(row.spearman.value) for row in self.correlations)
 
 
@@ -183,26 +204,28 @@ def correlate_rankings(
     num_samples: int = DRAWS,
     resample_placements: bool = False,
 ) -> MetricAgreement:
-    """Rank placements by metrics, and compare with the mean of the judges.
+    """Correlate rankings by metrics with the mean of the raters.
 
-    The intervals are those of a bootstrap: judges are drawn anew, and with them the worlds of the metrics that have
-    `num_samples`. The placements are the same in each draw, unless they too are a sample.
+    Intervals come from a bootstrap over raters, and over scenes for metrics with bootstrap values.
 
     Args:
-        rankings: What the metrics say of the placements of `ratings`, in its order.
-        ratings: What the judges say.
-        num_samples: How often; at most as many as the rankings have.
-        resample_placements: Whether to draw placements, too.
+        rankings: Rankings of the placements, in the order of `ratings`.
+        ratings: Ratings of the placements.
+        num_samples: Number of bootstrap samples; at most that of the rankings.
+        resample_placements: True: the placements are resampled, too.
+
+    Returns:
+        Correlations, and the significance of the best metric.
 
     Raises:
-        ValueError: A metric of another number of placements, or with fewer draws.
+        ValueError: A metric with another number of placements, or with fewer bootstrap samples.
 
     Example:
         >>> from torchcover.estimation import Quantity
-        >>> judged = Judged("AP", tuple("abcd"), ("net", "other"), np.array([[1.0, 2, 3, 4], [1, 2, 4, 3]]))
-        >>> height = Ranking.of_values(Quantity("height", "mean height", "m", lower_is_better=False), [1.0, 2, 3, 3])
-        >>> found = correlate_rankings([height], judged, draws=100)
-        >>> round(found.ranked[0].spearman.value, 3), found.best, found.looked_at
+        >>> judged = PlacementRatings("AP", tuple("abcd"), ("net", "other"), np.array([[1.0, 2, 3, 4], [1, 2, 4, 3]]))
+        >>> height = Ranking.from_values(Quantity("height", "mean height", "m", lower_is_better=False), [1.0, 2, 3, 3])
+        >>> found = correlate_rankings([height], judged, num_samples=100)
+        >>> round(found.correlations[0].spearman.value, 3), found.best_metric, found.metric_count
         (1.0, 'height', 1)
     """
     count = len(ratings.placements)
@@ -213,8 +236,8 @@ def correlate_rankings(
             raise ValueError(
                 f"{one.name}: a value of each of {count} placements is needed, and {num_samples} draws or none"
             )
-    truths, columns = _drawn(ratings, num_samples, placements=resample_placements)
-    ranked = tuple(_ranked(one, ratings.mean, truths, columns) for one in rankings)
+    truths, columns = _resample_ratings(ratings, num_samples, placements=resample_placements)
+    ranked = tuple(_correlate_ranking(one, ratings.mean, truths, columns) for one in rankings)
     strength = np.array([abs(row.spearman.value) for row in ranked])
     if np.isnan(strength).all():
         return MetricAgreement(ratings, ranked, None, math.nan, math.nan)
@@ -236,49 +259,52 @@ def compare_correlations(
     num_samples: int = DRAWS,
     resample_placements: bool = False,
 ) -> RankCorrelation:
-    """By how much Spearman's correlation of a metric is above that of another one, with its interval.
+    """Compute the difference of the Spearman correlations of two metrics, with its interval.
 
-    Both are held against the same draws, so that what they share cancels out.
+    Both use the same bootstrap samples, so that common variation cancels out.
 
     Args:
-        first: The metric.
-        second: What it is to beat.
-        ratings: As in `correlate_rankings`, and so are all that follow.
-        num_samples: How often.
-        resample_placements: Whether to draw placements, too.
+        first: Metric.
+        second: Metric to subtract.
+        ratings: Ratings of the placements.
+        num_samples: Number of bootstrap samples.
+        resample_placements: True: the placements are resampled, too.
+
+    Returns:
+        Difference of the correlations with its interval.
 
     Example:
         >>> from torchcover.estimation import Quantity
-        >>> judged = Judged("AP", tuple("abcd"), ("net",), np.array([[1.0, 2, 3, 4]]))
+        >>> judged = PlacementRatings("AP", tuple("abcd"), ("net",), np.array([[1.0, 2, 3, 4]]))
         >>> height = Quantity("height", "mean height", "m", lower_is_better=False)
-        >>> good, bad = (Ranking.of_values(height, values) for values in ([1.0, 2, 3, 4], [4.0, 3, 2, 1]))
-        >>> lead(good, bad, judged)
-        Relation(value=2.0, low=2.0, high=2.0)
+        >>> good, bad = (Ranking.from_values(height, values) for values in ([1.0, 2, 3, 4], [4.0, 3, 2, 1]))
+        >>> compare_correlations(good, bad, judged)
+        RankCorrelation(value=2.0, low=2.0, high=2.0)
     """
-    truths, columns = _drawn(ratings, num_samples, placements=resample_placements)
+    truths, columns = _resample_ratings(ratings, num_samples, placements=resample_placements)
     found = [compute_spearman(each.scores, ratings.mean) for each in (first, second)]
-    drawn = [compute_spearman(*_along(each, truths, columns)) for each in (first, second)]
+    drawn = [compute_spearman(*_get_sampled_scores(each, truths, columns)) for each in (first, second)]
     return RankCorrelation.from_samples(float(found[0] - found[1]), drawn[0] - drawn[1])
 
 
-def _drawn(judged: PlacementRatings, draws: int, *, placements: bool) -> tuple[Float64, Int64]:
-    """(R, n) the mean of judges that are drawn anew, and which placements are drawn."""
+def _resample_ratings(judged: PlacementRatings, draws: int, *, placements: bool) -> tuple[Float64, Int64]:
+    """Resample the raters: (R, n) means of the ratings and (R, n) indices of the placements."""
     generator, count = np.random.default_rng(0), len(judged.placements)
     chosen = generator.integers(len(judged.raters), size=(draws, len(judged.raters)))
     columns = generator.integers(count, size=(draws, count)) if placements else np.tile(np.arange(count), (draws, 1))
     return judged.values[chosen].mean(axis=1), columns
 
 
-def _along(one: Ranking, truths: Float64, columns: Int64) -> tuple[Float64, Float64]:
-    """(R, n) what a metric and the judges say in each draw."""
+def _get_sampled_scores(one: Ranking, truths: Float64, columns: Int64) -> tuple[Float64, Float64]:
+    """Return (R, n) scores of a metric and (R, n) mean ratings in each bootstrap sample."""
     drawn = (
         np.broadcast_to(one.scores, truths.shape) if one.sampled_scores is None else one.sampled_scores[: len(truths)]
     )
     return np.take_along_axis(drawn, columns, axis=1), np.take_along_axis(truths, columns, axis=1)
 
 
-def _ranked(one: Ranking, truth: Float64, truths: Float64, columns: Int64) -> MetricCorrelation:
-    drawn = _along(one, truths, columns)
+def _correlate_ranking(one: Ranking, truth: Float64, truths: Float64, columns: Int64) -> MetricCorrelation:
+    drawn = _get_sampled_scores(one, truths, columns)
     rho, tau = (
         RankCorrelation.from_samples(float(statistic(one.scores, truth)), statistic(*drawn))
         for statistic in (compute_spearman, compute_kendall_tau_b)

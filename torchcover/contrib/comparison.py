@@ -1,4 +1,4 @@
-"""Metrics side by side: which rig each thinks best, how alike their orders are, and both in tables and files."""
+"""Comparison of metrics: rankings of rigs, rank correlations, tables and files."""
 
 import json
 import math
@@ -15,19 +15,20 @@ from torchcover.estimation import Number
 from torchcover.files import format_csv
 from torchcover.report import PageTable, TextCell, format_number, get_display_unit, to_json_record
 
-TITLE, TAU_TITLE = "Metrics of others", "Kendall's tau-b with torchcover's numbers, 95 % over worlds"
+TITLE = "Published metrics"
+TAU_TITLE = "Kendall's tau-b with the coverage numbers, 95 % over scenes"
 
-NOT_VALIDATED = "None of these metrics is validated; docs/metrics.md says what each is blind to."
-TOO_FEW = "Kendall's tau needs three rigs or more: two are in one order or in the other by chance; there are {}"
-# Of a table with a row for each rig and number.
+NOT_VALIDATED = "None of these metrics is validated; docs/metrics.md lists their limitations."
+TOO_FEW = "Kendall's tau needs at least three rigs, since two have only two orders; got {}"
+# Columns of a table with a row for each rig and number.
 COLUMNS = ("rig", "metric", "name", "value", "error", "low", "high", "unit", "lower_is_better", "count", "counted_items",
            "parameters", "warning", "rank")  # fmt: skip
 
 
 class KendallTau(NamedTuple):
-    """How alike two numbers order the rigs: tau-b of what each holds for better, and its 95 % interval over worlds.
+    """Kendall's tau-b of two numbers over rigs, with its 95 % interval over scenes.
 
-    The interval is NaN where one of the two does not say what it would be over other worlds.
+    The interval is NaN if one of the two numbers has no bootstrap values.
     """
 
     first: str
@@ -40,9 +41,13 @@ class KendallTau(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class MetricComparison:
-    """What metrics of others say of the rigs of a run, compared with torchcover's own numbers of regions.
+    """Published metrics of the rigs of a run, compared with the coverage numbers of regions.
 
-    `omissions` says of a metric that could not be made why.
+    Args:
+        rigs: Names of the rigs.
+        rankings: Rankings by the published metrics.
+        coverage_rankings: Rankings by coverage numbers.
+        omissions: Name of a metric that could not be built -> reason.
     """
 
     rigs: tuple[str, ...]
@@ -52,11 +57,11 @@ class MetricComparison:
 
     @property
     def main_rankings(self) -> list[Ranking]:
-        """The numbers that are about everything, and not about a category or a region only."""
-        return [one for one in self.rankings if not one.is_part]
+        """Rankings by numbers over all data, without those of a category or a region."""
+        return [ranking for ranking in self.rankings if not ranking.is_part]
 
     def compute_taus(self) -> list[KendallTau]:
-        """Of all pairs of the main numbers and torchcover's own; none for fewer than three rigs."""
+        """Compute tau for all pairs of main and coverage numbers; empty for fewer than three rigs."""
         if len(self.rigs) < LEAST:
             return []
         return [
@@ -65,37 +70,39 @@ class MetricComparison:
         ]
 
     def iterate_rows(self) -> Iterator[dict[str, Any]]:
-        """A row of `COLUMNS` for each rig and number, those of parts too; NaN where unknown."""
-        for one in (*self.rankings, *self.coverage_rankings):
-            for rig, number, rank in zip(self.rigs, one.numbers, one.ranks.tolist(), strict=True):
-                given = {**number.quantity._asdict(), **number._asdict(), "rig": rig, "rank": rank}
-                row = {**given, "metric": one.metric, "name": one.name}
+        """Iterate over rows with `COLUMNS`, one for each rig and number; NaN if unknown."""
+        for ranking in (*self.rankings, *self.coverage_rankings):
+            for rig, number, rank in zip(self.rigs, ranking.numbers, ranking.ranks.tolist(), strict=True):
+                row = {**number.quantity._asdict(), **number._asdict(), "rig": rig, "rank": rank}
+                row |= {"metric": ranking.metric, "name": ranking.name}
                 yield {column: row[column] for column in COLUMNS}
 
     @property
     def notes(self) -> list[str]:
-        """What a reader is to know."""
-        few = [] if len(self.rigs) >= LEAST else [f"{TOO_FEW.format(len(self.rigs))}."]
-        warned: dict[str, dict[str, None]] = {}  # what to say of which metrics
-        for one in self.rankings:
-            for number in one.numbers:
+        """Notes for the reader: validation, warnings and omitted metrics."""
+        too_few_rigs = [] if len(self.rigs) >= LEAST else [f"{TOO_FEW.format(len(self.rigs))}."]
+        warned: dict[str, dict[str, None]] = {}  # metrics by warning
+        for ranking in self.rankings:
+            for number in ranking.numbers:
                 if number.warning:
-                    warned.setdefault(number.warning, {})[one.metric] = None
+                    warned.setdefault(number.warning, {})[ranking.metric] = None
         warnings = [f"{', '.join(metrics)}: {warning}" for warning, metrics in warned.items()]
-        along_rays = [one for one in self.main_rankings if one.metric.startswith("s_mig")]
-        rays = [
-            note
-            for one in along_rays
-            if (note := describe_unequal_rays(dict(zip(self.rigs, one.numbers, strict=True))))
-        ]
-        missing = [f"Without {name}: {why}" for name, why in (self.omissions or {}).items()]
-        return [NOT_VALIDATED, *few, *warnings, *rays, *missing]
+        ray_notes = []
+        for ranking in self.main_rankings:
+            if ranking.metric.startswith("s_mig"):
+                note = describe_unequal_rays(dict(zip(self.rigs, ranking.numbers, strict=True)))
+                ray_notes += [note] if note else []
+        missing = [f"Without {name}: {reason}" for name, reason in (self.omissions or {}).items()]
+        return [NOT_VALIDATED, *too_few_rigs, *warnings, *ray_notes, *missing]
 
     def build_page_tables(self, *, include_parts: bool = True) -> list[PageTable]:
-        """Return the table of numbers, and that of Kendall's tau if there are three rigs or more.
+        """Build the table of numbers, and that of Kendall's tau for at least three rigs.
 
         Args:
-            include_parts: Whether numbers of a category or a region are rows too.
+            include_parts: True: include numbers of a category or a region.
+
+        Returns:
+            The tables.
         """
         rows = [
             [TextCell(cell) for cell in _format_row(ranking)]
@@ -103,7 +110,7 @@ class MetricComparison:
         ]
         headings = ["metric", "unit", "better", *self.rigs]
         title = f"{TITLE} (rank)" if len(self.rigs) > 1 else TITLE
-        return [PageTable(title, headings, rows, 3, self.notes), *_tau_tables(self)]
+        return [PageTable(title, headings, rows, 3, self.notes), *_build_tau_tables(self)]
 
     @property
     def record(self) -> dict[str, Any]:
@@ -131,40 +138,51 @@ class MetricComparison:
 
 
 def compute_tau(first: Ranking, second: Ranking) -> KendallTau:
-    """Kendall's tau-b of two numbers, each turned so that more is better, and its interval over drawn worlds."""
+    """Compute Kendall's tau-b of two numbers, with the sign for which higher is better, and its bootstrap interval.
+
+    Args:
+        first: Ranking of the rigs.
+        second: Ranking of the same rigs.
+
+    Returns:
+        Tau with its 95 % interval over scenes.
+    """
     value = float(compute_kendall_tau_b(first.scores, second.scores))
-    known = int((~np.isnan(first.scores + second.scores)).sum())
+    num_known = int((~np.isnan(first.scores + second.scores)).sum())
     low = high = math.nan
     if first.sampled_scores is not None and second.sampled_scores is not None:
         low, high = compute_bootstrap_interval95(
             value, compute_kendall_tau_b(first.sampled_scores, second.sampled_scores)
         )
-    return KendallTau(first.name, second.name, value, low, high, known)
+    return KendallTau(first.name, second.name, value, low, high, num_known)
 
 
-def _format_row(one: Ranking) -> list[str]:
-    better = "less" if one.quantity.lower_is_better else "more"
-    ranks = one.ranks.tolist() if len(one.numbers) > 1 else [math.nan]
-    return [one.name, get_display_unit(one.quantity.unit).name, better, *map(_words, one.numbers, ranks)]
+def _format_row(ranking: Ranking) -> list[str]:
+    better = "less" if ranking.quantity.lower_is_better else "more"
+    ranks = ranking.ranks.tolist() if len(ranking.numbers) > 1 else [math.nan]
+    cells = [_format_ranked_number(number, rank) for number, rank in zip(ranking.numbers, ranks, strict=True)]
+    return [ranking.name, get_display_unit(ranking.quantity.unit).name, better, *cells]
 
 
-def _words(number: Number, rank: float) -> str:
+def _format_ranked_number(number: Number, rank: float) -> str:
     if not number.has_value:
         return "–"
     return format_number(number) if math.isnan(rank) else f"{format_number(number)} ({rank:g})"
 
 
-def _tau_tables(comparison: MetricComparison) -> list[PageTable]:
-    """A row for each main number; no table if there are no taus."""
-    found = {(tau.first, tau.second): tau for tau in comparison.compute_taus()}
-    # Numbers of torchcover that the table has room for: the detections.
-    shown = [own.name for own in comparison.coverage_rankings if not own.quantity.lower_is_better]
-    mains = [one.name for one in comparison.main_rankings if found]
-    rows = [[TextCell(name), *(TextCell(_tau_words(found[name, own])) for own in shown)] for name in mains]
-    return [PageTable(TAU_TITLE, ["metric", *shown], rows)] if rows else []
+def _build_tau_tables(comparison: MetricComparison) -> list[PageTable]:
+    """Build the table with a row for each main number; none without taus."""
+    taus = {(tau.first, tau.second): tau for tau in comparison.compute_taus()}
+    # The table shows detection rates only, for lack of space.
+    columns = [ranking.name for ranking in comparison.coverage_rankings if not ranking.quantity.lower_is_better]
+    rows = []
+    for ranking in comparison.main_rankings if taus else ():
+        cells = [TextCell(_format_tau(taus[ranking.name, column])) for column in columns]
+        rows.append([TextCell(ranking.name), *cells])
+    return [PageTable(TAU_TITLE, ["metric", *columns], rows)] if rows else []
 
 
-def _tau_words(tau: KendallTau) -> str:
+def _format_tau(tau: KendallTau) -> str:
     if math.isnan(tau.tau):
         return "–"
     interval = "" if math.isnan(tau.low) else f" [{tau.low:+.2f}, {tau.high:+.2f}]"

@@ -1,4 +1,4 @@
-"""Rigs in the order of a number, how alike two such orders are, and whether that is more than chance."""
+"""Rankings of rigs by a number, rank correlations and their significance."""
 
 import math
 from collections.abc import Sequence
@@ -12,28 +12,30 @@ from scipy.stats import permutation_test, rankdata
 from torchcover.estimation import MIN_BLOCKS, Estimate, Number, Quantity
 from torchcover.geometry.arrays import Float64
 
-# Two things have two orders, and are alike or opposite by chance.
+# Two items have only two orders, so a rank correlation needs at least three.
 LEAST = 3
-# All permutations of eight values; of more values as many are sampled.
+# Number of permutations of eight values; for more values, this number of permutations is sampled.
 MAX_PERMUTATIONS = math.factorial(8)
-# Worlds are drawn again so many times for intervals.
+# Number of bootstrap samples of scenes for intervals.
 DRAWS = 500
-# The metric that numbers of torchcover itself are of; and what takes no simulation to know, or little.
-OWN, BASELINE = "torchcover", "baseline"
+# Metric name of the numbers of torchcover.
+OWN = "torchcover"
+# Metric name of properties of a rig that need no simulation.
+BASELINE = "baseline"
 
 
 class Ranking(NamedTuple):
-    """One number of every rig, which ranks them.
+    """Ranking of rigs by one number.
 
     Args:
-        name: Of the number, with all that decides it.
-        metric: The published metric that it is of, `OWN` or `BASELINE`.
-        numbers: One for each rig.
-        samples: (R, rigs) what they were in worlds that are drawn again; None if that is unknown.
+        name: Name of the number with its parameters.
+        metric: Published metric of the number, `OWN` or `BASELINE`.
+        numbers: One number for each rig.
+        samples: (R, rigs) bootstrap values over resampled scenes; None if unknown.
 
     Example:
         >>> height = Quantity("height", "mean mounting height", "m", lower_is_better=False)
-        >>> Ranking.of_values(height, [2.2, 2.5, 2.2]).ranks.tolist()
+        >>> Ranking.from_values(height, [2.2, 2.5, 2.2]).ranks.tolist()
         [2.5, 1.0, 2.5]
     """
 
@@ -50,36 +52,53 @@ class Ranking(NamedTuple):
         metric: str = BASELINE,
         samples: Float64 | None = None,
     ) -> "Ranking":
-        """Of values (rigs,) without errors."""
+        """Build a ranking from values without errors.
+
+        Args:
+            quantity: Description of the values.
+            values: (rigs,) values.
+            metric: Name of the metric.
+            samples: (R, rigs) bootstrap values; None if unknown.
+
+        Returns:
+            The ranking.
+        """
         return cls(quantity.key, metric, tuple(Number(quantity, float(value)) for value in values), samples)
 
     @property
     def quantity(self) -> Quantity:
-        """What the numbers are."""
+        """Description of the numbers."""
         return self.numbers[0].quantity
 
     @property
     def is_part(self) -> bool:
-        """Whether it is about a part only of what another number is about: a category, a region."""
+        """True for numbers of a part of the data (a category, a region)."""
         return ":" in self.name
 
     @property
     def scores(self) -> Float64:
-        """(rigs,) the values, with the sign turned so that more is better; NaN where unknown."""
+        """(rigs,) values with the sign for which higher is better; NaN if unknown."""
         return np.array([number.quantity.compute_improvement(number.value) for number in self.numbers])
 
     @property
     def sampled_scores(self) -> Float64 | None:
-        """(R, rigs) likewise those of the draws."""
+        """(R, rigs) bootstrap values with the sign for which higher is better."""
         return None if self.samples is None else self.quantity.compute_improvement(1.0) * self.samples
 
     @property
     def ranks(self) -> Float64:
-        """(rigs,) 1 for the best; equal ones share the mean of theirs, NaN where unknown."""
+        """(rigs,) ranks, 1 for the best; equal values share their mean rank, NaN if unknown."""
         return rank_values(-self.scores)
 
     def select(self, rig_indices: Sequence[int]) -> "Ranking":
-        """Of some of the rigs, by their places, in another order."""
+        """Select some of the rigs.
+
+        Args:
+            rig_indices: Indices of the rigs in the desired order.
+
+        Returns:
+            Ranking of the selected rigs.
+        """
         numbers = tuple(self.numbers[rig] for rig in rig_indices)
         return self._replace(
             numbers=numbers, samples=None if self.samples is None else self.samples[:, list(rig_indices)]
@@ -89,35 +108,60 @@ class Ranking(NamedTuple):
 def build_rankings(
     metric: str, numbers: Sequence[Sequence[Number]], estimates: Sequence[Estimate], seed: int
 ) -> list[Ranking]:
-    """A ranking by each number of a metric, the same of each rig, with draws of worlds from what they come from.
+    """Build a ranking for each number of a metric, with bootstrap values over scenes.
 
-    The seed is the same for all metrics of a run.
+    Args:
+        metric: Name of the metric.
+        numbers: Numbers of each rig, in the same order for all rigs.
+        estimates: Estimate of each rig from which the numbers come.
+        seed: Seed of the bootstrap, the same for all metrics of a run.
+
+    Returns:
+        One ranking for each number.
     """
-    draws = [resample_estimate(estimate, seed) for estimate in estimates]
-    known = [each for each in draws if each is not None]
-    stacked = np.stack(known, axis=2) if len(known) == len(draws) else None
-    return [
-        Ranking(each[0].quantity.key, metric, each, None if stacked is None else stacked[:, at])
-        for at, each in enumerate(zip(*numbers, strict=True))
-    ]
+    samples = [resample_estimate(estimate, seed) for estimate in estimates]
+    available = [sample for sample in samples if sample is not None]
+    stacked = np.stack(available, axis=2) if len(available) == len(samples) else None
+    rankings = []
+    for index, rig_numbers in enumerate(zip(*numbers, strict=True)):
+        number_samples = None if stacked is None else stacked[:, index]
+        rankings.append(Ranking(rig_numbers[0].quantity.key, metric, rig_numbers, number_samples))
+    return rankings
 
 
 def resample_estimate(estimate: Estimate, seed: int) -> Float64 | None:
-    """(R, Q) numbers over worlds that are drawn with replacement; None if too few, or what that gives, are known."""
-    worlds = len(estimate.frame_counts)
-    if worlds < MIN_BLOCKS:
+    """Resample the scenes of an estimate with replacement.
+
+    Args:
+        estimate: Estimate of Q numbers.
+        seed: Seed of the bootstrap.
+
+    Returns:
+        (R, Q) bootstrap values; None for fewer than 8 blocks or if the estimate cannot be recomputed.
+    """
+    num_blocks = len(estimate.frame_counts)
+    if num_blocks < MIN_BLOCKS:
         return None
-    drawn = np.random.default_rng([seed, worlds]).multinomial(worlds, np.full(worlds, 1 / worlds), size=DRAWS)
-    again = estimate.resample(torch.from_numpy(drawn))
-    return None if again is None else again.cpu().numpy()
+    rng = np.random.default_rng([seed, num_blocks])
+    block_weights = rng.multinomial(num_blocks, np.full(num_blocks, 1 / num_blocks), size=DRAWS)
+    values = estimate.resample(torch.from_numpy(block_weights))
+    return None if values is None else values.cpu().numpy()
 
 
 def compute_bootstrap_interval95(value: float, sampled_values: Float64) -> tuple[float, float]:
-    """Ends of the 95 % interval of a number by what it is in draws; NaN where it, or all of them, are unknown."""
-    known = sampled_values[~np.isnan(sampled_values)]
-    if math.isnan(value) or not known.size:
+    """Compute the 95 % bootstrap interval of a number.
+
+    Args:
+        value: The number.
+        sampled_values: (R,) bootstrap values; NaN are ignored.
+
+    Returns:
+        Lower and upper end; NaN if the number or all bootstrap values are unknown.
+    """
+    finite_values = sampled_values[~np.isnan(sampled_values)]
+    if math.isnan(value) or not finite_values.size:
         return math.nan, math.nan
-    low, high = np.quantile(known, (0.025, 0.975)).tolist()
+    low, high = np.quantile(finite_values, (0.025, 0.975)).tolist()
     return low, high
 
 
@@ -125,7 +169,10 @@ def rank_values(values: ArrayLike) -> Float64:
     """Rank values from 1, the smallest; equal values share the mean of their ranks, NaN stays NaN.
 
     Args:
-        values: (..., n).
+        values: (..., n) values.
+
+    Returns:
+        (..., n) ranks.
     """
     ranks: Float64 = rankdata(np.asarray(values, dtype=np.float64), axis=-1, nan_policy="omit")
     return ranks
@@ -140,37 +187,45 @@ def compute_kendall_tau_b(first: ArrayLike, second: ArrayLike) -> Float64:
     239). `scipy.stats.kendalltau` takes one pair of series; a bootstrap has thousands.
 
     Args:
-        first: (..., n), NaN where unknown; a value that is unknown in one series is in no pair.
-        second: (..., n), likewise; the two broadcast.
+        first: (..., n) series, NaN if unknown; values that are unknown in one series are excluded from all pairs.
+        second: (..., n) series; the two broadcast.
 
     Returns:
-        (...); NaN for fewer than three known values, or if all values of a series are equal.
+        (...) tau-b; NaN for fewer than three known values, or if all values of a series are equal.
     """
-    one, other = _mask_unknown(first, second)
+    first_known, second_known = _mask_unknown(first, second)
     signs = []
-    for values in (one, other):
+    for values in (first_known, second_known):
         left, right = values[..., :, None], values[..., None, :]
         signs.append((left > right).astype(np.float64) - (left < right))
     agreement = (signs[0] * signs[1]).sum(axis=(-2, -1))
     untied = [np.abs(sign).sum(axis=(-2, -1)) for sign in signs]
-    return _divide(agreement, np.sqrt(untied[0] * untied[1]), one)
+    return _divide(agreement, np.sqrt(untied[0] * untied[1]), first_known)
 
 
 def compute_spearman(first: ArrayLike, second: ArrayLike) -> Float64:
-    """Compute Spearman's rank correlation: Pearson's of the ranks, so that ties are right; else as `compute_kendall_tau_b`."""
+    """Compute Spearman's rank correlation, Pearson's correlation of the ranks, which handles ties.
+
+    Args:
+        first: (..., n) series, NaN if unknown.
+        second: (..., n) series; the two broadcast.
+
+    Returns:
+        (...) correlation; NaN under the same conditions as `compute_kendall_tau_b`.
+    """
     masked = _mask_unknown(first, second)
     centered = []
     for values in masked:
         ranks = rank_values(values)
         count = np.maximum(np.isfinite(ranks).sum(axis=-1, keepdims=True), 1)
         centered.append(np.nan_to_num(ranks - np.nansum(ranks, axis=-1, keepdims=True) / count))
-    one, other = centered
-    spread = np.sqrt((one**2).sum(axis=-1) * (other**2).sum(axis=-1))
-    return _divide((one * other).sum(axis=-1), spread, masked[0])
+    first_known, second_known = centered
+    spread = np.sqrt((first_known**2).sum(axis=-1) * (second_known**2).sum(axis=-1))
+    return _divide((first_known * second_known).sum(axis=-1), spread, masked[0])
 
 
 class BestCorrelation(NamedTuple):
-    """How strong the best rank correlation of several series with one target is, and how strong it is by chance.
+    """Strongest rank correlation of several series with one target, compared with chance.
 
     Args:
         strongest: Absolute rank correlation of the best series; NaN if none is known.
@@ -184,14 +239,17 @@ class BestCorrelation(NamedTuple):
 
 
 def check_best_correlation(first: ArrayLike, second: ArrayLike, seed: int = 0) -> BestCorrelation:
-    """Compare the best of several series with what permutations of the target give (`scipy.stats.permutation_test`).
+    """Test the strongest of several rank correlations by permutation of the target (`scipy.stats.permutation_test`).
 
-    All permutations of up to eight values are tried, else as many are sampled.
+    All permutations are used for up to eight values, a sample of the same size for more values.
 
     Args:
-        first: (n,) a series, or (k, n) several: of k metrics that mean nothing, one is always good.
-        second: (n,) the target.
+        first: (n,) series, or (k, n) several series.
+        second: (n,) target.
         seed: Seed of sampled permutations.
+
+    Returns:
+        Strongest correlation and its p-value, corrected for the choice among k series.
     """
     series, target = np.atleast_2d(np.asarray(first, dtype=np.float64)), np.asarray(second, dtype=np.float64)
 
@@ -217,11 +275,13 @@ def check_best_correlation(first: ArrayLike, second: ArrayLike, seed: int = 0) -
 
 
 def _mask_unknown(first: ArrayLike, second: ArrayLike) -> tuple[Float64, Float64]:
-    one, other = np.broadcast_arrays(np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64))
-    unknown = np.isnan(one) | np.isnan(other)
-    return np.where(unknown, math.nan, one), np.where(unknown, math.nan, other)
+    first_known, second_known = np.broadcast_arrays(
+        np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
+    )
+    unknown = np.isnan(first_known) | np.isnan(second_known)
+    return np.where(unknown, math.nan, first_known), np.where(unknown, math.nan, second_known)
 
 
 def _divide(above: Float64, below: Float64, values: Float64) -> Float64:
-    enough = ((~np.isnan(values)).sum(axis=-1) >= LEAST) & (below > 0)
-    return np.where(enough, above / np.where(below > 0, below, 1.0), math.nan)
+    is_defined = ((~np.isnan(values)).sum(axis=-1) >= LEAST) & (below > 0)
+    return np.where(is_defined, above / np.where(below > 0, below, 1.0), math.nan)

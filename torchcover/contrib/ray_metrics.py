@@ -61,7 +61,7 @@ class MSog(BlockedSums, FrameMetric):
         voxel_m: Side of a voxel; the paper does not print its own.
         region: What the voxels fill, 60 x 40 x 4 m as of S-MIG if not given.
         category: Of the boxes that have a label of their own.
-        kwargs: `rig` and `sights` of `FrameMetric`.
+        kwargs: `rig_name` and `query_cache` of `FrameMetric`.
 
     Raises:
         ValueError: No sensor, voxels that do not divide the region or do not fit into the memory. From `update`: a
@@ -88,7 +88,7 @@ class MSog(BlockedSums, FrameMetric):
         voxel_m: float = 0.5,
         region: BoundingBox = REGION,
         category: str = "car",
-        **kwargs: Any,  # noqa: ANN401  (of `FrameMetric`)
+        **kwargs: Any,  # noqa: ANN401  (arguments of `FrameMetric`)
     ) -> None:
         check_sensors(sensors)
         grid = create_voxel_grid(region, voxel_m, BLOCKS * LABELS * 8)
@@ -120,7 +120,7 @@ class MSog(BlockedSums, FrameMetric):
         chosen = 2 * np.bincount(which, weights=votes[voxel >= 0], minlength=len(occupied)) >= points
         return torch.from_numpy(occupied[chosen]), torch.from_numpy(occupied[~chosen])
 
-    def _found(self) -> tuple[Estimate, Sequence[Number]]:
+    def _compute_numbers(self) -> tuple[Estimate, Sequence[Number]]:
         crossed = torch.from_numpy(mark_crossed_by_rays(self.sensors, self.grid).reshape(-1).nonzero()[0])
         about = describe_number(
             f"m_sog_{self.category}_{self.grid.voxel_m:g}m",
@@ -171,7 +171,7 @@ class FalseVisible(SceneRatios):
         grid: Extent and height bands; its cells are made `cell_m` long.
         threshold_m: Distance within which a point counts as seen.
         cell_m: Side of the cells.
-        kwargs: `rig` and `sights` of `FrameMetric`.
+        kwargs: `rig_name` and `query_cache` of `FrameMetric`.
 
     Raises:
         ValueError: No sensors: of a recording, name the rig or give its file; a threshold that is negative.
@@ -192,7 +192,7 @@ class FalseVisible(SceneRatios):
         grid: BevGrid,
         threshold_m: float = 0.4,
         cell_m: float = 1.0,
-        **kwargs: Any,  # noqa: ANN401  (of `FrameMetric`)
+        **kwargs: Any,  # noqa: ANN401  (arguments of `FrameMetric`)
     ) -> None:
         if not sensors:
             raise ValueError(
@@ -220,7 +220,7 @@ class FalseVisible(SceneRatios):
         self.predicted_mask = predicted.flatten()
         self.threshold_m = float(threshold_m)
 
-    def _of_frame(self, frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
+    def _sum_frame(self, frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
         seen = (
             self.query_cache.find_distances_m(frame, get_rig_name(frame, self.rig_name), self.threshold_m)
             <= self.threshold_m

@@ -1,4 +1,4 @@
-"""The metrics of others by the names that `--set metrics=NAME` takes: their needs, and how a run builds them."""
+"""Registry of the published metrics: names for `--set metrics=NAME`, required data and construction."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -17,28 +17,28 @@ from torchcover.frames import FrameSource
 from torchcover.simulation import Sensor
 from torchcover.simulation.shapes import Mesh
 
-# boxes: `Frame.boxes`. sensors: the rig's sensors, with mounts and rays. sensor_points: which points are of which
-# sensor.
+# boxes: `Frame.boxes`; sensors: the sensors of the rig with mounts and rays; sensor_point_counts: number of points of
+# each sensor.
 Need: TypeAlias = Literal["boxes", "sensors", "sensor_point_counts"]
 
 GRID = BevGrid(x_m=(-40.0, 160.0), y_m=(-40.0, 40.0))
-# Of smaller cells most are empty whatever the rig.
+# Most of the smaller cells are empty for every rig, which hides differences in uniformity.
 UNIFORMITY_CELL_M = 1.0
 
 
 @dataclass(frozen=True)
 class MetricSetup:
-    """What metrics of one rig are made from.
+    """Inputs from which the metrics of one rig are built.
 
     Args:
-        rig_name: Its name in `Frame.clouds`; the only one if not given.
-        sensors: Its sensors; empty if they are unknown.
-        ego_mesh: The body that carries it, in the vehicle frame; None if it is unknown.
-        grid: Cells and height bands of the run.
-        regions: Those that numbers are given for.
-        has_area_weights: Whether frames have the square metres of their reference points.
-        threshold_m: Distance within which a point counts as seen.
-        query_cache: What metrics of the same run share, so that each frame is searched once.
+        rig_name: Name of the rig in `Frame.clouds`; may be None if there is only one.
+        sensors: Sensors of the rig; empty if unknown.
+        ego_mesh: Mesh of the ego vehicle in the vehicle frame; None if unknown.
+        grid: Cells and band bands of the run.
+        regions: Regions with separate numbers.
+        has_area_weights: True if frames have area weights of their reference points.
+        threshold_m: Detection threshold.
+        query_cache: Cache that the metrics of a run share, so that each frame is searched once.
     """
 
     rig_name: str | None = None
@@ -52,18 +52,18 @@ class MetricSetup:
 
     @property
     def common_arguments(self) -> dict[str, Any]:
-        """The arguments that metrics of what frames show have in common."""
+        """Keyword arguments of all metrics."""
         return {"rig_name": self.rig_name, "query_cache": self.query_cache}
 
 
 @dataclass(frozen=True)
 class PublishedMetric:
-    """A metric by its name in `--set metrics=NAME`.
+    """Entry of the registry.
 
     Args:
-        build: Makes it.
-        needs: What it cannot do without.
-        description: What it says, in a line.
+        build: Function that builds the metric.
+        needs: Data that the metric requires.
+        description: Description of its numbers in one line.
     """
 
     build: Callable[[MetricSetup], FrameMetric]
@@ -71,11 +71,11 @@ class PublishedMetric:
     description: str
 
 
-def _point_density(setup: MetricSetup) -> PointDensity:
-    # A region that is smaller than a cell of 1 m needs the cells of the run.
+def _build_point_density(setup: MetricSetup) -> PointDensity:
+    # Regions smaller than a cell of 1 m need the cells of the run.
     coarse = build_coarse_grid(setup.grid, UNIFORMITY_CELL_M)
-    fits = all(region.mask_cells(coarse).any() for region in setup.regions)
-    return PointDensity(coarse if fits else setup.grid, setup.regions, **setup.common_arguments)
+    covers_regions = all(region.mask_cells(coarse).any() for region in setup.regions)
+    return PointDensity(coarse if covers_regions else setup.grid, setup.regions, **setup.common_arguments)
 
 
 PUBLISHED: Mapping[str, PublishedMetric] = {
@@ -98,15 +98,17 @@ PUBLISHED: Mapping[str, PublishedMetric] = {
             **setup.common_arguments,
         ),
         frozenset({"sensor_point_counts"}),
-        "share of the surface seen by 1, 2, 3 sensors",
+        "share of the surface detected by 1, 2, 3 sensors",
     ),
-    "point_density": PublishedMetric(_point_density, frozenset(), "points, for each square metre, and how evenly"),
+    "point_density": PublishedMetric(
+        _build_point_density, frozenset(), "points, points per square meter, and their uniformity"
+    ),
     "false_visible": PublishedMetric(
         lambda setup: FalseVisible(
             setup.sensors, setup.ego_mesh, setup.grid, setup.threshold_m, **setup.common_arguments
         ),
         frozenset({"sensors"}),
-        "blind cells that the field of view promised (Börger 2022)",
+        "blind cells within the field of view (Börger 2022)",
     ),
     "s_mig": PublishedMetric(
         lambda setup: SMig(setup.sensors, **setup.common_arguments),
@@ -116,7 +118,7 @@ PUBLISHED: Mapping[str, PublishedMetric] = {
     "s_mig_occluded": PublishedMetric(
         lambda setup: SMig(setup.sensors, ends_at_hits=True, **setup.common_arguments),
         frozenset({"boxes", "sensors", "sensor_point_counts"}),
-        "the same, up to what the rays hit",
+        "s_mig with rays that end at their hits",
     ),
     "m_sog": PublishedMetric(
         lambda setup: MSog(setup.sensors, **setup.common_arguments),
@@ -127,10 +129,16 @@ PUBLISHED: Mapping[str, PublishedMetric] = {
 
 
 def parse_metric_names(names_or_text: str | Iterable[str]) -> tuple[str, ...]:
-    """The metrics that a user asks for; "all" is all of them.
+    """Parse the names of requested metrics.
+
+    Args:
+        names_or_text: Names, or text with names separated by commas; "all" selects all metrics.
+
+    Returns:
+        Names without repetitions.
 
     Raises:
-        ValueError: No such metric.
+        ValueError: An unknown metric.
     """
     names = (
         [name.strip() for name in names_or_text.split(",")] if isinstance(names_or_text, str) else list(names_or_text)
@@ -144,9 +152,9 @@ def parse_metric_names(names_or_text: str | Iterable[str]) -> tuple[str, ...]:
 
 
 REASONS: Mapping[Need, str] = {
-    "boxes": "it needs boxes of objects, which simulations and labelled recordings have",
+    "boxes": "it needs boxes of objects, which simulations and labeled recordings have",
     "sensors": "it needs the rig's sensors, with mounts and rays: give the rig's YAML file or a built-in name",
-    "sensor_point_counts": "which points are of which sensor is unknown",
+    "sensor_point_counts": "the sensor of each point is unknown",
 }
 
 
@@ -167,39 +175,53 @@ class RunMetrics(NamedTuple):
         return {f"{name} of {rig}": metric for name, metrics in self.by_rig.items() for rig, metric in metrics.items()}
 
     def update_from(self, observers: Mapping[str, Any]) -> "RunMetrics":
-        """Return the metrics as a run left them, by the names of `observers`."""
+        """Return the metrics in the state after a run.
+
+        Args:
+            observers: Metrics after the run, under the names of `observers`.
+
+        Returns:
+            The metrics by rig.
+        """
         by_rig = {name: {rig: observers[f"{name} of {rig}"] for rig in rigs} for name, rigs in self.by_rig.items()}
         return RunMetrics(by_rig, self.omissions)
 
 
 def build_metrics(task: Task[FrameSource], settings: Settings) -> RunMetrics:
-    """Build the requested metrics for all rigs; those whose needs are not met are left out.
+    """Build the requested metrics for all rigs; those whose needs are not met are omitted.
+
+    Args:
+        task: Frames and rigs of the run.
+        settings: Settings with the names of the metrics and the thresholds.
+
+    Returns:
+        The metrics and the omissions.
 
     Raises:
         ValueError: No metric can be built; the message says why.
     """
-    sights = FrameQueryCache()
+    query_cache = FrameQueryCache()
     threshold_m = settings.thresholds_m[0] if settings.thresholds_m else 0.4
-    missing, ego = _find_missing_needs(task), task.frames.get_ego_mesh()
+    missing, ego_mesh = _find_missing_needs(task), task.frames.get_ego_mesh()
     unmet = {name: PUBLISHED[name].needs & missing for name in settings.metrics}
-    left_out = {name: REASONS[min(needs)] for name, needs in unmet.items() if needs}
-    if len(left_out) == len(settings.metrics):
-        raise ValueError("; ".join(f"metric {name}: {reason}" for name, reason in left_out.items()))
-    by_rig: dict[str, dict[str, FrameMetric]] = {name: {} for name in settings.metrics if name not in left_out}
+    omissions = {name: REASONS[min(needs)] for name, needs in unmet.items() if needs}
+    if len(omissions) == len(settings.metrics):
+        raise ValueError("; ".join(f"metric {name}: {reason}" for name, reason in omissions.items()))
+    by_rig: dict[str, dict[str, FrameMetric]] = {name: {} for name in settings.metrics if name not in omissions}
     for rig in task.rigs:
         setup = MetricSetup(
             rig_name=rig,
             sensors=tuple(task.sensors.get(rig, ())),
-            ego_mesh=ego,
+            ego_mesh=ego_mesh,
             grid=task.query_plan.grid,
             regions=task.query_plan.regions,
             has_area_weights=task.frames.has_area_weights,
             threshold_m=threshold_m,
-            query_cache=sights,
+            query_cache=query_cache,
         )
         for name, metrics in by_rig.items():
             metrics[rig] = PUBLISHED[name].build(setup).to(settings.device)
-    return RunMetrics(by_rig, left_out)
+    return RunMetrics(by_rig, omissions)
 
 
 def _find_missing_needs(task: Task[FrameSource]) -> frozenset[Need]:
@@ -214,26 +236,36 @@ def _find_missing_needs(task: Task[FrameSource]) -> frozenset[Need]:
 def compare_metrics(
     metrics: RunMetrics, coverages: Mapping[str, Coverage], regions: Sequence[Region], seed: int
 ) -> MetricComparison:
-    """Compare the metrics after a run with torchcover's numbers of the regions."""
+    """Compare the metrics after a run with the coverage numbers of the regions.
+
+    Args:
+        metrics: Metrics after the run.
+        coverages: Coverage of each rig.
+        regions: Regions of the coverage numbers.
+        seed: Seed of the bootstrap.
+
+    Returns:
+        Rankings of all numbers.
+    """
     published: list[Ranking] = []
     for name, by_rig in metrics.by_rig.items():
         numbers = [metric.compute() for metric in by_rig.values()]
         estimates = [metric.estimate() for metric in by_rig.values()]
         published += build_rankings(name, numbers, estimates, seed)
     heights = next(iter(coverages.values())).grid.heights
-    own: list[Ranking] = []
+    coverage_rankings: list[Ranking] = []
     for region in regions:
-        for height in heights:
-            own += _rank_by_coverage(list(coverages.values()), region, height, seed)
-    return MetricComparison(tuple(coverages), published, own, metrics.omissions)
+        for band in heights:
+            coverage_rankings += _rank_by_coverage(list(coverages.values()), region, band, seed)
+    return MetricComparison(tuple(coverages), published, coverage_rankings, metrics.omissions)
 
 
-def _rank_by_coverage(coverages: Sequence[Coverage], region: Region, height: str, seed: int) -> list[Ranking]:
+def _rank_by_coverage(coverages: Sequence[Coverage], region: Region, band: str, seed: int) -> list[Ranking]:
     numbers = []
     for coverage in coverages:
-        (row,) = (row for row in coverage.summary([region]) if row.band == height)
+        (row,) = (row for row in coverage.summary([region]) if row.band == band)
         parameters = {"measure": row.average, "cell_m": coverage.grid.cell_m}
         numbers.append([number._replace(parameters=parameters) for number in row.numbers.values()])
-    estimates = [coverage.estimate(region, height) for coverage in coverages]
+    estimates = [coverage.estimate(region, band) for coverage in coverages]
     ranked = build_rankings(OWN, numbers, estimates, seed)
-    return [ranking._replace(name=f"{ranking.name} {region.name} {height}") for ranking in ranked]
+    return [ranking._replace(name=f"{ranking.name} {region.name} {band}") for ranking in ranked]

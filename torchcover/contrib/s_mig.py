@@ -236,7 +236,7 @@ class SMig(FrameMetric):
         region: What the voxels fill, the published 60 x 40 x 4 m if not given.
         categories: Each has its own occupancy and number. The number of all is their sum.
         ends_at_hits: Whether rays end at what they hit.
-        kwargs: `rig` and `sights` of `FrameMetric`.
+        kwargs: `rig_name` and `query_cache` of `FrameMetric`.
 
     Raises:
         ValueError: No sensor, no category or one twice, voxels that do not divide the region or do not fit into the
@@ -265,7 +265,7 @@ class SMig(FrameMetric):
         categories: Sequence[str] = CATEGORIES,
         *,
         ends_at_hits: bool = False,
-        **kwargs: Any,  # noqa: ANN401  (of `FrameMetric`)
+        **kwargs: Any,  # noqa: ANN401  (arguments of `FrameMetric`)
     ) -> None:
         check_sensors(sensors)
         if not categories or len(set(categories)) < len(categories):
@@ -300,7 +300,7 @@ class SMig(FrameMetric):
             self.crossings += torch.from_numpy(crossed.reshape(-1)).to(self.crossings)
         self.boxes = insert_rows(self.boxes, rows)
 
-    def _found(self) -> tuple[Estimate, Sequence[Number]]:
+    def _compute_numbers(self) -> tuple[Estimate, Sequence[Number]]:
         of_each, times, rays = self._occupancies(), self._crossings(), count_rays(self.sensors)
         about = [
             describe_number(

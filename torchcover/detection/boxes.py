@@ -108,7 +108,7 @@ class Boxes:
                 raise ValueError(
                     f"{name}: shape {shape} is needed for {count} boxes; got {tuple(getattr(self, name).shape)}"
                 )
-        sequences = {"ids": self.ids, "categories": self.categories}
+        sequences: dict[str, tuple[str, ...] | Tensor] = {"ids": self.ids, "categories": self.categories}
         sequences |= {f"points_in_box[{rig!r}]": counts for rig, counts in self.points_in_box.items()}
         for name, entries in sequences.items():
             if len(entries) != count:
