@@ -54,7 +54,7 @@ def test_built_in_scenarios_leave_it_to_the_rig(name):
 
 def test_rigs_that_name_different_vehicles_need_one_that_is_for_all():
     two = (rig("sedan"), rig("van"))
-    with pytest.raises(ValueError, match=r"different vehicles \(0 sedan, 1 van\), .* one ego: say which by --vehicle"):
+    with pytest.raises(ValueError, match=r"different vehicles \(0 sedan, 1 van\), .* one ego: choose it by --vehicle"):
         length_m(given(), *two)
     assert length_m(given(), *two, vehicle="suv") == pytest.approx(4.90)
     assert length_m(given(shape=BOX), *two) == pytest.approx(6.0)

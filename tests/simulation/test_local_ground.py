@@ -338,7 +338,9 @@ def test_what_cannot_be_ground_is_refused():
         scenario(FLOOR, upright).build_scene()
     with pytest.raises(ValueError, match="band_frame: ground or vehicle is needed; got 'world'"):
         SurfaceReference(AREA, band_frame="world")
-    with pytest.raises(ValueError, match=r"bands_m: nothing is seen below the ground, and \(-3.0, -1.0\) m lies there"):
+    with pytest.raises(
+        ValueError, match=r"bands_m: nothing is visible below the ground, and \(-3.0, -1.0\) m lies there"
+    ):
         SurfaceReference(AREA, bands_m=((0.5, 2.0), (-3.0, -1.0)))
     SurfaceReference(AREA, bands_m=((-3.0, -1.0),), band_frame="vehicle")
 

@@ -13,7 +13,7 @@ from torchcover.simulation.reference_sensor import ReferenceContext
 from torchcover.simulation.scene import SceneGeometry
 from torchcover.simulation.shapes import Box, Plane
 from torchcover.simulation.sight import compute_visibility
-from torchcover.simulation.surface_reference import SurfaceStrata
+from torchcover.simulation.surface_strata import SurfaceStrata
 from torchcover.simulation.world import Actor, Scene
 
 from .small_worlds import AHEAD, FLOOR, agrees, box, scenario

@@ -157,7 +157,7 @@ def test_what_is_no_room_is_none_and_what_is_smaller_than_the_vehicle_is_a_mista
     assert office(ego={"pose": {"x_m": 20.0}}).find_room_bounds_m() is None
     assert Scenario.load("urban").find_room_bounds_m() is None
     with pytest.raises(
-        ValueError, match=r"'office': all that stands in it is 0.014 x 0.01 m, smaller than box; is the"
+        ValueError, match=r"'office': all its bodies together are 0.014 x 0.01 m, smaller than box; is the"
     ):
         office((0.014, 0.010)).find_room_bounds_m()
 

@@ -1,7 +1,8 @@
-"""What is asked about: regions, height bands and the grid, as YAML or in Python, and what follows for one vehicle."""
+"""Regions of interest: regions, height bands and grid, as YAML or in Python, and the query plan for one vehicle."""
 
 import math
 import warnings
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Annotated, ClassVar, NamedTuple, Self
 
@@ -12,30 +13,26 @@ from torchcover.coverage.grid import PAPER_HEIGHTS, BandFrame
 from torchcover.geometry.arrays import Float64
 from torchcover.simulation.documents import Bounds, Coordinate, Document, FileDocument
 
-# Holds the paper's regions, and the space beside and behind the vehicle.
+# Default grid: it contains the regions of the paper, and the space on all sides of the vehicle.
 GRID_X_M = (-40.0, 160.0)
 GRID_Y_M = (-40.0, 40.0)
-CELL_M = 0.25
-# In front, where nothing is to be seen beyond a room, or beyond the range of the sensors.
-NEAR_RANGES_M = (5.0, 10.0, 20.0)
-# What height bands are over, where nothing else is said.
 DEFAULT_BAND_FRAME: BandFrame = "ground"
 
-# A rectangle of the ground in the vehicle frame in metres: ((x_low, x_high), (y_low, y_high)).
+# Rectangle on the ground in the vehicle frame in meters: ((x_low, x_high), (y_low, y_high)).
 Area = tuple[tuple[float, float], tuple[float, float]]
 Areas = tuple[Area, ...]
-# Heights in metres: (low, high) of each.
+# (low, high) of each height band in meters.
 Bands = tuple[tuple[float, float], ...]
 NonEmptyName = Annotated[str, Field(min_length=1)]
 
 
 class RegionOfInterest(Document):
-    """A rectangle or a polygon on the ground, in the vehicle frame.
+    """Rectangle or polygon on the ground, in the vehicle frame.
 
     Args:
-        x_m: Lower and upper bound forward.
-        y_m: Lower and upper bound to the left.
-        polygon_m: Corners x, y of a polygon instead, one after the other around it.
+        x_m: Lower and upper bound of x (forward) of a rectangle.
+        y_m: Lower and upper bound of y (left) of a rectangle.
+        polygon_m: Corners x, y of a polygon in order, in place of `x_m` and `y_m`.
     """
 
     x_m: Bounds | None = None
@@ -50,7 +47,14 @@ class RegionOfInterest(Document):
         return self
 
     def build_region(self, name: str) -> Region:
-        """The region under a name."""
+        """Build the region.
+
+        Args:
+            name: Name of the region.
+
+        Raises:
+            ValueError: The polygon intersects itself.
+        """
         if self.x_m is not None and self.y_m is not None:
             return Region(name, self.x_m, self.y_m)
         assert self.polygon_m is not None  # checked in _check_one_of
@@ -58,11 +62,11 @@ class RegionOfInterest(Document):
 
 
 class GridSettings(Document):
-    """What of the grid is not to be as usual.
+    """Settings of the grid; None for the default.
 
     Args:
-        x_m: Lower and upper bound forward.
-        y_m: Lower and upper bound to the left.
+        x_m: Lower and upper bound of x (forward).
+        y_m: Lower and upper bound of y (left).
         cell_m: Side of a cell.
     """
 
@@ -72,24 +76,25 @@ class GridSettings(Document):
 
 
 class RegionsOfInterest(FileDocument):
-    """What a run is asked about, for any vehicle; with nothing given, the usual table.
+    """Regions, height bands and grid of an evaluation, for any vehicle.
 
     Args:
-        regions: By name. Not given: the paper's three in front of the vehicle, and the near field on its four sides
-            (`build_near_field_regions`), as far as the grid holds them.
-        heights: Name of each height band -> lower and upper bound of z in metres; they may overlap. Not given: the
-            paper's, ground and obstacle.
-        grid: Extent and cell. Not given: x from -40 to 160 m, y from -40 to 40 m, more if regions need it, and cells
-            of 0.25 m; where neither it nor regions are given, in a room of at most 40 m around the ego, or with sensors
-            that reach no farther, that, with the regions 5m, 10m, 20m as far as they fit, and `room` or `range`.
+        regions: Name -> region. By default the three regions of the paper in front of the vehicle and the near field
+            on its four sides (`build_near_field_regions`), if the grid contains them.
+        heights: Name of each height band -> lower and upper bound of z in meters; bands may overlap. By default
+            `ground` and `obstacle` of the paper.
+        grid: Extent and cell size. By default x from -40 to 160 m, y from -40 to 40 m, extended to contain the regions,
+            and cells of 0.25 m. In a room of at most 40 m around the ego vehicle, or with sensors of shorter range, the
+            default grid covers that space only, with the regions `5m`, `10m`, `20m` that it contains, and `room` or
+            `range`.
 
     Raises:
-        ValueError: Bounds that are inverted, equal or not finite, a polygon that crosses itself.
+        ValueError: Bounds that are inverted, equal or not finite, or a polygon that intersects itself.
 
     Example:
         >>> behind = {"behind": {"x_m": (-4.0, -2.5), "y_m": (-1.0, 1.0)}}
-        >>> asked = RegionsOfInterest(regions=behind, heights={"child": (0.1, 1.1)}).around()
-        >>> asked.regions[0].x, asked.grid.heights, asked.areas[0]
+        >>> plan = RegionsOfInterest(regions=behind, heights={"child": (0.1, 1.1)}).build_query_plan()
+        >>> plan.regions[0].x_m, plan.grid.heights, plan.areas[0]
         ((-4.0, -2.5), {'child': (0.1, 1.1)}, ((-4.0, -2.5), (-1.0, 1.0)))
     """
 
@@ -105,76 +110,82 @@ class RegionsOfInterest(FileDocument):
         band_frame: BandFrame = DEFAULT_BAND_FRAME,
         visible_region: Region | None = None,
     ) -> "QueryPlan":
-        """What follows for one vehicle.
+        """Build the query plan for one vehicle.
 
         Args:
             ego_outline_m: (K, 2) corners x, y of the vehicle; None if unknown: then there is no near field.
-            cell_m: Side of a cell, whatever `grid` says.
-            band_frame: What the height bands are over, as in `BevGrid`.
-            visible_region: Beyond which nothing is to be seen, such as a room: where neither regions nor the extent of the grid
-                are asked for, the grid is that, with the near field, and its name that of a region.
+            cell_m: Side of a cell, in place of that of `grid`.
+            band_frame: Frame of the height bands, as in `BevGrid`.
+            visible_region: Region outside of which nothing is visible, such as a room. Without regions and extent of
+                the grid, the grid covers that region and the near field, and the region is one of the plan.
+
+        Returns:
+            Grid, regions, and areas for the reference sensor.
 
         Raises:
-            ValueError: A region that the grid does not hold, or that holds no cell centre; a grid that cannot be.
+            ValueError: A region that the grid does not contain, or that contains no cell center; an invalid grid.
 
         Warns:
-            UserWarning: A region that lies within the vehicle.
+            UserWarning: A region inside the vehicle.
         """
-        vehicle = None if ego_outline_m is None else _bounds(ego_outline_m)
-        cell_m = cell_m or self.grid.cell_m or CELL_M
-        named = tuple(region.build_region(name) for name, region in self.regions.items())
-        if named or self.grid.x_m or self.grid.y_m:
+        vehicle_area = None if ego_outline_m is None else _compute_bounds(ego_outline_m)
+        cell_m = cell_m or self.grid.cell_m or 0.25
+        named_regions = tuple(region.build_region(name) for name, region in self.regions.items())
+        if named_regions or self.grid.x_m or self.grid.y_m or visible_region is None:
             visible_region = None
-        grid = (
-            self._grid(named, cell_m, band_frame)
-            if visible_region is None
-            else self._fitted(visible_region, vehicle, cell_m, band_frame)
-        )
-        if named:
-            check_regions(named, grid)
-            _warn_of_hidden(named, vehicle)
-            return QueryPlan(grid, named, (*(_area(region) for region in named), (grid.x_m, grid.y_m)), named)
-        ranges = forward_regions() if visible_region is None else forward_regions(NEAR_RANGES_M)
-        forward = tuple(region for region in ranges if region.is_within(grid))
+            grid = self._build_grid(named_regions, cell_m, band_frame)
+        else:
+            grid = self._build_fitted_grid(visible_region, vehicle_area, cell_m, band_frame)
+        grid_area = (grid.x_m, grid.y_m)
+        if named_regions:
+            check_regions(named_regions, grid)
+            _warn_about_regions_in_vehicle(named_regions, vehicle_area)
+            areas = (*(_get_area(region) for region in named_regions), grid_area)
+            return QueryPlan(grid, named_regions, areas, named_regions)
+        candidates = forward_regions() if visible_region is None else forward_regions((5.0, 10.0, 20.0))
+        forward = tuple(region for region in candidates if region.is_within(grid))
         if visible_region is not None:
             forward = *forward, Region(visible_region.name, grid.x_m, grid.y_m)
         check_regions(forward, grid)
-        near = () if ego_outline_m is None else build_near_field(ego_outline_m)
-        if not self.heights:  # of what is above the ground there, bodies are put there
-            near = tuple(replace(region, bands=("ground",)) for region in near)
+        near_field = () if ego_outline_m is None else build_near_field(ego_outline_m)
+        if not self.heights:  # test targets cover the space above the ground
+            near_field = tuple(replace(region, bands=("ground",)) for region in near_field)
         # Cells may be larger than the near field.
-        near = tuple(region for region in near if region.is_within(grid) and region.mask_cells(grid).any())
-        around = (_around(near),) if near else ()
-        usual = (*forward, *near) or (Region("grid", grid.x_m, grid.y_m),)
-        return QueryPlan(grid, usual, (*map(_area, forward), *around, (grid.x_m, grid.y_m)), forward or usual)
+        near_field = tuple(region for region in near_field if region.is_within(grid) and region.mask_cells(grid).any())
+        near_areas = (_compute_enclosing_area(map(_get_area, near_field)),) if near_field else ()
+        regions = (*forward, *near_field) or (Region("grid", grid.x_m, grid.y_m),)
+        areas = (*map(_get_area, forward), *near_areas, grid_area)
+        return QueryPlan(grid, regions, areas, forward or regions)
 
-    def _fitted(self, within: Region, vehicle: Area | None, cell_m: float, band_frame: BandFrame) -> BevGrid:
-        """Of whole cells around what can be seen and the near field."""
-        areas = [_area(within)] + ([] if vehicle is None else [_around(build_near_field_regions(*vehicle))])
-        x, y = (
-            (
-                round(math.floor(min(low for low, _ in of) / cell_m) * cell_m, 9),
-                round(math.ceil(max(high for _, high in of) / cell_m) * cell_m, 9),
-            )
-            for of in zip(*areas, strict=True)
-        )
-        return BevGrid(x, y, cell_m, self.heights or PAPER_HEIGHTS, band_frame)
+    def _build_fitted_grid(
+        self, visible_region: Region, vehicle_area: Area | None, cell_m: float, band_frame: BandFrame
+    ) -> BevGrid:
+        """Build a grid of whole cells that contains the visible region and the near field."""
+        areas = [_get_area(visible_region)]
+        if vehicle_area is not None:
+            areas += map(_get_area, build_near_field_regions(*vehicle_area))
+        bounds = []
+        for low, high in _compute_enclosing_area(areas):
+            lower_m, upper_m = math.floor(low / cell_m) * cell_m, math.ceil(high / cell_m) * cell_m
+            bounds.append((round(lower_m, 9), round(upper_m, 9)))
+        x_m, y_m = bounds
+        return BevGrid(x_m, y_m, cell_m, self.heights or PAPER_HEIGHTS, band_frame)
 
-    def _grid(self, regions: tuple[Region, ...], cell_m: float, band_frame: BandFrame) -> BevGrid:
-        x = self.grid.x_m or _holding(GRID_X_M, [region.x_m for region in regions], cell_m)
-        y = self.grid.y_m or _holding(GRID_Y_M, [region.y_m for region in regions], cell_m)
-        return BevGrid(x, y, cell_m, self.heights or PAPER_HEIGHTS, band_frame)
+    def _build_grid(self, regions: tuple[Region, ...], cell_m: float, band_frame: BandFrame) -> BevGrid:
+        x_m = self.grid.x_m or _extend_bounds(GRID_X_M, [region.x_m for region in regions], cell_m)
+        y_m = self.grid.y_m or _extend_bounds(GRID_Y_M, [region.y_m for region in regions], cell_m)
+        return BevGrid(x_m, y_m, cell_m, self.heights or PAPER_HEIGHTS, band_frame)
 
 
 class QueryPlan(NamedTuple):
-    """What a run is asked about.
+    """Regions of an evaluation for one vehicle.
 
     Args:
         grid: Cells and height bands.
-        regions: Those that numbers are given for.
-        areas: The rectangles that the reference sensor is aimed at, which hold them and the grid.
-        target_regions: The regions whose errors a target error waits for: all that were asked for by name; in the usual table
-            those in front.
+        regions: Regions whose numbers are reported.
+        areas: Rectangles that the reference sensor samples; they contain the regions and the grid.
+        target_regions: Regions whose standard errors must reach a target error: all regions that the user named, or by
+            default those in front of the vehicle.
     """
 
     grid: BevGrid
@@ -184,49 +195,56 @@ class QueryPlan(NamedTuple):
 
     @property
     def bands_m(self) -> Bands:
-        """The height bands that the reference sensor is aimed at."""
+        """Height bands that the reference sensor samples."""
         return tuple(self.grid.heights.values())
 
 
 def build_near_field(ego_outline_m: Float64) -> tuple[Region, ...]:
-    """That of a vehicle with (K, 2) corners x, y; see `build_near_field_regions`."""
-    return build_near_field_regions(*_bounds(ego_outline_m))
+    """Build the near-field regions of a vehicle, see `build_near_field_regions`.
+
+    Args:
+        ego_outline_m: (K, 2) corners x, y of the vehicle.
+    """
+    return build_near_field_regions(*_compute_bounds(ego_outline_m))
 
 
-def _bounds(outline_m: Float64) -> Area:
-    """The bounds x and y of a vehicle, to the millimetre."""
+def _compute_bounds(outline_m: Float64) -> Area:
+    """Compute the bounds x and y of a vehicle, rounded to millimeters."""
     lower, upper = outline_m.min(axis=0).round(3).tolist(), outline_m.max(axis=0).round(3).tolist()
     return (lower[0], upper[0]), (lower[1], upper[1])
 
 
-def _area(region: Region) -> Area:
+def _get_area(region: Region) -> Area:
     return region.x_m, region.y_m
 
 
-def _around(regions: tuple[Region, ...]) -> Area:
-    """One rectangle around all of them: it takes fewer rays from the others than each would for itself."""
-    x, y = zip(*map(_area, regions), strict=True)
-    return (
-        (min(low for low, _ in x), max(high for _, high in x)),
-        (min(low for low, _ in y), max(high for _, high in y)),
-    )
+def _compute_enclosing_area(areas: Iterable[Area]) -> Area:
+    """Compute the smallest rectangle that contains all areas; one large area needs fewer rays than many small ones."""
+    x, y = zip(*areas, strict=True)
+    x_lows, x_highs = zip(*x, strict=True)
+    y_lows, y_highs = zip(*y, strict=True)
+    return (min(x_lows), max(x_highs)), (min(y_lows), max(y_highs))
 
 
-def _holding(usual: tuple[float, float], wanted: list[tuple[float, float]], cell_m: float) -> tuple[float, float]:
-    """The usual bounds, with as many whole cells more as regions need."""
-    below = max(0.0, usual[0] - min([low for low, _ in wanted], default=usual[0]))
-    above = max(0.0, max([high for _, high in wanted], default=usual[1]) - usual[1])
-    return usual[0] - math.ceil(below / cell_m) * cell_m, usual[1] + math.ceil(above / cell_m) * cell_m
+def _extend_bounds(
+    default: tuple[float, float], region_bounds: list[tuple[float, float]], cell_m: float
+) -> tuple[float, float]:
+    """Extend the default bounds by whole cells to contain all regions."""
+    below_m = max(0.0, default[0] - min([low for low, _ in region_bounds], default=default[0]))
+    above_m = max(0.0, max([high for _, high in region_bounds], default=default[1]) - default[1])
+    return default[0] - math.ceil(below_m / cell_m) * cell_m, default[1] + math.ceil(above_m / cell_m) * cell_m
 
 
-def _warn_of_hidden(regions: tuple[Region, ...], vehicle: Area | None) -> None:
+def _warn_about_regions_in_vehicle(regions: tuple[Region, ...], vehicle_area: Area | None) -> None:
+    if vehicle_area is None:
+        return
+    (x_low, x_high), (y_low, y_high) = vehicle_area
     for region in regions:
-        if vehicle and all(
-            low <= own[0] and own[1] <= high for own, (low, high) in zip(_area(region), vehicle, strict=True)
-        ):
+        is_inside_x = x_low <= region.x_m[0] and region.x_m[1] <= x_high
+        is_inside_y = y_low <= region.y_m[0] and region.y_m[1] <= y_high
+        if is_inside_x and is_inside_y:
             warnings.warn(
-                f"region {region.name!r} lies within the vehicle (x = {vehicle[0][0]:g} to {vehicle[0][1]:g} m, y = "
-                f"{vehicle[1][0]:g} to {vehicle[1][1]:g} m): only what can be seen beneath it counts, and a number "
-                "that nothing counts for is unknown",
+                f"region {region.name!r} lies within the vehicle (x = {x_low:g} to {x_high:g} m, y = {y_low:g} to "
+                f"{y_high:g} m): only surfaces below it can be observed, so its numbers may be unknown",
                 stacklevel=3,
             )

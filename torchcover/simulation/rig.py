@@ -52,8 +52,8 @@ class Rig(BuiltInDocument):
         vehicle: Built-in vehicle or YAML file of the vehicle that carries the rig, unless the user or the scenario
             chooses one.
         weather: Weather of the measurement, in place of that in the scenario.
-        bodies: Bodies that the rig adds to the vehicle, such as a roof box, in the vehicle frame. They occlude only the
-            sensors of this rig, neither other rigs nor the reference, so that rigs with and without them are comparable.
+        bodies: Bodies that the rig adds to the vehicle, such as a roof box, in the vehicle frame. They occlude
+            sensors of this rig only, so that rigs with and without them can be compared in the same frames.
         sensors: Sensors, each of a type in `SENSORS`; their points are merged.
 
     Example:
@@ -235,8 +235,8 @@ def _find_vehicle_of_rigs(rigs: Mapping[str, Rig]) -> Shape:
     if len(set(vehicles.values())) > 1:
         listing = ", ".join(f"{name} {vehicle}" for name, vehicle in vehicles.items())
         raise ValueError(
-            f"the rigs name different vehicles ({listing}), but all are compared in the same frames, which have one ego: "
-            "say which by --vehicle (in Python, vehicle=), and give a rig what its vehicle has in addition as `bodies`"
+            f"the rigs name different vehicles ({listing}), but all are compared in the same frames, which have one "
+            "ego: choose it by --vehicle (in Python, vehicle=), and add parts of another vehicle as `bodies` of a rig"
         )
     if not vehicles:
         return DEFAULT_EGO

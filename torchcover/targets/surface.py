@@ -15,7 +15,8 @@ from torchcover.simulation.moving import BodyGeometry
 from torchcover.simulation.patches import find_outward_faces
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.sight import SHORTER, compute_visibility
-from torchcover.simulation.surface_reference import ABOVE_M, PLANE_STEPS
+from torchcover.simulation.surface_reference import ABOVE_M
+from torchcover.simulation.surface_strata import PLANE_STEPS
 
 # What people say -> the built-in body that is meant, whose name has its size.
 TARGETS = {"child": "child_110cm", "adult": "adult", "dog": "dog_57cm", "cyclist": "cyclist", "pole": "pole_100cm"}
