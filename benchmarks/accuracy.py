@@ -17,7 +17,7 @@ import torch
 
 from benchmarks import table
 from torchcover import BevGrid, CoverageMetric, forward_regions, nearest
-from torchcover.coverage.quantity import (
+from torchcover.coverage.quantities import (
     RADIUS,
     make_detection_quantity,
     make_redundancy_quantity,

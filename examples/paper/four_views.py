@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from matplotlib.patches import Patch, Wedge
 
-from torchcover.coverage.quantity import RADIUS
+from torchcover.coverage.quantities import RADIUS
 from torchcover.report.colors import (
     UNOBSERVED,
     ColorScale,

@@ -10,8 +10,8 @@ import torch
 
 from torchcover import Coverage
 from torchcover.coverage import Layer
-from torchcover.coverage.blocks import BlockSums, ObservedCells
 from torchcover.coverage.region_sums import RegionSums
+from torchcover.coverage.sparse_sums import BlockSums, ObservedCells
 from torchcover.metrics import sum_rows
 
 

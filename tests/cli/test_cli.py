@@ -263,7 +263,7 @@ def test_too_few_steps_for_errors_are_told_and_a_recording_has_no_reference_sens
         ),
         (["evaluate", "front_roof_128", "--device", "meta"], "device meta: cannot be used here"),
         (["evaluate", "front_roof_128", "--set", "cell_m=-1"], "cell_m: a positive length"),
-        (["evaluate", "front_roof_128", "--thresholds-m", "-1"], "thresholds: finite distances >= 0"),
+        (["evaluate", "front_roof_128", "--thresholds-m", "-1"], "thresholds_m: finite distances >= 0"),
         (["evaluate", "front_roof_128", "--num-frames", "0"], "--num-frames"),
         (["evaluate", "front_roof_128", "--num-frames", "many"], "--num-frames"),
         (["evaluate", "front_roof_128", "--seed", "-1"], "--seed"),

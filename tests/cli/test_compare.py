@@ -212,7 +212,7 @@ def test_what_is_not_in_a_recording_is_told_with_what_is(torchcover, recording, 
         (["front_roof_128", "none.yaml"], "none.yaml: no such file"),
         (["front_roof_128", "front_roof_64", "--scenario", "moon"], "one of the built-in scenarios; is "),
         (["front_roof_128", "front_roof_64", "--set", "cell_m=0.3"], "not a multiple of the cell"),
-        (["front_roof_128", "front_roof_64", "--thresholds-m", "-1"], "thresholds: finite distances >= 0"),
+        (["front_roof_128", "front_roof_64", "--thresholds-m", "-1"], "thresholds_m: finite distances >= 0"),
         (["front_roof_128", "front_roof_64", "--device", "abacus"], "device abacus: cannot be used here"),
         (["front_roof_128", "front_roof_64", "--num-frames", "0"], "--num-frames"),
         (

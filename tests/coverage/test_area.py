@@ -203,7 +203,7 @@ def test_no_square_metre_is_unknown_and_no_sensor_point_is_infinitely_far():
 
 def test_it_needs_has_area_weights():
     sensor, reference, _ = steps_of(1)[0]
-    with pytest.raises(ValueError, match="weights: the square metres of each reference point are needed"):
+    with pytest.raises(ValueError, match="weights: the area of each reference point in m2 is needed"):
         CoverageMetric(grid(), has_area_weights=True).update(sensor, reference)
     plain = CoverageMetric(grid())
     plain.update(sensor, reference)

@@ -68,15 +68,19 @@ def test_points_without_ground_are_in_no_band_and_counted():
 @pytest.mark.parametrize(
     ("grid", "height", "message"),
     [
-        (GROUND, None, r"height\[0\]: bands over the ground need the heights of points above it; got none"),
+        (GROUND, None, r"heights_m\[0\]: bands over the ground need the heights of points above it; got none"),
         (
             VEHICLE,
             HEIGHT,
-            r"height\[0\]: of no use for bands over z of the vehicle; use BevGrid\(band_frame='ground'\)",
+            r"heights_m\[0\]: of no use for bands over z of the vehicle; use BevGrid\(band_frame='ground'\)",
         ),
-        (GROUND, HEIGHT[:3], r"height\[0\]: shape \(80,\), one for each point, is needed; got \(3,\)"),
-        (GROUND, HEIGHT / 0, r"height\[0\]: metres are needed, NaN where there is no ground; got infinite ones"),
-        (GROUND, [HEIGHT, HEIGHT], "1 weights, 2 heights, 1 places in time and 1 errors for 1 reference clouds"),
+        (GROUND, HEIGHT[:3], r"heights_m\[0\]: shape \(80,\), one for each point, is needed; got \(3,\)"),
+        (
+            GROUND,
+            HEIGHT / 0,
+            r"heights_m\[0\]: finite meters are needed, NaN where there is no ground; got infinite ones",
+        ),
+        (GROUND, [HEIGHT, HEIGHT], "1 weights, 2 heights, 1 block indices and 1 errors for 1 reference clouds"),
     ],
 )
 def test_heights_that_do_not_go_with_the_grid_are_refused(grid, height, message):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchcover.coverage.blocks import BlockSums
+from torchcover.coverage.sparse_sums import BlockSums
 
 SHAPE, QUANTITIES = (5, 2, 3, 4), 3
 

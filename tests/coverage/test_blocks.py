@@ -9,7 +9,7 @@ import torch
 
 from torchcover import BevGrid, CoverageMetric, Region
 from torchcover.coverage import Coverage, Layer, Maximum, MeanOfMeans, PooledMean, Quantiles
-from torchcover.coverage.blocks import BlockSums, ObservedCells
+from torchcover.coverage.sparse_sums import BlockSums, ObservedCells
 from torchcover.estimation import compute_jackknife_error, estimate_ratio_errors
 
 # Cells so large that the sensor point below a reference point is always the nearest.
@@ -335,7 +335,7 @@ def test_a_step_far_ahead_makes_room_and_leaves_a_gap():
 
 @pytest.mark.parametrize(
     ("index", "message"),
-    [(-1, "a number from 0 to .*; got -1"), ([0, 1], "2 places in time and 1 errors for 1 reference clouds")],
+    [(-1, "a number from 0 to .*; got -1"), ([0, 1], "2 block indices and 1 errors for 1 reference clouds")],
 )
 def test_numbers_of_steps_that_make_no_sense_are_refused(index, message):
     with pytest.raises(ValueError, match=message):
@@ -414,7 +414,7 @@ def test_bad_weights_are_refused_and_nothing_is_counted(weights, message):
     metric = CoverageMetric(GRID)
     with pytest.raises(ValueError, match=rf"weights\[0\]: .*{message}"):
         metric.update(*clouds_of({0: [0.5, 0.5]}), weights=torch.tensor(weights))
-    with pytest.raises(ValueError, match="2 weights, 1 heights, 1 places in time and 1 errors for 1 reference clouds"):
+    with pytest.raises(ValueError, match="2 weights, 1 heights, 1 block indices and 1 errors for 1 reference clouds"):
         metric.update(*clouds_of({0: [0.5]}), weights=[torch.ones(1), torch.ones(1)])
     assert int(metric.num_frames) == 0
 

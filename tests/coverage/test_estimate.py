@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from torchcover import BevGrid, CoverageMetric, Region
-from torchcover.coverage.measures import compute_cell_average
+from torchcover.coverage.averages import compute_cell_average
 
 GRID = BevGrid(x_m=(0.0, 8.0), y_m=(0.0, 4.0), cell_m=1.0, heights={"low": (0.0, 1.0), "high": (1.0, 2.0)})
 PART = Region("part", x_m=(1.0, 7.0), y_m=(0.0, 3.0))

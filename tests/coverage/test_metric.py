@@ -212,7 +212,7 @@ def test_without_radii_only_points_near_the_reference_matter_to_the_last_bit():
     assert torch.equal(whole.detection.nan_to_num(-1), less.detection.nan_to_num(-1))
     assert less.radius.isnan().all()
     assert less.counts["saturated_points"] == 0
-    with pytest.raises(ValueError, match="radii: aggregations and sensors need them"):
+    with pytest.raises(ValueError, match="needs_radii: aggregations and sensor_names need radii"):
         CoverageMetric(GRID, (0.25,), needs_radii=False, aggregations=[Maximum()])
     with pytest.raises(ValueError, match="belongs to another metric"):
         CoverageMetric(GRID, (0.25,)).merge_state(CoverageMetric(GRID, (0.25,), needs_radii=False))
@@ -267,7 +267,7 @@ def test_numbers_that_mean_something_else_than_they_seem_are_warned_of_once():
         in_lidar_frame.compute()
     in_lidar_frame.update(ground, ground - torch.tensor([0.0, 0.0, 1.8]))
     in_lidar_frame.compute()
-    with pytest.warns(UserWarning, match="square metres were given, but this metric averages over cells"):
+    with pytest.warns(UserWarning, match="areas were passed, but this metric averages over cells"):
         over_cells.update(ground, ground, weights=torch.ones(1200))
     over_cells.update(ground, ground, weights=torch.ones(1200))
     right.update(ground, ground)
@@ -353,12 +353,12 @@ def test_errors_are_those_of_all_sensors_one_after_the_other():
         (
             torch.zeros(3),
             ValueError,
-            r"error\[0\]: metres of each of 2 points of the rig are needed; got \(3,\) with 0 NaN",
+            r"errors_m\[0\]: the error in meters of each of 2 points of the rig is needed; got shape \(3,\) with 0 NaN",
         ),
-        (torch.tensor([0.0, math.nan]), ValueError, r"error\[0\]: .*got \(2,\) with 1 NaN"),
-        ([torch.zeros(2)] * 2, ValueError, r"2 errors for 1 reference clouds; one a step each"),
-        (0.1, TypeError, r"error .*tensor"),
-        ({"a": torch.zeros(2)}, TypeError, r"error .*tensor"),
+        (torch.tensor([0.0, math.nan]), ValueError, r"errors_m\[0\]: .*got shape \(2,\) with 1 NaN"),
+        ([torch.zeros(2)] * 2, ValueError, r"2 errors for 1 reference clouds; each frame needs one of each"),
+        (0.1, TypeError, r"errors_m .*tensor"),
+        ({"a": torch.zeros(2)}, TypeError, r"errors_m .*tensor"),
     ],
 )
 def test_errors_that_are_none_of_its_points_are_refused(given, error, message):
@@ -383,18 +383,18 @@ def test_a_step_split_in_two_is_another_number():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"thresholds_m": (0.4, -0.1)}, r"thresholds: finite distances >= 0 in metres are needed; got \(0.4, -0.1\)"),
-        ({"thresholds_m": (math.nan,)}, "thresholds: finite distances >= 0"),
+        ({"thresholds_m": (0.4, -0.1)}, r"thresholds_m: finite distances >= 0 in meters are needed; got \(0.4, -0.1\)"),
+        ({"thresholds_m": (math.nan,)}, "thresholds_m: finite distances >= 0"),
         # Within it lies whatever a blind rig has not seen.
-        ({"thresholds_m": (0.4, math.inf)}, r"thresholds: finite distances .*got \(0.4, inf\)"),
-        ({"thresholds_m": (0.4, 0.5, 0.4)}, r"thresholds: each may be given once.*got \(0.4, 0.5, 0.4\)"),
-        ({"thresholds_m": (0.4, 0.40000004)}, "thresholds: each may be given once, to the six digits that name it"),
-        ({"thresholds_m": (0.4, 3.0), "max_radius_m": 2.0}, "thresholds: at most max_radius = 2.0 m"),
-        ({"max_radius_m": 0.0}, "max_radius: a positive distance in metres is needed; got 0.0"),
-        ({"max_radius_m": -1.0}, "max_radius: a positive distance"),
-        ({"max_radius_m": math.nan}, "max_radius: a positive distance"),
-        ({"aggregations": [Maximum(), Maximum()]}, "aggregations: one of each kind.*got maximum, maximum"),
-        ({"aggregations": [MeanOfMeans((0.4,))]}, "none of those that are built in; got mean"),
+        ({"thresholds_m": (0.4, math.inf)}, r"thresholds_m: finite distances .*got \(0.4, inf\)"),
+        ({"thresholds_m": (0.4, 0.5, 0.4)}, r"thresholds_m: values that differ in six digits.*got \(0.4, 0.5, 0.4\)"),
+        ({"thresholds_m": (0.4, 0.40000004)}, "thresholds_m: values that differ in six digits"),
+        ({"thresholds_m": (0.4, 3.0), "max_radius_m": 2.0}, "thresholds_m: at most max_radius_m = 2.0 m"),
+        ({"max_radius_m": 0.0}, "max_radius_m: a positive distance in meters is needed; got 0.0"),
+        ({"max_radius_m": -1.0}, "max_radius_m: a positive distance"),
+        ({"max_radius_m": math.nan}, "max_radius_m: a positive distance"),
+        ({"aggregations": [Maximum(), Maximum()]}, "aggregations: at most one of each class.*got maximum, maximum"),
+        ({"aggregations": [MeanOfMeans((0.4,))]}, "none of the built-in ones is possible; got mean"),
     ],
 )
 def test_parameters_that_make_no_sense_are_refused(options, message):
@@ -404,7 +404,9 @@ def test_parameters_that_make_no_sense_are_refused(options, message):
 
 @pytest.mark.parametrize("thresholds", [0.4, "0.4", ("0.4",), {0.4: 1}])
 def test_what_is_no_sequence_of_thresholds_is_refused(thresholds):
-    with pytest.raises(TypeError, match=r"thresholds: a sequence of metres, as in \(0.4,\), is needed; got"):
+    with pytest.raises(
+        TypeError, match=r"thresholds_m: a sequence of distances in meters, as in \(0.4,\), is needed; got"
+    ):
         CoverageMetric(ONE_CELL, thresholds)
 
 
@@ -417,8 +419,8 @@ def test_what_is_no_sequence_of_thresholds_is_refused(thresholds):
             r"block_index\[0\]: a number from 0 to 1,000,000,000,000,000 is needed; got 1000000000000000000",
         ),
         (-1, ValueError, r"block_index\[0\]: a number from 0"),
-        (1.5, TypeError, "block_index: a whole number, or a list with one for each step, is needed; got 1.5"),
-        (["1"], TypeError, "block_index: a whole number"),
+        (1.5, TypeError, "block_index: an integer, or a list with one per frame, is needed; got 1.5"),
+        (["1"], TypeError, "block_index: an integer"),
     ],
 )
 def test_a_number_of_a_step_that_is_none_is_refused(index, error, message):
@@ -450,11 +452,16 @@ BAD = torch.tensor([[0.0, 0.0, math.nan], [0.0, 0.0, 0.0], [math.inf, 0.0, 0.0]]
     [
         (BAD, ORIGIN, ValueError, r"sensor\[0\]: 2 of 3 points have NaN or infinite coordinates"),
         ([ORIGIN, ORIGIN], [ORIGIN, BAD], ValueError, r"reference\[1\]: 2 of 3 points have NaN"),
-        ([ORIGIN], [ORIGIN, ORIGIN], ValueError, "1 sensor clouds for 2 reference clouds; one pair a step"),
+        (
+            [ORIGIN],
+            [ORIGIN, ORIGIN],
+            ValueError,
+            "1 sensor clouds for 2 reference clouds; each frame needs one of each",
+        ),
         (torch.zeros(4, 2), ORIGIN, ValueError, r"sensor\[0\]: shape \(N, 3\) is needed; got \(4, 2\)"),
         ([ORIGIN], [torch.zeros(1, 3, dtype=torch.int64)], TypeError, r"reference\[0\]: .*got torch.int64"),
         (ORIGIN.numpy(), ORIGIN, TypeError, r"sensor \(one, or a list .* NumPy array of float32; torch.from_numpy"),
-        (ORIGIN, ORIGIN.numpy(), TypeError, r"reference \(one, or a list with one for each step"),
+        (ORIGIN, ORIGIN.numpy(), TypeError, r"reference \(one, or a list with one per frame"),
         ([[0.0, 0.0, 0.0]], [ORIGIN], TypeError, r"sensor\[0\]: a floating-point torch tensor is needed; got list"),
     ],
 )

@@ -131,8 +131,8 @@ def test_a_region_that_the_metric_was_not_told_of_has_no_redundancy_by_area():
 @pytest.mark.parametrize(
     ("sensor", "message"),
     [
-        (torch.zeros(1, 3), "the clouds of roof, left, rear, by these names, are needed; got Tensor"),
-        ({"roof": torch.zeros(1, 3)}, "the clouds of roof, left, rear, by these names, are needed; got roof"),
+        (torch.zeros(1, 3), "a dict with the clouds of roof, left, rear is needed; got Tensor"),
+        ({"roof": torch.zeros(1, 3)}, "a dict with the clouds of roof, left, rear is needed; got roof"),
     ],
 )
 def test_other_clouds_are_refused(sensor, message):
@@ -141,5 +141,5 @@ def test_other_clouds_are_refused(sensor, message):
 
 
 def test_clouds_by_name_need_a_metric_that_knows_the_names():
-    with pytest.raises(TypeError, match="got clouds by name, for which the metric needs sensors="):
+    with pytest.raises(TypeError, match="got clouds by name, for which the metric needs sensor_names="):
         CoverageMetric(GRID).update({"roof": torch.zeros(1, 3)}, torch.zeros(1, 3))

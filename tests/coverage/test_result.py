@@ -12,7 +12,7 @@ import torch
 
 from torchcover import BevGrid, Coverage, CoverageMetric, Region
 from torchcover.coverage import FrameQuantiles, Layer, Maximum, MeanOfMeans, PooledMean, Quantiles, compute_differences
-from torchcover.coverage.blocks import ObservedCells
+from torchcover.coverage.sparse_sums import ObservedCells
 from torchcover.detection import Boxes, measure_box_visibility
 from torchcover.files import BadFileError
 from torchcover.frames import Frame, collate_frames

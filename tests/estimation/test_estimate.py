@@ -8,7 +8,7 @@ import pytest
 import torch
 from scipy import stats
 
-from torchcover.coverage.quantity import RADIUS, make_detection_quantity
+from torchcover.coverage.quantities import RADIUS, make_detection_quantity
 from torchcover.estimation import Estimate
 from torchcover.estimation.errors import BLIND_SIDE, compute_interval95
 

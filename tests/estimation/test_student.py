@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import special, stats
 
-from torchcover.coverage.quantity import RADIUS, make_detection_quantity
+from torchcover.coverage.quantities import RADIUS, make_detection_quantity
 from torchcover.estimation import Quantity, compute_interval95, compute_student_p, compute_student_t95
 from torchcover.estimation.errors import BLIND_SIDE, is_significant
 

@@ -143,7 +143,7 @@ def test_what_cannot_be_measured_ends_the_run_with_what_was_seen_before(frames, 
     frames[4] = replace(frames[4], reference_weights=None)
     run = observe(frames, [observer], num_workers=workers, keep_partial=True, skip_bad_frames=True)
     assert (run.num_frames, run.skipped_frames, int(observer.metric.num_frames)) == (4, [], 4)
-    assert "weights: the square metres of each reference point are needed" in str(run.failure)
+    assert "weights: the area of each reference point in m2 is needed" in str(run.failure)
 
 
 def test_of_several_workers_one_makes_the_frames_of_a_world_and_all_come_in_order():
@@ -274,7 +274,7 @@ def test_what_ended_a_run_is_raised_unless_the_caller_keeps_what_there_is(frames
 
 def test_square_metres_are_not_made_up(frames):
     metric = CoverageMetric(GRID, has_area_weights=True)
-    with pytest.raises(ValueError, match="the square metres of each reference point are needed"):
+    with pytest.raises(ValueError, match="the area of each reference point in m2 is needed"):
         CoverageObserver(metric, "a").update(replace(frames[0], reference_weights=None))
     CoverageObserver(metric, "a").update(frames[0])
     assert metric.compute().average == "area"

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from torchcover.coverage.quantity import make_detection_quantity
+from torchcover.coverage.quantities import make_detection_quantity
 from torchcover.estimation import ErrorModel
 from torchcover.evaluation import Settings, StudyPlan, Trial, evaluate, measure_error_against_time
 from torchcover.evaluation.study import StudiedNumber, Study

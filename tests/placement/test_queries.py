@@ -173,7 +173,7 @@ def test_an_objective_that_makes_no_sense_is_refused(given, message):
 
 
 def test_the_worst_sensor_is_the_worst_without_each_block_too():
-    from torchcover.coverage.quantity import RADIUS, make_detection_quantity
+    from torchcover.coverage.quantities import RADIUS, make_detection_quantity
     from torchcover.placement.queries import _select_worst
 
     value, left_out = torch.tensor([0.4]), torch.tensor([[0.3], [0.6]])

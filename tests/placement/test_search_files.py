@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.placement.surfaces import plan, space
-from torchcover.coverage.quantity import RADIUS, make_detection_quantity
+from torchcover.coverage.quantities import RADIUS, make_detection_quantity
 from torchcover.estimation import Difference
 from torchcover.placement import PlacementSearch, run_search
 from torchcover.placement.running import JOURNAL

@@ -13,7 +13,7 @@ from matplotlib.image import imread
 
 from torchcover.coverage import AGGREGATIONS, Aggregation, BevGrid, Coverage, CoverageMetric, Layer, Region
 from torchcover.coverage.aggregations import SumState
-from torchcover.coverage.quantity import RADIUS, make_detection_quantity
+from torchcover.coverage.quantities import RADIUS, make_detection_quantity
 from torchcover.estimation import Quantity
 from torchcover.report import SensorView, build_difference_scale, plot_band_maps, plot_maps, write_figures
 

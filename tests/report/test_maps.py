@@ -12,7 +12,7 @@ from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
 from torchcover.coverage import BevGrid
-from torchcover.coverage.quantity import RADIUS, make_detection_quantity
+from torchcover.coverage.quantities import RADIUS, make_detection_quantity
 from torchcover.geometry import build_transform, convert_euler_to_rotation
 from torchcover.report import ColorScale, SensorView, build_color_scale, plot_side_by_side
 from torchcover.report.colors import INFINITE_COLOR, UNOBSERVED_STYLE

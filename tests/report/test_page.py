@@ -16,7 +16,7 @@ import torch
 from matplotlib.figure import Figure
 
 from torchcover.coverage import BevGrid, Coverage, CoverageMetric
-from torchcover.coverage.quantity import RADIUS
+from torchcover.coverage.quantities import RADIUS
 from torchcover.geometry import build_transform, convert_euler_to_rotation
 from torchcover.notebooks import build_result_html
 from torchcover.report import (

@@ -9,7 +9,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from torchcover.coverage import BevGrid
-from torchcover.coverage.quantity import RADIUS
+from torchcover.coverage.quantities import RADIUS
 from torchcover.report import SensorView, build_color_scale, plot_side_by_side
 
 GRID = BevGrid(x_m=(-8.0, 12.0), y_m=(-5.0, 5.0), cell_m=1.0)

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from torchcover.coverage import BevGrid, CoverageMetric, Region
-from torchcover.coverage.blocks import BlockSums
+from torchcover.coverage.sparse_sums import BlockSums
 from torchcover.report.map_layers import (
     MapParams,
     compute_opacity,

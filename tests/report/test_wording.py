@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchcover.coverage.quantity import RADIUS, make_detection_quantity
+from torchcover.coverage.quantities import RADIUS, make_detection_quantity
 from torchcover.estimation import Difference, Number
 from torchcover.report.number_format import (
     format_difference,

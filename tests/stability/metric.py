@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from torchcover import BevGrid, Region
-from torchcover.coverage.quantity import RADIUS
+from torchcover.coverage.quantities import RADIUS
 from torchcover.estimation import Estimate
 
 from .case import Case, most, relative

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from torchcover.coverage import BevGrid
-from torchcover.coverage.bodies import TRIED
+from torchcover.coverage.target_sums import TRIED
 from torchcover.data import SimulatedFrames
 from torchcover.geometry import build_transform
 from torchcover.simulation import PaperReference

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchcover.coverage import BevGrid
 from torchcover.coverage.grid import CellAssignment
-from torchcover.coverage.quantity import MEASURED_WITHIN_M
+from torchcover.coverage.quantities import MEASURED_WITHIN_M
 from torchcover.detection import Boxes, find_points_in_boxes
 from torchcover.detection.inside import BoxPointPairs
 from torchcover.devices import has_float64

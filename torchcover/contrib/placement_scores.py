@@ -12,7 +12,7 @@ from torchcover.contrib.comparison import MetricComparison
 from torchcover.contrib.ranks import BASELINE, LEAST, OWN, Ranking, build_rankings
 from torchcover.contrib.registry import PUBLISHED
 from torchcover.coverage import Coverage, Region
-from torchcover.coverage.measures import Average
+from torchcover.coverage.averages import Average
 from torchcover.estimation import Quantity
 from torchcover.evaluation.evaluating import evaluate
 from torchcover.evaluation.task import AnyRig, load_rig

@@ -19,7 +19,7 @@ from torchcover.contrib.frame_metric import (
     get_rig_name,
 )
 from torchcover.coverage import BevGrid, Region, check_regions
-from torchcover.coverage.quantity import MEASURED_WITHIN_M
+from torchcover.coverage.quantities import MEASURED_WITHIN_M
 from torchcover.coverage.regions import RegionBands
 from torchcover.detection.visibility import compute_box_means
 from torchcover.frames import Frame

@@ -1,4 +1,4 @@
-"""Grid, aggregations, metric, result, regions and paired differences: from clouds to coverage numbers."""
+"""Coverage metric: grid, aggregations, sums, results, regions and paired differences."""
 
 import lazy_loader
 

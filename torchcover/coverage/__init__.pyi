@@ -9,9 +9,8 @@ from .aggregations import PooledMean as PooledMean
 from .aggregations import Quantiles as Quantiles
 from .aggregations import SumState as SumState
 from .aggregations import parse_aggregation as parse_aggregation
-from .bodies import TargetSums as TargetSums
+from .averages import Average as Average
 from .grid import BevGrid as BevGrid
-from .measures import Average as Average
 from .metric import CoverageMetric as CoverageMetric
 from .mixture import CoverageMixture as CoverageMixture
 from .number_metric import CoverageNumberMetric as CoverageNumberMetric
@@ -31,3 +30,4 @@ from .result import Coverage as Coverage
 from .summary import RegionRedundancy as RegionRedundancy
 from .summary import RegionSummary as RegionSummary
 from .sums import CoverageSums as CoverageSums
+from .target_sums import TargetSums as TargetSums

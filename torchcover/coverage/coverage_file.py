@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchcover.coverage.aggregations import Layer
-from torchcover.coverage.blocks import BlockSums, ObservedCells
-from torchcover.coverage.bodies import COLUMNS, TargetSums
 from torchcover.coverage.grid import BevGrid
 from torchcover.coverage.redundancy import Redundancy, list_redundancy_quantities
 from torchcover.coverage.region_sums import AggregatedNumbers, RegionSums
 from torchcover.coverage.regions import Region
+from torchcover.coverage.sparse_sums import BlockSums, ObservedCells
+from torchcover.coverage.target_sums import COLUMNS, TargetSums
 from torchcover.estimation import Quantity
 from torchcover.files import (
     TooLargeError,

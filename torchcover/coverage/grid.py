@@ -260,7 +260,7 @@ class BevGrid:
         parts = zip(*(torch.split(values.detach(), size) for values in each), strict=True)
         return (tuple(values.double() for values in part) for part in parts)
 
-    def check_heights(self, points: Tensor, heights_m: Tensor | None, name: str = "height") -> None:
+    def check_heights(self, points: Tensor, heights_m: Tensor | None, name: str = "heights_m") -> None:
         """Refuse heights that do not go with the bands.
 
         Args:

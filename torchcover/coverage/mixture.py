@@ -3,11 +3,11 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-from torchcover.coverage.bodies import TargetMixture
-from torchcover.coverage.measures import Average, estimate_redundancy
+from torchcover.coverage.averages import Average, estimate_redundancy
 from torchcover.coverage.regions import Region, list_region_bands
 from torchcover.coverage.result import Coverage
 from torchcover.coverage.summary import RegionSummary, summarize_redundancy
+from torchcover.coverage.target_sums import TargetMixture
 from torchcover.estimation import Estimate
 
 SAME = ("band_frame", "grid", "thresholds_m", "max_radius_m", "average", "regions")

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from torchcover.coverage.quantity import make_area_quantity
+from torchcover.coverage.quantities import make_area_quantity
 from torchcover.coverage.result import Coverage
 
 if TYPE_CHECKING:

@@ -8,14 +8,14 @@ import torch
 from torch import Tensor
 
 from torchcover.coverage.aggregations import Aggregation, BinnedFrame, Layer, SumState
-from torchcover.coverage.blocks import LazyMaps, ObservedCells
-from torchcover.coverage.quantity import (
+from torchcover.coverage.quantities import (
     RADIUS,
     make_detection_quantity,
     make_failure_quantity,
     make_redundancy_quantity,
     make_sensor_count_quantity,
 )
+from torchcover.coverage.sparse_sums import LazyMaps, ObservedCells
 from torchcover.estimation import Quantity
 
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchcover.coverage.aggregations import Aggregation
-from torchcover.coverage.columns import CellSums
+from torchcover.coverage.sum_columns import CellSums
 from torchcover.estimation import Estimate, Quantity
 
 

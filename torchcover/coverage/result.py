@@ -12,22 +12,22 @@ import torch
 from torch import Tensor
 
 from torchcover.coverage.aggregations import Layer, MeanOfMeans
-from torchcover.coverage.blocks import BlockSums, LazyMaps, ObservedCells
-from torchcover.coverage.bodies import TargetSums
-from torchcover.coverage.coverage_file import read_coverage, write_coverage
-from torchcover.coverage.grid import BandFrame, BevGrid
-from torchcover.coverage.measures import (
+from torchcover.coverage.averages import (
     Average,
     estimate_area_average,
     estimate_cell_average,
     estimate_cell_errors,
     estimate_redundancy,
 )
-from torchcover.coverage.quantity import RADIUS, make_area_quantity, make_cells_quantity
+from torchcover.coverage.coverage_file import read_coverage, write_coverage
+from torchcover.coverage.grid import BandFrame, BevGrid
+from torchcover.coverage.quantities import RADIUS, make_area_quantity, make_cells_quantity
 from torchcover.coverage.redundancy import Redundancy, expand_layers, list_redundancy_quantities
 from torchcover.coverage.region_sums import AggregatedNumbers, RegionSums
 from torchcover.coverage.regions import Region, RegionBands, check_regions, get_paper_regions, list_region_bands
+from torchcover.coverage.sparse_sums import BlockSums, LazyMaps, ObservedCells
 from torchcover.coverage.summary import RegionSummary, summarize_region
+from torchcover.coverage.target_sums import TargetSums
 from torchcover.estimation import Estimate, Quantity
 from torchcover.files import write_atomically
 from torchcover.notebooks import build_dataframe, build_result_html, build_xarray_dataset
@@ -243,7 +243,7 @@ class Coverage:
         Args:
             region: A region within the grid.
             band: Name of the band.
-            average: "area", the mean over the visible surface (`torchcover.coverage.measures.sum_area_by_block`), or
+            average: "area", the mean over the visible surface (`torchcover.coverage.averages.sum_area_by_block`), or
                 "cells", the paper's unweighted mean over the known cells. Not given: that of this result.
 
         Returns:

@@ -7,8 +7,8 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from torchcover.coverage.aggregations import MeanOfMeans
-from torchcover.coverage.measures import Average, estimate_redundancy, sum_area_by_block
-from torchcover.coverage.quantity import make_failure_quantity
+from torchcover.coverage.averages import Average, estimate_redundancy, sum_area_by_block
+from torchcover.coverage.quantities import make_failure_quantity
 from torchcover.coverage.redundancy import list_redundancy_quantities
 from torchcover.coverage.regions import Region
 from torchcover.estimation import Difference, Estimate, Number

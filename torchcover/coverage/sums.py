@@ -1,23 +1,16 @@
-"""The sums of coverage: clouds in, sums over the cells that were touched, coverage out."""
+"""Sums of coverage: point clouds become sums over touched cells, and these sums become a `Coverage`."""
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from torchcover.coverage.aggregations import Aggregation, AreaAverage, MeanOfMeans
-from torchcover.coverage.blocks import BlockSums, ObservedCells
-from torchcover.coverage.columns import CellSums, SumColumns
-from torchcover.coverage.grid import BevGrid
-from torchcover.coverage.measures import Average
-from torchcover.coverage.quantity import MEASURED_WITHIN_M
-from torchcover.coverage.redundancy import Redundancy, SensorFailures
-from torchcover.coverage.region_sums import RegionSums, compute_aggregated_numbers
-from torchcover.coverage.regions import Region, RegionBands, check_regions, get_paper_regions
-from torchcover.coverage.result import Coverage
-from torchcover.coverage.steps import (
+from torchcover.coverage.averages import Average
+from torchcover.coverage.frame_input import (
     Clouds,
     FrameInput,
     FrameSums,
@@ -25,6 +18,14 @@ from torchcover.coverage.steps import (
     build_frame_inputs,
     check_parameters,
 )
+from torchcover.coverage.grid import BevGrid
+from torchcover.coverage.quantities import MEASURED_WITHIN_M
+from torchcover.coverage.redundancy import Redundancy, SensorFailures
+from torchcover.coverage.region_sums import RegionSums, compute_aggregated_numbers
+from torchcover.coverage.regions import Region, RegionBands, check_regions, get_paper_regions
+from torchcover.coverage.result import Coverage
+from torchcover.coverage.sparse_sums import BlockSums, ObservedCells
+from torchcover.coverage.sum_columns import CellSums, SumColumns
 from torchcover.devices import ensure_float64, map_tensors
 from torchcover.estimation import Estimate
 from torchcover.metrics import BlockedSums, SparseSums, sum_rows
@@ -33,49 +34,49 @@ from torchcover.neighbors import nearest
 
 
 class CoverageSums(BlockedSums):
-    """Blind spot radius and detection over a grid, as a mean over steps of means over reference points.
+    """Blind spot radius and detection rate over a grid: means over frames of means over reference points.
 
         radius[h, y, x]    = E_t[ E_q in cell [ r(q) ] ]
         detection[h, y, x] = E_t[ E_q in cell [ 1(r(q) <= threshold) ] ]
 
-    with r(q) from `torchcover.blind_spot_radius`; a step counts in a cell only if it had a reference point there
-    (Uecker & Zöllner 2024). The state is a few sums for each cell and region that a step has touched: two metrics over
-    different steps merge exactly (`merge_state`), and ranks are added up when `compute` is called. Steps are added up
-    in the order in which they come; in another one, or in parts, the last bits may differ, as of any sum of floats.
+    with r(q) from `torchcover.blind_spot_radius`; a frame counts in a cell only if it has a reference point there
+    (Uecker & Zöllner 2024). The state consists of a few sums for each cell and region that a frame touched: two metrics
+    over different frames merge exactly (`merge_state`), and `compute` adds up the sums of all ranks. Frames are added
+    in the order of their arrival; another order, or merging, may change the last bits, as for any sum of floats.
 
-    With `blocks` the sums are kept in as many blocks of contiguous steps, and the result has standard errors: steps
-    that follow each other are alike, blocks that are longer than the likeness lasts are independent.
+    With several blocks the sums are kept per block of contiguous frames, and the result has standard errors: successive
+    frames are correlated, but blocks that are longer than the correlation time are independent.
 
     Args:
-        grid: Cells and height bands; its `band_frame` decides whether `update` needs heights above the ground.
-        thresholds_m: Radii in metres up to which a point counts as detected, each of them finite, >= 0 and at most
-            `max_radius_m`.
-        max_radius_m: Saturation of r in metres. An empty sensor cloud gives r = `max_radius_m`: with the default,
-            infinity, such a step makes the radius of its cells infinite.
-        blocks: 1 for no errors, or an even number from 8 on, half of which at least are in use at the end of a long
-            run.
-        aggregations: Others than the mean of means, from `torchcover.coverage`: `Maximum()`, `PooledMean()`,
-            `Quantiles(levels)`, `FrameQuantiles(levels)`, or a class of one's own; at most one of each. Each gives maps,
-            and numbers of `regions`.
-        regions: What the result gives numbers for; the paper's `forward_regions()` that fit the grid if not given. By
-            area, a reference point belongs to a region by its own place, so that cells decide about maps only.
-        sensor_names: Names of the rig's sensors, for `Coverage.redundancy`: then `update` takes a cloud for each by its
-            name, and what the rig is without each of them is known as well.
-        needs_radii: Whether radii are asked for. Without, they are NaN, and the search ends at the largest threshold: the
-            clouds may lack points that are farther from any reference point.
-        has_area_weights: Whether there is to be an estimate by area too; then every step needs the square metres of its
-            reference points, as `SurfaceReference` gives them.
-        backend: Nearest-neighbour search, as in `torchcover.nearest`.
-        memory_mb: As in `torchcover.nearest`.
-        kwargs: For the next base, as `MergeableMetric` of torchmetrics is one.
+        grid: Cells and height bands; its `band_frame` determines whether `update` needs heights above ground.
+        thresholds_m: Radii in meters up to which a point counts as detected; finite, >= 0 and at most `max_radius_m`.
+        max_radius_m: Radius in meters at which r saturates. An empty sensor cloud gives r = `max_radius_m`; with the
+            default, infinity, such a frame makes the radius of its cells infinite.
+        num_blocks: 1 for no standard errors, or an even number from 8 on. At least half of the blocks are in use at the
+            end of a long run.
+        aggregations: Aggregations in addition to the mean of means, from `torchcover.coverage`: `Maximum()`,
+            `PooledMean()`, `Quantiles(levels)`, `FrameQuantiles(levels)`, or a custom class; at most one of each class.
+            Each yields maps, and numbers of `regions`.
+        regions: Regions for which the result has numbers; by default the regions of `forward_regions()` that fit the
+            grid. Averages over area assign each reference point to regions by its position, so that cells only affect
+            maps.
+        sensor_names: Names of the sensors of the rig, for `Coverage.redundancy`; `update` then takes one cloud per
+            sensor by name, and the result describes the rig without each of them.
+        needs_radii: Compute radii. Without them radii are NaN, and the search ends at the largest threshold: the clouds
+            may lack points that are farther from any reference point.
+        has_area_weights: Compute averages over area as well; each frame then needs the area of its reference points, as
+            `SurfaceReference` provides it.
+        backend: Nearest-neighbor search, as in `torchcover.nearest`.
+        memory_mb: Memory limit in megabytes, as in `torchcover.nearest`.
+        kwargs: Keyword arguments of the next base class, such as `MergeableMetric`.
 
     Raises:
-        ValueError: A threshold that is negative, not finite, over `max_radius_m`, or given twice; a `max_radius_m` that is
-            not positive; a number of blocks that is neither 1 nor even and 8 or more; two aggregations of one kind; a
-            region beyond the grid, or without a cell centre.
+        ValueError: A threshold is negative, not finite, above `max_radius_m` or repeated; `max_radius_m` is not
+            positive; `num_blocks` is neither 1 nor even and 8 or more; two aggregations have one class; a region
+            reaches beyond the grid or contains no cell center.
 
     Example:
-        >>> metric = CoverageSums(BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=1.0, heights={"all": (-1.0, 1.0)}))
+        >>> metric = CoverageSums(BevGrid(x_m=(0.0, 2.0), y_m=(0.0, 1.0), cell_m=1.0, heights={"all": (-1.0, 1.0)}))
         >>> metric.update(sensor=torch.zeros(1, 3), reference=torch.tensor([[0.3, 0.0, 0.0], [0.5, 0.0, 0.0]]))
         >>> metric.compute().radius
         tensor([[[0.4000,    nan]]], dtype=torch.float64)
@@ -108,35 +109,41 @@ class CoverageSums(BlockedSums):
     ) -> None:
         check_parameters(thresholds_m, max_radius_m, aggregations)
         if not needs_radii and (aggregations or sensor_names or not thresholds_m):
-            raise ValueError("radii: aggregations and sensors need them, and without there has to be a threshold")
+            raise ValueError(
+                "needs_radii: aggregations and sensor_names need radii, and without radii a threshold is needed"
+            )
         regions = get_paper_regions(grid) if regions is None else tuple(regions)
         check_regions(regions, grid)
         thresholds_m, max_radius_m = tuple(float(threshold) for threshold in thresholds_m), float(max_radius_m)
-        meaning = {
+        definition: dict[str, object] = {
             "grid": grid,
             "thresholds_m": thresholds_m,
             "max_radius_m": max_radius_m,
             "num_blocks": num_blocks,
             "aggregations": tuple(aggregations),
             "has_area_weights": has_area_weights,
-            **({"sensor_names": tuple(sensor_names)} if sensor_names else {}),
-            **({} if needs_radii else {"needs_radii": needs_radii}),
-            **({"regions": regions} if has_area_weights or aggregations else {}),
         }
-        super().__init__(num_blocks, meaning, **kwargs)
+        if sensor_names:
+            definition["sensor_names"] = tuple(sensor_names)
+        if not needs_radii:
+            definition["needs_radii"] = needs_radii
+        if has_area_weights or aggregations:
+            definition["regions"] = regions
+        super().__init__(num_blocks, definition, **kwargs)
         self.grid, self.thresholds_m, self.max_radius_m = grid, thresholds_m, max_radius_m
         self.regions, self.sensor_names, self.has_area_weights = regions, tuple(sensor_names), has_area_weights
         self.needs_radii, self.backend, self.memory_mb = needs_radii, backend, memory_mb
-        over_area = [AreaAverage(thresholds_m)] if has_area_weights else []
-        self._of_grid: tuple[Aggregation, ...] = (MeanOfMeans(thresholds_m), *over_area, *aggregations)
+        area_averages = [AreaAverage(thresholds_m)] if has_area_weights else []
+        self._map_aggregations: tuple[Aggregation, ...] = (MeanOfMeans(thresholds_m), *area_averages, *aggregations)
         self._failures = SensorFailures(self.sensor_names, thresholds_m, has_area_weights) if sensor_names else None
-        self.aggregations: tuple[Aggregation, ...] = (*self._of_grid, *([self._failures] if self._failures else []))
-        self._aggregated, self._columns = tuple(aggregations), SumColumns(self.aggregations)
-        self._places = RegionBands(regions if has_area_weights or aggregations else (), grid)
-        shape: dict[str, Any] = {"num_columns": self._columns.num_columns, "num_maxima": self._columns.num_maxima}
-        self.define_sparse_sums("cell_sums", grid.num_cells, **shape)
-        self.define_sparse_sums("region_sums", self._places.num_region_bands, **shape, is_fine=True)
-        for name in Coverage.COUNTS[1:]:  # the base counts the frames
+        failures = [self._failures] if self._failures else []
+        self.aggregations: tuple[Aggregation, ...] = (*self._map_aggregations, *failures)
+        self._extra_aggregations, self._columns = tuple(aggregations), SumColumns(self.aggregations)
+        self._region_bands = RegionBands(regions if has_area_weights or aggregations else (), grid)
+        layout: dict[str, Any] = {"num_columns": self._columns.num_columns, "num_maxima": self._columns.num_maxima}
+        self.define_sparse_sums("cell_sums", grid.num_cells, **layout)
+        self.define_sparse_sums("region_sums", self._region_bands.num_region_bands, **layout, is_fine=True)
+        for name in Coverage.COUNTS[1:]:  # the base class counts the frames
             self.define_sum(name, (), torch.int64)
 
     def update(
@@ -149,183 +156,219 @@ class CoverageSums(BlockedSums):
         block_index: int | Sequence[int] | None = None,
         errors_m: Clouds | None = None,
     ) -> None:
-        """Add one step, or one step for each entry of two lists.
+        """Add one frame, or one frame per entry of two lists.
 
         Args:
-            sensor: (N, 3) points of the rig in the vehicle frame in metres, where they truly are if that is known, or a
-                list of them. N = 0: a blind step. Of a metric with `sensors`: name of the sensor -> its points, or a
-                list of such dicts.
-            reference: (M, 3) points of the reference sensor in the same frame, or a list of the same length. M = 0:
-                the step says nothing.
-            weights: (M,) square metres that each reference point stands for (`frame.reference_weights`), or a list of
-                the same length: what it weighs in the mean over its cell in its step, and in the estimate by area. Not
-                given: all weigh the same.
-            heights_m: (M,) height of each reference point above the local ground (`frame.reference_heights_m`), or a list
-                of the same length, for a grid whose `band_frame` is "ground", and no other. NaN, where there is no
-                ground at or below a point: it is in no band, and counted.
-            block_index: Number of the step, 10^15 at most, or a list of them (`frame.block_index`); it decides
-                about the block, so that steps of one number, as of an instant that is seen again, share one. Not
-                given: counted on from the steps so far.
-            errors_m: (N,) by how many metres each point of the rig was measured off its place, along its ray, those of
-                several sensors one after the other, or a list of them. A point covers nothing at thresholds below that,
-                and counts for radii up to `MEASURED_WITHIN_M`, 0.4. Not given: none is off.
+            sensor: (N, 3) points of the rig in the vehicle frame in meters, at their true positions if these are known,
+                or a list of such clouds. N = 0 is a frame without returns. With `sensor_names`: a dict from sensor name
+                to points, or a list of such dicts.
+            reference: (M, 3) points of the reference sensor in the same frame, or a list of the same length. A frame
+                with M = 0 adds nothing.
+            weights: (M,) area in m2 that each reference point represents (`frame.reference_weights`), or a list: weight
+                in the mean over a cell in this frame and in averages over area. By default all points weigh the same.
+            heights_m: (M,) height of each reference point above ground in meters (`frame.reference_heights_m`), or a
+                list; required if `grid.band_frame` is "ground", refused otherwise. A point with NaN, without ground at
+                or below it, is in no band and is counted.
+            block_index: Index of the frame in time, at most 10^15, or a list (`frame.block_index`). It determines the
+                block; frames with the same index, such as two passes of one recorded time, share one. By default
+                frames are numbered in the order of their arrival.
+            errors_m: (N,) distance in meters by which each point was measured off its true position along its ray, in
+                the order of the sensors, or a list. A point detects nothing at thresholds below its error and counts
+                for radii if the error is at most `MEASURED_WITHIN_M`, 0.4 m. By default all errors are 0.
 
         Raises:
-            ValueError: Lists of different length, a shape other than (N, 3), NaN or infinite coordinates; weights,
-                heights, places in time or errors as `torchcover.coverage.steps.build_frame_inputs` refuses them.
-            TypeError: A cloud is not a floating-point tensor, a place in time not a whole number.
+            ValueError: Lists of different length, a shape other than (N, 3), NaN or infinite coordinates, or weights,
+                heights, block indices or errors that `torchcover.coverage.frame_input.build_frame_inputs` refuses.
+            TypeError: A cloud is not a floating-point tensor, or a block index is not an integer.
         """
-        given = {"weights": weights, "heights_m": heights_m, "block_index": block_index, "errors_m": errors_m}
-        for sums in self.compute_sums(sensor, reference, **given):
+        options = {"weights": weights, "heights_m": heights_m, "block_index": block_index, "errors_m": errors_m}
+        for sums in self.compute_sums(sensor, reference, **options):
             self.add_sums(sums)
 
     def compute_sums(self, sensor: SensorClouds, reference: Clouds, **options: Any) -> list[FrameSums]:  # noqa: ANN401
-        """What `update` adds for each step: the same in any process, where the metric has the same parameters.
+        """Compute what `update` adds for each frame; the result is the same in any process with the same parameters.
 
-        It takes and refuses what `update` does.
+        Args:
+            sensor: As in `update`.
+            reference: As in `update`.
+            options: Further arguments of `update`.
+
+        Returns:
+            One entry per frame, for `add_sums`.
         """
         options = dict.fromkeys(("weights", "heights_m", "block_index", "errors_m")) | options
         sensor, reference, options = map_tensors((sensor, reference, options), ensure_float64)
-        parameters: dict[str, Any] = {
-            name: getattr(self, name) for name in ("grid", "thresholds_m", "has_area_weights")
-        }
-        parameters |= {"sensor_names": self.sensor_names, "first_block_index": int(self.num_frames)}
-        return list(map(self._sums_of, build_frame_inputs(sensor, reference, **options, **parameters)))
+        frames = build_frame_inputs(
+            sensor,
+            reference,
+            **options,
+            grid=self.grid,
+            thresholds_m=self.thresholds_m,
+            has_area_weights=self.has_area_weights,
+            sensor_names=self.sensor_names,
+            first_block_index=int(self.num_frames),
+        )
+        return [self._compute_frame_sums(frame) for frame in frames]
 
-    @torch.no_grad()  # the sums would hold on to every step's graph
-    def _sums_of(self, step: FrameInput) -> FrameSums:
-        _, _, reference, weights, height, block_index = step
-        inside, of, cell = self.grid.assign_cells(reference, height)
+    @torch.no_grad()  # the sums would keep the graph of each frame alive
+    def _compute_frame_sums(self, frame: FrameInput) -> FrameSums:
+        _, _, reference, weights, heights_m, block_index = frame
+        point_indices, point_positions, cell_indices = self.grid.assign_cells(reference, heights_m)
         # Only the reference may be cropped: the nearest sensor point may lie outside the grid.
-        of_sensors = self._distances(reference[inside], step)
-        distance = of_sensors[0].amin(dim=0)
-        values, points = self._values([one[:, of] for one in of_sensors]), reference[inside[of]]
-        weights = None if weights is None else weights.to(reference.device)[inside[of]]
-        place, point = self._places.assign_points(points, cell)
+        sensor_distances = self._measure_sensor_distances(reference[point_indices], frame)
+        distance = sensor_distances[0].amin(dim=0)
+        values = self._compute_values([distances[:, point_positions] for distances in sensor_distances])
+        points = reference[point_indices[point_positions]]
+        weights = None if weights is None else weights.to(reference.device)[point_indices[point_positions]]
+        region_bands, region_points = self._region_bands.assign_points(points, cell_indices)
+        region_weights = None if weights is None else weights[region_points]
         counts = {
             "num_frames": 1,
-            "empty_sensor_frames": int(step.is_blind),
+            "empty_sensor_frames": int(frame.is_blind),
             "empty_reference_frames": int(len(reference) == 0),
             "saturated_points": int((distance >= self.max_radius_m).sum()) if self.needs_radii else 0,
             "inside_points": len(distance),
             "outside_points": len(reference) - len(distance),
-            "no_ground_points": 0 if height is None else int(height.isnan().sum()),
+            "no_ground_points": 0 if heights_m is None else int(heights_m.isnan().sum()),
         }
         return FrameSums(
             block_index,
             counts,
-            self._columns.compute_columns(cell, values, weights),
-            self._columns.compute_columns(place, values[:, point], None if weights is None else weights[point]),
+            self._columns.compute_columns(cell_indices, values, weights),
+            self._columns.compute_columns(region_bands, values[:, region_points], region_weights),
         )
 
     def add_sums(self, sums: FrameSums) -> None:
-        """Add a step that `sums_of` a metric of the same parameters has measured."""
-        block, fine = self._assign_block(sums.block_index), self._get_fine_block(sums.block_index)
+        """Add the sums of one frame.
+
+        Args:
+            sums: Result of `compute_sums` of a metric with the same parameters.
+        """
+        block = self._assign_block(sums.block_index)
         self.add_to_sparse_sums("cell_sums", block, sums.cell_columns)
-        self.add_to_sparse_sums("region_sums", fine, sums.region_columns)
+        self.add_to_sparse_sums("region_sums", self._get_fine_block(sums.block_index), sums.region_columns)
         for name, count in sums.counts.items():
             getattr(self, name).add_(count)
         self._handle_added_frames()
 
-    def _distances(self, reference: Tensor, step: FrameInput) -> list[Tensor]:
-        """(S, M) metres to the nearest point of each sensor that counts for the radius, then those for each threshold.
+    def _measure_sensor_distances(self, reference: Tensor, frame: FrameInput) -> list[Tensor]:
+        """Compute (S, M) distances to the nearest point of each sensor: for the radius, then for each threshold.
 
-        Each point is searched in once, beside those that the same thresholds take: most are off by less than any.
+        Points are grouped by their error, and each group is searched once: most errors are below all thresholds.
         """
-        found: dict[float, Tensor] = {}
-        beyond_m, distance = -math.inf, None
-        for within_m in sorted({MEASURED_WITHIN_M, *self.thresholds_m}):
-            for_radii = self.needs_radii and within_m <= MEASURED_WITHIN_M
-            reach_m = self.max_radius_m if for_radii else max(self.thresholds_m)
-            some = step.select_points(beyond_m, within_m)
-            if distance is None or any(map(len, some)):
-                how: dict[str, Any] = {"backend": self.backend, "memory_mb": self.memory_mb, "max_distance": reach_m}
-                each = torch.stack([nearest(reference, one.to(reference.device), **how).distance for one in some])
-                distance = each if distance is None else torch.minimum(distance, each)
-            found[within_m], beyond_m = distance, within_m
-        return [found[within_m] for within_m in (MEASURED_WITHIN_M, *self.thresholds_m)]
+        distances_by_error: dict[float, Tensor] = {}
+        lower_error_m, distance = -math.inf, None
+        for error_m in sorted({MEASURED_WITHIN_M, *self.thresholds_m}):
+            counts_for_radii = self.needs_radii and error_m <= MEASURED_WITHIN_M
+            reach_m = self.max_radius_m if counts_for_radii else max(self.thresholds_m)
+            clouds = frame.select_points(lower_error_m, error_m)
+            if distance is None or any(map(len, clouds)):
+                search = partial(nearest, max_distance=reach_m, backend=self.backend, memory_mb=self.memory_mb)
+                distances = torch.stack([search(reference, cloud.to(reference.device)).distance for cloud in clouds])
+                distance = distances if distance is None else torch.minimum(distance, distances)
+            distances_by_error[error_m], lower_error_m = distance, error_m
+        return [distances_by_error[error_m] for error_m in (MEASURED_WITHIN_M, *self.thresholds_m)]
 
-    def _values(self, of_sensors: Sequence[Tensor]) -> Tensor:
-        """(V, N) float64 values of points, from what `_distances` found."""
-        distance, *of_thresholds = (one.amin(dim=0) for one in of_sensors)
-        # Before saturation: a point with nothing within `max_radius` is not detected at a threshold of `max_radius`.
-        pairs = zip(of_thresholds, self.thresholds_m, strict=True)
-        detected = [(near <= threshold).double() for near, threshold in pairs]
+    def _compute_values(self, sensor_distances: Sequence[Tensor]) -> Tensor:
+        """Compute (V, N) float64 values of points from the result of `_measure_sensor_distances`."""
+        distance, *threshold_distances = (distances.amin(dim=0) for distances in sensor_distances)
+        # Before saturation: a point without a sensor point within max_radius_m is not detected at that threshold.
+        pairs = zip(threshold_distances, self.thresholds_m, strict=True)
+        detections = [(distances <= threshold_m).double() for distances, threshold_m in pairs]
         radius = distance.clamp(max=distance.new_tensor(self.max_radius_m)).double()
         radius = radius if self.needs_radii else torch.full_like(radius, math.nan)
-        values = torch.stack([radius, *detected])
+        values = torch.stack([radius, *detections])
         if self._failures:
-            values = torch.cat([values, self._failures.compute_values(of_sensors, self.max_radius_m)])
+            values = torch.cat([values, self._failures.compute_values(sensor_distances, self.max_radius_m)])
         return values
 
     def compute(self) -> Coverage:
-        """The coverage so far. Cells that no reference point ever probed are NaN with count 0."""
-        cells, table = self.grid.num_cells, self.cell_sums
-        whole = sum_rows(torch.cat([table[:, :1] % cells, table[:, 1:]], dim=1), self._columns.num_maxima)
-        at, sums = whole[:, 0].long(), self._columns.split_columns(whole[:, 1:].T)
-
-        known = ObservedCells(self.grid.shape, at, sums.observed_frames.long(), sums.point_counts.long())
-        failures = sums.compute_layers(self._failures, self.max_radius_m) if self._failures else []
-        in_blocks = self._columns.split_columns(table[:, 1:].T)
-        listed = self.block_frame_counts.clone(), (self.num_blocks, *self.grid.shape), table[:, 0].long()
-        mean, area = (in_blocks.sums_by_aggregation.get(kind.name, {}) for kind in (MeanOfMeans, AreaAverage))
+        """Compute the coverage so far. Cells without any reference point are NaN with count 0."""
+        num_cells, table = self.grid.num_cells, self.cell_sums
+        rows = sum_rows(torch.cat([table[:, :1] % num_cells, table[:, 1:]], dim=1), self._columns.num_maxima)
+        sums = self._columns.split_columns(rows[:, 1:].T)
+        observed_cells = ObservedCells(
+            self.grid.shape, rows[:, 0].long(), sums.observed_frames.long(), sums.point_counts.long()
+        )
+        layers = []
+        for aggregation in self._map_aggregations:
+            layers += sums.compute_layers(aggregation, self.max_radius_m)
+        block_sums, area_sums = self._build_block_sums(table)
+        redundancy = None
+        if self._failures:
+            failure_layers = sums.compute_layers(self._failures, self.max_radius_m)
+            redundancy = Redundancy(
+                self.sensor_names, observed_cells, {layer.quantity.key: layer for layer in failure_layers}
+            )
+        aggregated_numbers = None
+        if self._extra_aggregations and self._region_bands.num_region_bands:
+            aggregated_numbers = compute_aggregated_numbers(
+                self._sum_regions(use_fine_blocks=False), self._extra_aggregations, self.max_radius_m
+            )
         return Coverage(
             grid=self.grid,
             thresholds_m=self.thresholds_m,
             max_radius_m=self.max_radius_m,
-            observed_cells=known,
-            layers=[layer for one in self._of_grid for layer in sums.compute_layers(one, self.max_radius_m)],
-            block_sums=BlockSums(*listed, in_blocks.observed_frames.long(), mean["sums"])
-            if self.num_blocks > 1
-            else None,
-            area_sums=BlockSums(*listed, area["m2"], area["sums"]) if area else None,
+            observed_cells=observed_cells,
+            layers=layers,
+            block_sums=block_sums,
+            area_sums=area_sums,
             counts={name: int(getattr(self, name)) for name in Coverage.COUNTS},
             regions=self.regions,
-            region_sums=self._by_area(),
-            aggregated_numbers=compute_aggregated_numbers(
-                self._in_places(fine=False), self._aggregated, self.max_radius_m
-            )
-            if self._aggregated and self._places.num_region_bands
-            else None,
-            redundancy=Redundancy(self.sensor_names, known, {one.quantity.key: one for one in failures})
-            if failures
-            else None,
+            region_sums=self._build_region_sums(),
+            aggregated_numbers=aggregated_numbers,
+            redundancy=redundancy,
         )
 
-    def _in_places(self, *, fine: bool) -> CellSums:
-        """The sums of (..., B, P) places in blocks, the fine ones or the others."""
-        together = 1 if fine else min(int(self.frames_per_block), FINE_BLOCKS_PER_BLOCK)  # so many fine blocks are one
-        blocks, count = self.num_fine_blocks if fine else self.num_blocks, self._places.num_region_bands
-        key, columns = self.region_sums.split_with_sizes([1, self._columns.num_columns], dim=1)
-        key = key.div(together * count, rounding_mode="floor") * count + key % count
-        rows = sum_rows(torch.cat([key, columns], dim=1), self._columns.num_maxima)
-        sums = columns.new_zeros(self._columns.num_columns, blocks * count)
-        sums[self._columns.num_columns - self._columns.num_maxima :] = -math.inf
+    def _build_block_sums(self, table: Tensor) -> tuple[BlockSums | None, BlockSums | None]:
+        """Build the sums in blocks for means over frames, and those for averages over area."""
+        sums = self._columns.split_columns(table[:, 1:].T)
+        lists = self.block_frame_counts.clone(), (self.num_blocks, *self.grid.shape), table[:, 0].long()
+        means = sums.sums_by_aggregation[MeanOfMeans.name]
+        has_blocks = self.num_blocks > 1
+        block_sums = BlockSums(*lists, sums.observed_frames.long(), means["sums"]) if has_blocks else None
+        if not self.has_area_weights:
+            return block_sums, None
+        areas = sums.sums_by_aggregation[AreaAverage.name]
+        return block_sums, BlockSums(*lists, areas["m2"], areas["sums"])
+
+    def _sum_regions(self, *, use_fine_blocks: bool) -> CellSums:
+        """Compute the sums (..., B, P) of P regions and bands, in fine blocks or in blocks."""
+        # Until a block has as many frames as fine blocks, only so many fine blocks belong to it.
+        fine_per_block = 1 if use_fine_blocks else min(int(self.frames_per_block), FINE_BLOCKS_PER_BLOCK)
+        num_blocks = self.num_fine_blocks if use_fine_blocks else self.num_blocks
+        num_region_bands, num_columns = self._region_bands.num_region_bands, self._columns.num_columns
+        keys, columns = self.region_sums.split_with_sizes([1, num_columns], dim=1)
+        block_indices = keys.div(fine_per_block * num_region_bands, rounding_mode="floor")
+        keys = block_indices * num_region_bands + keys % num_region_bands
+        rows = sum_rows(torch.cat([keys, columns], dim=1), self._columns.num_maxima)
+        sums = columns.new_zeros(num_columns, num_blocks * num_region_bands)
+        sums[num_columns - self._columns.num_maxima :] = -math.inf
         sums[:, rows[:, 0].long()] = rows[:, 1:].T
-        return self._columns.split_columns(sums.view(-1, blocks, count))
+        return self._columns.split_columns(sums.view(-1, num_blocks, num_region_bands))
 
-    def _by_area(self) -> RegionSums | None:
-        if not (self.has_area_weights and self._places.num_region_bands):
+    def _build_region_sums(self) -> RegionSums | None:
+        if not (self.has_area_weights and self._region_bands.num_region_bands):
             return None
-        sums = self._in_places(fine=True).sums_by_aggregation
-        own = [sums[kind.name]["sums"] for kind in (AreaAverage, SensorFailures) if kind.name in sums]
-        return RegionSums(
-            self.fine_block_frame_counts.clone(), sums[AreaAverage.name]["m2"], torch.cat(own).movedim(0, 1)
-        )
+        sums = self._sum_regions(use_fine_blocks=True).sums_by_aggregation
+        names = [name for name in (AreaAverage.name, SensorFailures.name) if name in sums]
+        values = torch.cat([sums[name]["sums"] for name in names]).movedim(0, 1)
+        return RegionSums(self.fine_block_frame_counts.clone(), sums[AreaAverage.name]["m2"], values)
 
     def estimate_regions(self, region_bands: Sequence[tuple[Region, str]], average: Average) -> list[Estimate]:
-        """The numbers of regions in bands so far: those of `compute().estimate`, but no maps are made for them.
+        """Compute the numbers of regions so far, equal to those of `compute().estimate`, without computing maps.
 
         Args:
             region_bands: Regions within the grid, each with the name of a band.
-            average: What the numbers are means over, as there.
+            average: "area" or "cells", as in `Coverage.estimate`.
 
         Raises:
-            ValueError: As there.
+            ValueError: As in `Coverage.estimate`.
         """
-        sums, numbers = self._by_area(), [self._places.find_index(*place) for place in region_bands]
-        if average == "area" and sums and None not in numbers:
+        sums = self._build_region_sums()
+        indices = [self._region_bands.find_index(region, band) for region, band in region_bands]
+        if average == "area" and sums and None not in indices:
             quantities = MeanOfMeans(self.thresholds_m).quantities
-            return [sums.estimate(quantities, number) for number in numbers if number is not None]
+            return [sums.estimate(quantities, index) for index in indices if index is not None]
         coverage = self.compute()
-        return [coverage.estimate(region, height, average) for region, height in region_bands]
+        return [coverage.estimate(region, band, average) for region, band in region_bands]

@@ -7,7 +7,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from torchcover.coverage.quantity import MEASURED_WITHIN_M
+from torchcover.coverage.quantities import MEASURED_WITHIN_M
 from torchcover.detection.inside import SKIN_M
 from torchcover.encounters.criterion import Criterion
 from torchcover.encounters.sighting import (

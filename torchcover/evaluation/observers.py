@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Protocol, Self, TypeVar, runtime_checkable
 
 from torchcover.coverage import Coverage, CoverageSums
-from torchcover.coverage.steps import FrameSums
+from torchcover.coverage.frame_input import FrameSums
 from torchcover.frames import Frame
 
 ResultT = TypeVar("ResultT", covariant=True)

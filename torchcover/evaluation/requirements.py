@@ -22,7 +22,7 @@ from pydantic import (
 )
 
 from torchcover.coverage import AGGREGATIONS
-from torchcover.coverage.quantity import (
+from torchcover.coverage.quantities import (
     RADIUS,
     make_cells_quantity,
     make_detection_quantity,

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchcover.coverage import BevGrid
-from torchcover.coverage.quantity import RADIUS, make_area_quantity
+from torchcover.coverage.quantities import RADIUS, make_area_quantity
 from torchcover.detection import Boxes
 from torchcover.files import reject_links, write_atomically
 from torchcover.files.atomic import TEMPORARY

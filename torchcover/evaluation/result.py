@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from torchcover import __version__
 from torchcover.coverage import Coverage, Region
-from torchcover.coverage.quantity import make_area_quantity
+from torchcover.coverage.quantities import make_area_quantity
 from torchcover.estimation import MIN_BLOCKS
 from torchcover.evaluation.pipeline import Run
 from torchcover.evaluation.progress import defer_signals

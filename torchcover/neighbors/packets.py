@@ -62,10 +62,11 @@ def search(query: Tensor, points: Tensor, max_distance: float, memory_mb: float)
         # A pool starts no thread before its first task, so a single thread stays the only one.
         run = pool.map if torch.get_num_threads() > 1 else map
         order, tree_order = run(compute_morton_order, (queries, tree_points))
-        tree = _build_tree(tree_points, tree_order)
+        leaves, indices, boxes, min_indices = _build_tree(tree_points, tree_order)
 
         def search_chunk(start: int) -> None:
-            _search_chunk(queries, order[start : start + CHUNK_SIZE], *tree, bound, result)
+            chunk = order[start : start + CHUNK_SIZE]
+            _search_chunk(queries, chunk, leaves, indices, boxes, min_indices, bound, result)
 
         list(run(search_chunk, range(0, len(order), CHUNK_SIZE)))
     return torch.from_numpy(result)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchcover.coverage import AGGREGATIONS, Aggregation, Average, BevGrid, CoverageSums, MeanOfMeans, Region
 from torchcover.coverage.grid import PAPER_HEIGHTS
-from torchcover.coverage.quantity import RADIUS, make_detection_quantity, make_failure_quantity
+from torchcover.coverage.quantities import RADIUS, make_detection_quantity, make_failure_quantity
 from torchcover.estimation import Estimate
 from torchcover.evaluation import CoverageObserver
 from torchcover.evaluation.measurement import NUM_BLOCKS

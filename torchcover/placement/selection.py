@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchcover import __version__
 from torchcover.coverage import Average
-from torchcover.coverage.quantity import make_detection_quantity
+from torchcover.coverage.quantities import make_detection_quantity
 from torchcover.coverage.regions import RegionBands
 from torchcover.estimation import Number
 from torchcover.evaluation.progress import Progress

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from torchcover.coverage.grid import PAPER_HEIGHTS
-from torchcover.coverage.quantity import make_detection_quantity
+from torchcover.coverage.quantities import make_detection_quantity
 from torchcover.estimation import Difference, Estimate, Quantity
 from torchcover.estimation.errors import ROUND_OFF
 from torchcover.evaluation.target_visibility import build_flat_ground

@@ -89,7 +89,7 @@ def build_color_scale(quantity: Quantity, values: Tensor) -> ColorScale:
 
     Example:
         >>> import torch
-        >>> from torchcover.coverage.quantity import RADIUS
+        >>> from torchcover.coverage.quantities import RADIUS
         >>> build_color_scale(RADIUS, torch.tensor([0.5, 2.04])).label
         'mean blind spot radius (m)'
     """

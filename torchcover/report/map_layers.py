@@ -16,8 +16,8 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
 from torchcover.coverage import BevGrid, Coverage, Layer
-from torchcover.coverage.blocks import BlockSums, ObservedCells
-from torchcover.coverage.quantity import make_area_quantity
+from torchcover.coverage.quantities import make_area_quantity
+from torchcover.coverage.sparse_sums import BlockSums, ObservedCells
 from torchcover.estimation import Quantity
 from torchcover.metrics import sum_rows
 from torchcover.report.colors import UNOBSERVED, ColorScale, build_color_scale

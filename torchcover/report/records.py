@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
-from torchcover.coverage.measures import Average
+from torchcover.coverage.averages import Average
 from torchcover.coverage.redundancy import list_redundancy_quantities
 from torchcover.estimation import Difference, Number
 from torchcover.files import format_csv

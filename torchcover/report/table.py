@@ -16,7 +16,7 @@ from torchcover.coverage import (
     compute_differences,
     list_region_bands,
 )
-from torchcover.coverage.measures import Average
+from torchcover.coverage.averages import Average
 from torchcover.coverage.paired import EstimatorGetters, find_leaders
 from torchcover.estimation import MIN_BLOCKS, ROUND_OFF, Difference, Quantity
 

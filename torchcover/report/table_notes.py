@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from textwrap import fill
 
 from torchcover.coverage import Region, RegionRedundancy
-from torchcover.coverage.quantity import RADIUS, make_redundancy_quantity, make_sensor_count_quantity
+from torchcover.coverage.quantities import RADIUS, make_redundancy_quantity, make_sensor_count_quantity
 from torchcover.estimation import MIN_BLOCKS, Quantity, estimate_blocks_needed
 from torchcover.report.number_format import (
     UNKNOWN,

@@ -11,7 +11,7 @@ from typing import Any, Self
 import numpy as np
 import torch
 
-from torchcover.coverage.quantity import MEASURED_WITHIN_M
+from torchcover.coverage.quantities import MEASURED_WITHIN_M
 from torchcover.detection.boxes import Boxes
 from torchcover.detection.inside import add_point_counts
 from torchcover.frames.frame import Frame, Measurement

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchcover.coverage import NEAR_FIELD_M, BevGrid, Region, TargetSums
-from torchcover.coverage.bodies import COLUMNS, FREE, SEEN, TRIED
+from torchcover.coverage.target_sums import COLUMNS, FREE, SEEN, TRIED
 from torchcover.frames import Frame
 from torchcover.geometry import BoundingBox, find_overlaps
 from torchcover.geometry.arrays import Bools, Float64, Int64

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchcover.coverage.aggregations.aggregation import Aggregation, BinnedFrame, Layer, SumState
-from torchcover.coverage.quantity import make_radius_quantity
+from torchcover.coverage.quantities import make_radius_quantity
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchcover.coverage.aggregations.aggregation import Aggregation, BinnedFrame, Layer, SumState
-from torchcover.coverage.quantity import RADIUS, make_area_quantity, make_detection_quantity, make_radius_quantity
+from torchcover.coverage.quantities import RADIUS, make_area_quantity, make_detection_quantity, make_radius_quantity
 from torchcover.estimation import Quantity
 
 

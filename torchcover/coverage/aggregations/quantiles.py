@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchcover.coverage.aggregations.aggregation import Aggregation, BinnedFrame, Layer, SumState
-from torchcover.coverage.quantity import make_radius_quantity
+from torchcover.coverage.quantities import make_radius_quantity
 from torchcover.estimation import Quantity
 
 # A sum of weights that misses its target by rounding has reached it: 0.1 + 0.2 + 0.3 is half of 1.2.

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Literal
 import torch
 from torch import Tensor
 
-from torchcover.coverage.blocks import BlockSums, ObservedCells
 from torchcover.coverage.regions import Region
+from torchcover.coverage.sparse_sums import BlockSums, ObservedCells
 from torchcover.estimation import MIN_BLOCKS_OF_A_CELL, Estimate, Quantity, estimate_ratio_errors
 
 if TYPE_CHECKING:
