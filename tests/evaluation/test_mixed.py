@@ -50,14 +50,14 @@ def mixed(yards):
 
 def test_each_world_is_as_if_it_were_alone(mixed, yards):
     alone = evaluate(RIGS, yards / "far.yaml", **SMALL)
-    assert mixed.worlds["far"].summary == alone.summary
-    assert list(mixed.worlds) == ["near", "far"]
+    assert mixed.scenario_results["far"].summary == alone.summary
+    assert list(mixed.scenario_results) == ["near", "far"]
     assert mixed.weights == {"near": 0.75, "far": 0.25}
 
 
 def test_a_mixture_is_the_weighted_mean_and_its_variance_that_of_the_sum(mixed):
     for at, row in enumerate(mixed.summary):
-        parts = [(mixed.weights[name], world.summary[at]) for name, world in mixed.worlds.items()]
+        parts = [(mixed.weights[name], world.summary[at]) for name, world in mixed.scenario_results.items()]
         assert all(part["rig"] == row["rig"] for _, part in parts)
         for key in NUMBERS:
             assert row[key] == pytest.approx(sum(weight * part[key] for weight, part in parts))
@@ -77,7 +77,7 @@ def test_marks_are_beyond_chance_in_the_mixture(mixed, yards):
     assert not any(row["detection_0.4m_best"] for row in few.summary)
     # Eight blocks in all are not eight in each.
     assert all(row["detection_0.4m_low"] is None for row in few.summary)
-    assert "Not enough steps for intervals in near: 4 blocks" in " ".join(str(few).split())
+    assert "Not enough frames for intervals in near: 4 blocks" in " ".join(str(few).split())
 
 
 def test_redundancy_is_mixed_by_the_book(yards):
@@ -86,7 +86,10 @@ def test_redundancy_is_mixed_by_the_book(yards):
     )
     given = {str(yards / "near.yaml"): 3, str(yards / "far.yaml"): 1}
     mixed = evaluate(rig, given, redundancy=True, **SMALL)
-    (row,), parts = mixed.summary, [(mixed.weights[name], world.summary[0]) for name, world in mixed.worlds.items()]
+    (row,), parts = (
+        mixed.summary,
+        [(mixed.weights[name], world.summary[0]) for name, world in mixed.scenario_results.items()],
+    )
     assert row["most_important_sensor"] == "high"
     for key in ("sensors_0.4m", "detection_0.4m_without_high", "detection_0.4m_without_high_change"):
         assert row[key] == pytest.approx(sum(weight * part[key] for weight, part in parts))
@@ -103,7 +106,7 @@ def test_what_kinds_of_world_agree_in_is_said_once_and_else_of_each(mixed, yards
         other.table.notes
     )
     (page,) = (
-        file for file in mixed.save(tmp_path, files="page") if file.parent == tmp_path and file.suffix == ".html"
+        file for file in mixed.save(tmp_path, file_kinds="page") if file.parent == tmp_path and file.suffix == ".html"
     )
     text = page.read_text()
     assert all(said in text for said in ("mixture: Mean blind spot radius", "far: Mean blind", "near 0.75, far 0.25"))
@@ -113,7 +116,7 @@ def test_what_kinds_of_world_agree_in_is_said_once_and_else_of_each(mixed, yards
 def test_all_weight_on_one_is_that_one(yards):
     paths = [str(yards / f"{name}.yaml") for name in ("near", "far")]
     only = evaluate(RIGS, dict(zip(paths, (0.0, 2.0), strict=True)), **SMALL)
-    for row, same in zip(only.summary, only.worlds["far"].summary, strict=True):
+    for row, same in zip(only.summary, only.scenario_results["far"].summary, strict=True):
         for key in (*NUMBERS, "radius_m_low", "radius_m_difference_high", "cells_radius_m_error"):
             assert row[key] == pytest.approx(same[key])
 
@@ -123,23 +126,23 @@ def test_results_of_one_rig_each_are_compared_as_if_measured_together(mixed, yar
     each = [evaluate(rig, given, **SMALL) for rig in RIGS]
     assert compare(each).summary == mixed.summary
     with pytest.raises(ValueError, match="same scenarios with the same weights"):
-        compare([each[0], MixedResult.from_results(each[1].worlds, {"near": 0.5, "far": 0.5})])
+        compare([each[0], MixedResult.from_results(each[1].scenario_results, {"near": 0.5, "far": 0.5})])
     with pytest.raises(ValueError, match="same scenarios with the same weights"):
-        compare([each[0], each[1].worlds["far"]])
+        compare([each[0], each[1].scenario_results["far"]])
 
 
 def test_files_hold_every_world_and_the_mixture(mixed, tmp_path):
-    files = mixed.save(tmp_path, files="numbers")
+    files = mixed.save(tmp_path, file_kinds="numbers")
     assert all(file.is_file() for file in files)
     record = json.loads((tmp_path / "summary.json").read_text())
     assert record["rows"] == mixed.summary
     assert record["sensor_model"] == {"high": "ideal", "low": "ideal"}
-    assert {name: world["weight"] for name, world in record["worlds"].items()} == mixed.weights
-    for name, world in mixed.worlds.items():
+    assert {name: world["weight"] for name, world in record["scenarios"].items()} == mixed.weights
+    for name, world in mixed.scenario_results.items():
         assert json.loads((tmp_path / name / "summary.json").read_text())["rows"] == world.summary
     with (tmp_path / "summary.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert [row["world"] for row in rows] == ["near"] * 2 + ["far"] * 2 + ["mixture"] * 2
+    assert [row["scenario"] for row in rows] == ["near"] * 2 + ["far"] * 2 + ["mixture"] * 2
     assert [float(row["radius_m"]) for row in rows[4:]] == [row["radius_m"] for row in mixed.summary]
     assert {(row["vehicle"], row["sensor_model"]) for row in rows} == {("box", "ideal")}
     assert [stem.split("/")[0] for stem, _ in mixed.maps()][:: len(list(mixed.maps())) - 1] == ["near", "far"]

@@ -16,7 +16,11 @@ from torchcover.simulation import Rig
 from torchcover.targets import STATES, Raster
 
 NASTY = "<script>alert(1)</script>"
-MEETING = {"name": "a", "ego": {"speed_kmh": [20, 30]}, "road_user": {"body": "adult", "speed_kmh": 5, "from_m": 2}}
+MEETING = {
+    "name": "a",
+    "ego": {"speed_kmh": [20, 30]},
+    "road_user": {"body": "adult", "speed_kmh": 5, "approach_distance_m": 2},
+}
 MOST_CHARS = 800
 
 

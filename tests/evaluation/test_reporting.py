@@ -24,7 +24,11 @@ def lidar(name, x_m, z_m=0.8):
 
 ONE = Rig.model_validate({"name": "one", "sensors": [lidar("front", 2.6)]})
 TWO = Rig.model_validate({"name": NASTY, "sensors": [lidar("front", 2.6), lidar("rear", -2.6)]})
-CROSSING = {"name": "a", "ego": {"speed_kmh": 30}, "road_user": {"body": "adult", "speed_kmh": 5, "from_m": 2}}
+CROSSING = {
+    "name": "a",
+    "ego": {"speed_kmh": 30},
+    "road_user": {"body": "adult", "speed_kmh": 5, "approach_distance_m": 2},
+}
 NEEDS = {"name": "needs", "requirements": [{"target": "child", "positions": {"points_m": [[5.0, 0.0]]}, "points": 5}]}
 
 

@@ -55,9 +55,9 @@ def test_a_study_says_of_the_same_steps_what_an_evaluation_says(study):
     # Of 8 blocks at least: here the others see all of them.
     for each, rays in ((first, 256), (fewer, 64)):
         coverage = evaluate(*SMALL.rigs, "courtyard", num_frames=8, cell_m=4.0, num_rays=rays).coverage
-        rows = {(row.region, row.height): row.numbers for row in coverage.summary()}
+        rows = {(row.region, row.band): row.numbers for row in coverage.summary()}
         for one in each.numbers:
-            number = rows[one.region, one.height][one.quantity.key]
+            number = rows[one.region, one.band][one.quantity.key]
             assert (one.value == number.value) or math.isnan(one.value)
             if not math.isnan(number.error):
                 assert one.error.error_after(8) == pytest.approx(math.hypot(number.error, one.error.bias), rel=1e-9)
@@ -68,12 +68,14 @@ def test_a_study_says_of_the_same_steps_what_an_evaluation_says(study):
 def test_numbers_of_another_definition_are_not_held_against_each_other(study):
     paper = study.trials[2]
     assert all(math.isnan(one.difference.value) and math.isnan(one.error.bias) for one in paper.numbers)
-    assert paper.steps_for(0.02) is None
+    assert paper.estimate_num_frames(0.02) is None
 
 
 def test_times_are_those_of_a_whole_command(study):
     first = study.trials[0]
-    assert first.seconds_for(16, study.start_s) - first.seconds_for(8, study.start_s) == pytest.approx(first.seconds)
+    assert first.estimate_duration_s(16, study.start_s) - first.estimate_duration_s(8, study.start_s) == pytest.approx(
+        first.seconds
+    )
     assert study.start_s == pytest.approx(100.0 - first.seconds / 8)
     assert first.processor_s > 0
 
@@ -108,7 +110,7 @@ def test_another_setting_is_recommended_only_where_it_saves_a_fifth():
 def test_only_a_bias_beyond_chance_counts_and_is_marked(study):
     for one in study.trials[1].numbers:
         if not math.isnan(one.difference.value):
-            assert one.is_biased is (one.difference.p * len(study.trials[1].numbers) < 0.05)
+            assert one.is_biased is (one.difference.p_value * len(study.trials[1].numbers) < 0.05)
             assert one.error.bias == (abs(one.difference.value) if one.is_biased else 0.0)
 
 

@@ -150,7 +150,7 @@ class MixedResult(Result):
 
     def _csv(self) -> str:
         tables = {**{name: world.table for name, world in self.scenario_results.items()}, MIXTURE: self.table}
-        rows = [{"world": name, **row} for name, table in tables.items() for row in build_records(table)]
+        rows = [{"scenario": name, **row} for name, table in tables.items() for row in build_records(table)]
         columns = list(dict.fromkeys(chain.from_iterable(rows)))
         return format_csv([columns, *([row.get(column, "") for column in columns] for row in rows)])
 
