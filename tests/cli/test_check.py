@@ -33,8 +33,8 @@ def test_the_exit_code_is_the_verdict_on_all(torchcover, worlds, requirements, c
     assert [[child.tag for child in case] for case in suite] == [tags[state] for state in states]
     assert suite[0].get("name") == "<a> & b: adult, points_m [[5.0, 0.0]]: points >= 5"
     told = {case[0].get("message"): case[0].text for case in suite if len(case)}
-    unknown = "worst: -; margin: -; not met: 0; not decided: 1; of: 1; no room: 0; the worst is: {}"
-    where = "x = 0.00, y = 0.00 m, no room"
+    unknown = "worst value: -; margin: -; not met: 0; not decided: 1; total: 1; occupied: 0; worst location: {}"
+    where = "x = 0.00, y = 0.00 m, occupied"
     assert (told.get(unknown.format(where)) == where) == ("not decided" in states)
     assert record["scenarios"] == {"target": str(worlds / "yard.yaml")}
     assert suite.get("failures") == str(states.count("not met"))

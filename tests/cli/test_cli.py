@@ -227,7 +227,7 @@ def test_frames_that_are_skipped_leave_their_place_in_time(torchcover, recording
 
 def test_too_few_steps_for_errors_are_told_and_a_recording_has_no_reference_sensor(torchcover, recording, tmp_path):
     _, printed, _ = torchcover("evaluate", "--frames", recording, "--out", tmp_path / "out")
-    assert "Not enough frames for an answer: 4 form 4 blocks of time, intervals need about 9" in printed
+    assert "Not enough frames for an answer: 4 frames form 4 blocks, 9 are needed" in printed
     assert "Brackets: 95" not in printed
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert (summary["reference"]["sensor"], summary["target_error"]) == ("recorded", None)
@@ -292,8 +292,8 @@ def test_too_few_steps_for_errors_are_told_and_a_recording_has_no_reference_sens
             "reference, rays and frame_interval_s are for simulations",
         ),
         (["evaluate", "--frames", "recording", "--reference", "paper"], "a recording has `recorded` or `accumulated`"),
-        (["evaluate", "--frames", "recording", "--reference", "accumulated"], "does not say when its scans were made"),
-        (["evaluate", "--frames", "recording", "--sensors", "roof"], "which has sensor, reference; got roof"),
+        (["evaluate", "--frames", "recording", "--reference", "accumulated"], "has no times of its scans"),
+        (["evaluate", "--frames", "recording", "--sensors", "roof"], "got roof; give sensors of the recording recording: sensor, reference"),
         (
             ["evaluate", "--frames", "recording", "--reference", "recorded", "--set", "recording.window_s=1"],
             "recorded reference has none",
@@ -311,7 +311,7 @@ def test_too_few_steps_for_errors_are_told_and_a_recording_has_no_reference_sens
             ["compare", "--frames", "recording", "--set", "recording.pose_convention=wrong"],
             "recording.pose_convention: 'world_T_vehicle', 'vehicle_T_world' or 'swapped_xy' is needed; got 'wrong'",
         ),
-        (["average"], "No such command 'measure'"),
+        (["average"], "No such command 'average'"),
     ],
 )
 def test_a_mistake_ends_in_one_line_and_exit_code_2(torchcover, recording, monkeypatch, arguments, message):

@@ -120,7 +120,7 @@ def test_maps_are_side_by_side_and_as_differences(torchcover, worlds):
         for band in ("ground", "obstacle")
         for prefix, suffix in (("", ""), ("difference_", "_both_minus_low"))
     ]
-    near = [f"near_{metric}.png" for metric in metrics]
+    near = [f"near_field_{metric}.png" for metric in metrics]
     assert sorted(path.name for path in (out / "maps").iterdir()) == sorted([*of_bands, *near])
 
 

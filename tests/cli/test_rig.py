@@ -18,8 +18,8 @@ def test_a_recorded_rig_is_found_again(torchcover, worlds, tmp_path):
     assert "7 rows (those that returned anything), 30 columns" in rig.description
     for lidar, of in zip(rig.sensors, true.sensors, strict=True):
         # Behind the vehicle there is nothing that a level ray hits.
-        returned_deg = np.sort(of.elevations_deg())[::-1][of.name == "rear" :]
-        np.testing.assert_allclose(lidar.elevations_deg(), returned_deg, atol=5e-4)
+        returned_deg = np.sort(of.compute_elevations_deg())[::-1][of.name == "rear" :]
+        np.testing.assert_allclose(lidar.compute_elevations_deg(), returned_deg, atol=5e-4)
         assert (lidar.name, lidar.columns, lidar.horizontal_fov_deg) == (of.name, 30, 90.0)
         np.testing.assert_allclose(lidar.mount.to_matrix(), of.mount.to_matrix(), atol=1e-6)
         assert lidar.max_range_m <= 60.1

@@ -53,12 +53,12 @@ def test_a_scenario_is_drawn_in_the_frame_of_the_ego(torchcover, worlds, drawn):
     np.testing.assert_allclose(sorted(ahead.outline_m[:, 1].round(6)), [4.0, 4.0, 6.0, 6.0])
     assert drawn["title"] == "yard, step 3"
     # The rig saw the actor, where it is drawn.
-    sensor = drawn["sensor"]
+    sensor = drawn["sensor_points"]
     on_actor = sensor[sensor[:, 2] > 0.1]
     assert len(on_actor)
     assert (np.abs(on_actor[:, 0] - 20.0) < 2.1).all()
     assert (np.abs(on_actor[:, 1] - 5.0) < 1.1).all()
-    assert len(drawn["reference"]) > 1000
+    assert len(drawn["reference_points"]) > 1000
 
 
 @pytest.mark.filterwarnings("default")
@@ -166,8 +166,8 @@ def test_a_vehicle_is_drawn_with_its_mount_regions_on_its_skin(torchcover, tmp_p
         (lid, [-1.0, -0.4, 0.8], [1.0, 0.4, 0.8]),
         (tail, [-1.5, -0.3, 0.2], [-1.5, 0.3, 0.6]),
     ):
-        assert patch.places_m.min(axis=(0, 1)) == pytest.approx(lowest)
-        assert patch.places_m.max(axis=(0, 1)) == pytest.approx(highest)
+        assert patch.points_m.min(axis=(0, 1)) == pytest.approx(lowest)
+        assert patch.points_m.max(axis=(0, 1)) == pytest.approx(highest)
 
 
 def test_a_region_beside_the_body_is_named(torchcover, tmp_path):
@@ -365,7 +365,7 @@ def test_what_stands_on_a_slope_is_as_high_as_it_is_above_the_slope(at_m, torchc
     )
     code, _, _ = torchcover("show", worlds / "slope.yaml", "--rig", worlds / "low.yaml", "--out", worlds)
     assert code == 0
-    standing = drawn["static"]
+    standing = drawn["static_faces"]
     assert np.abs(standing.triangles_m[..., 0] - at_m).max() < 5.0  # the slope itself is no scenery
     # The last two faces of a box are its top, the two before them its bottom, which lies on the slope.
     np.testing.assert_allclose(standing.height_m[-4:], [0, 0, 1.0024, 1.0024], atol=1e-3)

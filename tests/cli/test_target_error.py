@@ -32,7 +32,7 @@ def test_evaluate_stops_when_it_is_good_enough(torchcover, long_recording, tmp_p
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     steps = summary["counts"]["num_frames"]
     assert 32 <= steps < 150
-    assert f"Target error reached after {steps} steps." in printed
+    assert f"Target error reached after {steps} frames." in printed
     assert (summary["complete"], summary["target_error"]["reached"]) == (True, True)
     assert all(row["radius_m_error"] <= 0.05 for row in summary["rows"] if row["observed_cells"])
     assert re.search(r"0\.\d+  \[0\.\d+, 0\.\d+\]", printed)
@@ -44,7 +44,7 @@ def test_a_target_beyond_the_steps_ends_the_run_as_ever_and_says_what_it_would_t
     arguments = ["--frames", long_recording, "--set", "cell_m=4", "--out", tmp_path / "out", "--num-frames", 40]
     code, printed, _ = torchcover("evaluate", *arguments, "--target-error", "1e-3m")
     assert code == 0
-    assert "Target error not reached in 40 steps" in printed
+    assert "Target error not reached in 40 frames" in printed
     assert "20m ground, radius_m of" in printed
     target = json.loads((tmp_path / "out" / "summary.json").read_text())["target_error"]
     assert target["reached"] is False
@@ -68,7 +68,7 @@ def test_compare_stops_when_rigs_and_differences_are_good_enough(torchcover, wor
     rigs = [worlds / "low.yaml", worlds / "both.yaml"]
     code, printed, _ = torchcover("compare", *rigs, *options, "--target-error", "50m")
     assert code == 0
-    assert "Target error reached after 67 steps." in printed
+    assert "Target error reached after 67 frames." in printed
     assert "Difference to low: mean blind spot radius (m)" in printed
     target = json.loads((worlds / "out" / "summary.json").read_text())["target_error"]
     assert {number["rig"] for number in target["numbers"]} == {"low", "both", "both minus low"}

@@ -277,7 +277,7 @@ def test_a_sensor_that_is_slower_than_the_encounter_is_too_late():
         found = sighted(mounted(lidar(rate_hz=1)), crossing(), Criterion(), num_start_offsets=2)
     assert not found.ttc_s.any()
     assert found.ttc_s.max() < found.censoring_ttc_s
-    unseen = crossing(20.0, {"approach_distance_m": None, "speed_kmh": 0}, seconds=2)
+    unseen = crossing(20.0, {"approach_distance_m": None, "speed_kmh": 0}, max_lead_time_s=2)
     with pytest.warns(UserWarning, match="too late, whatever it sees"):
         found = sighted(mounted(lidar(rate_hz=1)), unseen, Criterion(), num_start_offsets=2)
     assert not found.ttc_s.any()
@@ -285,7 +285,7 @@ def test_a_sensor_that_is_slower_than_the_encounter_is_too_late():
 
 
 def test_fog_hides_what_is_beyond_and_it_is_said_what_was_there_from_the_beginning():
-    far = crossing(72.0, {"approach_distance_m": None, "speed_kmh": 0}, seconds=3)
+    far = crossing(72.0, {"approach_distance_m": None, "speed_kmh": 0}, max_lead_time_s=3)
     sensor = lidar(channels=60, vertical_fov_deg=[-4, 0], columns=7200, max_range_m=80)
     found = [sighted(mounted(sensor), case, Criterion(points=1), num_start_offsets=2) for case in (
         far, far.model_copy(update={"weather": crossing(weather="fog_50m").weather}))]  # fmt: skip
@@ -338,7 +338,7 @@ def test_rows_are_of_speeds_with_intervals_over_draws():
 
 def test_in_time_up_to_a_speed_is_in_time_at_all_that_are_slower():
     these = EncounterSet.model_validate(
-        {"name": "s", "encounters": [FAMILY | {"ego": {"speed_kmh": [50, 10, 30]}, "obstacles": [], "other":
+        {"name": "s", "encounters": [FAMILY | {"ego": {"speed_kmh": [50, 10, 30]}, "obstacles": [], "road_user":
          {"body": "child_120cm", "speed_kmh": 5, "approach_distance_m": 1.5}}]}
     )  # fmt: skip
     partly = evaluate_encounters(rig(high("ahead")), these, num_start_offsets=5)

@@ -133,7 +133,7 @@ def test_the_files_hold_what_the_map_holds(tmp_path):
     assert (rows[8]["state"], rows[8]["points"], rows[8]["side"]) == ("occupied", "", "")
     record = json.loads((tmp_path / "summary.json").read_text())
     assert record["cells"] == {"free": 16, "occupied": 8, "outside": 0, "surface_share_unobserved": 0}
-    assert build_target_record(replace(seen, state=np.ones_like(seen.state)))["sides"][0]["seen"] is None
+    assert build_target_record(replace(seen, state=np.ones_like(seen.state)))["sides"][0]["detected_share"] is None
 
 
 def test_the_picture_shows_cells_where_they_are():

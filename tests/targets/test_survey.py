@@ -127,7 +127,7 @@ def test_a_place_does_not_depend_on_the_raster_the_chunks_or_the_threads(monkeyp
     part = measure_target_visibility(
         sensors, world(WALL), target, Raster((2.0, 7.0), (-2.0, 3.0), 1.0), num_frames=2, seed=3
     )
-    for name in ("sensor_points", "sensors", "seen", "min_points", "share", "state", "visible_m2"):
+    for name in ("sensor_points", "detecting_sensors", "detected_share", "min_points", "surface_share", "state", "visible_m2"):
         np.testing.assert_array_equal(getattr(whole, name)[..., 3:8, 9:], getattr(part, name))
     monkeypatch.setattr(counting, "CHUNK", 7)
     threads = torch.get_num_threads()

@@ -58,7 +58,7 @@ def show_item(
     """
     console, kind = Terminal(), _kind(name)
     if kind == "vehicle":
-        given = {"--scenario": scenario, "--rig": rig, "--vehicle": vehicle, "--step": frame_index, "--seed": seed}
+        given = {"--scenario": scenario, "--rig": rig, "--vehicle": vehicle, "--frame-index": frame_index, "--seed": seed}
         _refuse("rigs and scenarios", given, f"{name!r} is a vehicle")
         _refuse("a scenario", {"--animation": animation}, f"{name!r} is a vehicle")
         shape = create_body_shape(name)
@@ -81,7 +81,7 @@ def show_item(
         shown = load_named_rig(name)
         if not list_cameras(shown):
             _refuse(
-                "a scenario or cameras", {"--step": frame_index, "--seed": seed}, f"{name!r} is a rig without cameras"
+                "a scenario or cameras", {"--frame-index": frame_index, "--seed": seed}, f"{name!r} is a rig without cameras"
             )
         world = Scenario.load(scenario or DEFAULT_SCENARIO)
         _say(console, shown.description)

@@ -339,7 +339,7 @@ def _met(row: EncounterRow) -> str:
         if row.in_time_share < 1
         else ""
     )
-    return f"{_with_interval(row, 'from_the_beginning', format_percent)} %{least}{never}{late}"
+    return f"{_with_interval(row, 'detected_at_start_share', format_percent)} %{least}{never}{late}"
 
 
 def _speeds(up_to_kmh: dict[tuple[str, str], float], rigs: Sequence[str]) -> PageTable:

@@ -255,7 +255,7 @@ class Settings:
             raise ValueError(f"steps: at least 1 is needed; got {self.num_frames}")
         check_memory_fits(f"{self.num_workers or 0:,} workers", BYTES_PER_WORKER * (self.num_workers or 0), "use fewer")
         if self.average not in (None, "area", "cells"):
-            raise ValueError(f"estimate {self.average}: `area` or `known` is needed")
+            raise ValueError(f"average {self.average}: `area` or `cells` is needed")
         if self.band_frame not in (None, "ground", "vehicle"):
             raise ValueError(f"band_frame {self.band_frame}: `ground` or `vehicle` is needed")
         if self.sensor_model not in (None, "ideal", "real"):
@@ -307,7 +307,7 @@ class Settings:
         if self.vehicle is not None and not isinstance(self.frames, str | Path):
             raise ValueError("vehicle: for simulations and paths of recordings; frames have their own (recording.body)")
         if self.test_targets:
-            raise ValueError("probe: not for recordings, which have no scene to put a body into")
+            raise ValueError("test_targets: not for recordings, which have no scene to put a body into")
         if any(setting is not None for setting in (self.reference, self.num_rays, self.frame_interval_s)):
             raise ValueError(
                 "reference, rays and frame_interval_s are for simulations; a recording has its reference points"
