@@ -41,7 +41,7 @@ def format_short_repr(instance: Any) -> str:  # noqa: ANN401  (any dataclass)
         ... class Cloud:
         ...     points: np.ndarray
         ...     name: str = ""
-        ...     __repr__ = brief
+        ...     __repr__ = format_short_repr
         >>> Cloud(np.zeros((5000, 3)))
         Cloud(points=(5000, 3) float64)
     """

@@ -62,10 +62,10 @@ class BevGrid:
             cell_m, no band, another band frame, or more than 1e8 cells.
 
     Example:
-        >>> grid = BevGrid(x=(0.0, 20.0), y=(-5.0, 5.0), cell=0.5)
+        >>> grid = BevGrid(x_m=(0.0, 20.0), y_m=(-5.0, 5.0), cell_m=0.5)
         >>> grid.shape
         (2, 20, 40)
-        >>> grid.cell_of(torch.tensor([[0.0, -5.0, 0.0], [0.0, -5.0, 0.5], [20.0, 0.0, 0.0]]))
+        >>> grid.find_cells(torch.tensor([[0.0, -5.0, 0.0], [0.0, -5.0, 0.5], [20.0, 0.0, 0.0]]))
         tensor([  0, 800,  -1])
     """
 
@@ -170,9 +170,9 @@ class BevGrid:
 
         Example:
             >>> bands = {"dog": (0.05, 0.5), "child": (0.1, 1.1)}
-            >>> grid = BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=1.0, heights=bands)
-            >>> grid.bins(torch.tensor([[0.5, 0.5, 0.0], [0.5, 0.5, 0.3], [1.5, 0.5, 0.9]]))
-            Bins(inside=tensor([1, 2]), of=tensor([0, 0, 1]), cell=tensor([0, 2, 3]))
+            >>> grid = BevGrid(x_m=(0.0, 2.0), y_m=(0.0, 1.0), cell_m=1.0, heights=bands)
+            >>> grid.assign_cells(torch.tensor([[0.5, 0.5, 0.0], [0.5, 0.5, 0.3], [1.5, 0.5, 0.9]]))
+            CellAssignment(point_indices=tensor([1, 2]), point_positions=tensor([0, 0, 1]), cell_indices=tensor([0, 2, 3]))
         """
         cells = self._cells_of(points, heights_m)
         within = cells >= 0
@@ -190,8 +190,8 @@ class BevGrid:
             ValueError: Another shape, heights that are missing or of no use.
 
         Example:
-            >>> grid = BevGrid(x=(0.0, 2.0), y=(0.0, 1.0), cell=1.0)
-            >>> grid.points_by_column(torch.tensor([[0.5, 0.5, 0.0], [0.5, 0.5, 0.9], [1.5, 0.5, 9.0]]))
+            >>> grid = BevGrid(x_m=(0.0, 2.0), y_m=(0.0, 1.0), cell_m=1.0)
+            >>> grid.count_points_by_column(torch.tensor([[0.5, 0.5, 0.0], [0.5, 0.5, 0.9], [1.5, 0.5, 9.0]]))
             tensor([[2., 0.]], dtype=torch.float64)
         """
         parts = self._parts_of(points, heights_m)

@@ -36,8 +36,8 @@ class CoverageNumberMetric(CoverageMetric):
     Example:
         >>> import torch
         >>> from torchmetrics.wrappers import MetricTracker
-        >>> near = Region("near", x=(0.0, 2.0), y=(0.0, 1.0))
-        >>> tracker = MetricTracker(CoverageNumberMetric("radius_m", near, "ground", BevGrid(x=(0.0, 2.0), y=(0.0, 1.0))))
+        >>> near = Region("near", x_m=(0.0, 2.0), y_m=(0.0, 1.0))
+        >>> tracker = MetricTracker(CoverageNumberMetric("radius_m", near, "ground", BevGrid(x_m=(0.0, 2.0), y_m=(0.0, 1.0))))
         >>> for x_m in (1.0, 0.5, 1.5):
         ...     tracker.increment()
         ...     tracker.update(torch.zeros(1, 3), torch.tensor([[x_m, 0.0, 0.0]]))

@@ -10,7 +10,7 @@ def make_radius_quantity(statistic: str = "", title: str = "mean") -> Quantity:
     """A blind spot radius in metres: which one, as a part of its key, and in words.
 
     Example:
-        >>> radius("maximum", "largest")
+        >>> make_radius_quantity("maximum", "largest")
         Quantity(key='radius_maximum_m', title='largest blind spot radius', unit='m', lower_is_better=True)
     """
     key = f"radius_{statistic}_m" if statistic else "radius_m"
@@ -40,7 +40,7 @@ def make_failure_quantity(sensor_name: str, quantity: Quantity) -> Quantity:
     """A number of the rig without one of its sensors.
 
     Example:
-        >>> without("roof", detection(0.4)).key
+        >>> make_failure_quantity("roof", make_detection_quantity(0.4)).key
         'detection_0.4m_without_roof'
     """
     return quantity._replace(
@@ -52,7 +52,7 @@ def make_area_quantity(quantity: Quantity) -> Quantity:
     """The same over the surface that the reference sees, where every square metre weighs the same.
 
     Example:
-        >>> by_area(detection(0.4)).key, by_area(RADIUS).title
+        >>> make_area_quantity(make_detection_quantity(0.4)).key, make_area_quantity(RADIUS).title
         ('detection_area_0.4m', 'mean blind spot radius, by area')
     """
     kind, unit = quantity.key.split("_", 1)

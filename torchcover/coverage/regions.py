@@ -34,7 +34,7 @@ class Region:
             other bounds.
 
     Example:
-        >>> Region("rear", x=(-10.0, -2.5), y=(-2.5, 2.5)).mask(BevGrid(x=(-10.0, 10.0), y=(-5.0, 5.0), cell=0.5)).sum()
+        >>> Region("rear", x_m=(-10.0, -2.5), y_m=(-2.5, 2.5)).mask_cells(BevGrid(x_m=(-10.0, 10.0), y_m=(-5.0, 5.0), cell_m=0.5)).sum()
         tensor(150)
     """
 
@@ -65,8 +65,8 @@ class Region:
             ValueError: Fewer corners, one that is not finite, edges that cross or touch each other.
 
         Example:
-            >>> corner = Region.polygon("corner", [(2.0, 1.0), (5.0, 1.0), (2.0, 4.0)])
-            >>> corner.x, corner.mask(BevGrid(x=(0.0, 8.0), y=(0.0, 8.0), cell=1.0)).sum()
+            >>> corner = Region.from_corners("corner", [(2.0, 1.0), (5.0, 1.0), (2.0, 4.0)])
+            >>> corner.x_m, corner.mask_cells(BevGrid(x_m=(0.0, 8.0), y_m=(0.0, 8.0), cell_m=1.0)).sum()
             ((2.0, 5.0), tensor(3))
         """
         corners = tuple((float(x), float(y)) for x, y in corners_m)
@@ -105,8 +105,8 @@ class Region:
             bool of the shape that both have together.
 
         Example:
-            >>> lane = Region("lane", x=(0.0, 20.0), y=(-1.5, 1.5))
-            >>> lane.contains(torch.tensor([0.0, 3.0, 20.0]), torch.tensor([-1.5, 1.5, 0.0]))
+            >>> lane = Region("lane", x_m=(0.0, 20.0), y_m=(-1.5, 1.5))
+            >>> lane.mask_points(torch.tensor([0.0, 3.0, 20.0]), torch.tensor([-1.5, 1.5, 0.0]))
             tensor([ True, False, False])
         """
         x_m, y_m = x_m.double(), y_m.double()
@@ -134,7 +134,7 @@ class Region:
         """Whether it lies within the grid.
 
         Example:
-            >>> Region("far", (0.0, 90.0), (-1.0, 1.0)).fits(BevGrid(x=(0.0, 80.0), y=(-20.0, 20.0)))
+            >>> Region("far", (0.0, 90.0), (-1.0, 1.0)).is_within(BevGrid(x_m=(0.0, 80.0), y_m=(-20.0, 20.0)))
             False
         """
         return all(
@@ -164,7 +164,7 @@ class Region:
         """Whether its bounds are edges of cells, so that the points in its cells are those that belong to it.
 
         Example:
-            >>> grid = BevGrid(x=(0.0, 4.0), y=(0.0, 1.0), cell=0.5)
+            >>> grid = BevGrid(x_m=(0.0, 4.0), y_m=(0.0, 1.0), cell_m=0.5)
             >>> [Region("ahead", (0.0, far), (0.0, 1.0)).has_whole_cells(grid) for far in (2.5, 2.6)]
             [True, False]
         """
@@ -224,7 +224,7 @@ def get_paper_regions(grid: BevGrid) -> tuple[Region, ...]:
     """Those of the paper's regions that the grid holds.
 
     Example:
-        >>> [region.name for region in get_paper_regions(BevGrid(x=(0.0, 100.0), y=(-40.0, 40.0)))]
+        >>> [region.name for region in get_paper_regions(BevGrid(x_m=(0.0, 100.0), y_m=(-40.0, 40.0)))]
         ['20m', '80m']
     """
     return tuple(region for region in forward_regions() if region.is_within(grid))
@@ -241,7 +241,7 @@ def forward_regions(ranges: Sequence[float] = (20.0, 80.0, 160.0)) -> tuple[Regi
 
     Example:
         >>> forward_regions((20,))
-        (Region(name='20m', x=(0.0, 20.0), y=(-5.0, 5.0), corners_m=()),)
+        (Region(name='20m', x_m=(0.0, 20.0), y_m=(-5.0, 5.0), corners_m=()),)
     """
     return tuple(Region(f"{reach:g}m", (0.0, float(reach)), (-reach / 4, reach / 4)) for reach in ranges)
 
@@ -260,7 +260,7 @@ def build_near_field_regions(
         Four regions that do not overlap: "front_3m", "rear_3m", "left_3m", "right_3m".
 
     Example:
-        >>> [(each.name, each.x, each.y) for each in build_near_field_regions((-0.5, 0.5), (-0.4, 0.4))][1:3]
+        >>> [(each.name, each.x_m, each.y_m) for each in build_near_field_regions((-0.5, 0.5), (-0.4, 0.4))][1:3]
         [('rear_3m', (-3.5, -0.5), (-3.4, 3.4)), ('left_3m', (-0.5, 0.5), (0.4, 3.4))]
     """
     across = y_m[0] - distance_m, y_m[1] + distance_m

@@ -22,7 +22,7 @@ class Quantity(NamedTuple):
         lower_is_better: Whether less of it is better. Nothing else decides the direction of a number.
 
     Example:
-        >>> Quantity("radius_m", "mean blind spot radius", "m", lower_is_better=True).gain(-0.1)
+        >>> Quantity("radius_m", "mean blind spot radius", "m", lower_is_better=True).compute_improvement(-0.1)
         0.1
     """
 
@@ -151,10 +151,10 @@ class ErrorModel(NamedTuple):
         bias: What is left after any number of steps: by how much the setting is off, such as fewer rays.
 
     Example:
-        >>> model = ErrorModel.of(error=0.02, steps=64)
-        >>> model.error_after(256), model.steps_for(0.01)
+        >>> model = ErrorModel.from_error(error=0.02, num_frames=64)
+        >>> model.estimate_error(256), model.estimate_num_frames(0.01)
         (0.01, 256)
-        >>> ErrorModel(a=1.0, bias=0.1).steps_for(0.1) is None
+        >>> ErrorModel(error_coefficient=1.0, bias=0.1).estimate_num_frames(0.1) is None
         True
     """
 
@@ -207,11 +207,11 @@ def compute_interval95(
     Example:
         >>> radius = Quantity("radius_m", "mean blind spot radius", "m", lower_is_better=True)
         >>> detection = Quantity("detection_0.4m", "detection within 0.4 m", "share", lower_is_better=False)
-        >>> [round(end, 3) for end in interval95(2.0, 0.1, 10, radius)]
+        >>> [round(end, 3) for end in compute_interval95(2.0, 0.1, 10, radius)]
         [1.789, 2.299]
-        >>> [round(end, 3) for end in interval95(0.9, 0.02, 10, detection)]
+        >>> [round(end, 3) for end in compute_interval95(0.9, 0.02, 10, detection)]
         [0.846, 0.937]
-        >>> [round(end, 3) for end in interval95(-0.3, 0.1, 10, radius, is_difference=True)]
+        >>> [round(end, 3) for end in compute_interval95(-0.3, 0.1, 10, radius, is_difference=True)]
         [-0.579, -0.077]
     """
     t, unit = compute_student_t95(degrees_of_freedom), quantity.unit

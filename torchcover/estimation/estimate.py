@@ -38,7 +38,7 @@ class Number(NamedTuple):
 
     Example:
         >>> number = Number(Quantity("k_cover", "seen by two sensors", "share", lower_is_better=False), 0.25, count=12)
-        >>> number.known, number.error
+        >>> number.has_value, number.error
         (True, nan)
     """
 
@@ -108,14 +108,14 @@ class Estimate:
         >>> detection = Quantity("detection_0.4m", "detection within 0.4 m", "share", lower_is_better=False)
         >>> m2 = torch.full((8,), 10.0, dtype=torch.float64)
         >>> seen, more = (torch.arange(8.0, dtype=torch.float64)[:, None] + shift for shift in (0.0, 0.5))
-        >>> one, other = (Estimate.of_ratios((detection,), m2, each, torch.ones(8)) for each in (seen, more))
-        >>> number, = one.numbers().values()
+        >>> one, other = (Estimate.from_ratios((detection,), m2, each, torch.ones(8)) for each in (seen, more))
+        >>> number, = one.to_numbers().values()
         >>> round(number.value, 3), round(number.error, 3)
         (0.35, 0.087)
-        >>> difference, = other.differences(one).values()
-        >>> round(difference.value, 3), difference.blocks, difference.better
+        >>> difference, = other.compute_differences(one).values()
+        >>> round(difference.value, 3), difference.block_count, difference.better_count
         (0.05, 8, 8)
-        >>> one.resampled(torch.tensor([[1.0] * 8, [1.0] + [0.0] * 7]))
+        >>> one.resample(torch.tensor([[1.0] * 8, [1.0] + [0.0] * 7]))
         tensor([[0.3500],
                 [0.0000]], dtype=torch.float64)
     """
@@ -194,8 +194,8 @@ class Estimate:
         Example:
             >>> radius = Quantity("radius_m", "mean blind spot radius", "m", lower_is_better=True)
             >>> m2, metres = torch.ones(16, dtype=torch.float64), torch.arange(16.0, dtype=torch.float64)[:, None]
-            >>> low, high = (Estimate.of_ratios((radius,), m2, metres + more, m2) for more in (0.0, 10.0))
-            >>> mean, = Estimate.mixed([(0.5, low), (0.5, high)]).numbers().values()
+            >>> low, high = (Estimate.from_ratios((radius,), m2, metres + more, m2) for more in (0.0, 10.0))
+            >>> mean, = Estimate.from_strata([(0.5, low), (0.5, high)]).to_numbers().values()
             >>> bool(mean.value == 12.5), round(mean.error / low.error.item(), 3)
             (True, 0.707)
         """

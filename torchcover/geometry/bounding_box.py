@@ -70,7 +70,7 @@ def find_overlaps(box: BoundingBox, world_T_box: Float64, other_corners_m: Float
     Example:
         >>> car, away = BoundingBox((-2, -1, 0), (2, 1, 1.5)), np.eye(4)
         >>> away[:3, 3] = [3.0, 2.1, 0.0]
-        >>> overlapping(car, np.stack([np.eye(4), away]), car.corners_m).tolist()
+        >>> find_overlaps(car, np.stack([np.eye(4), away]), car.corners_m).tolist()
         [True, False]
     """
     ours_m = box.corners_m @ world_T_box[:, :3, :3].swapaxes(1, 2) + world_T_box[:, None, :3, 3]
@@ -106,7 +106,7 @@ def compute_contact_time_s(
 
     Example:
         >>> car_m = np.array([[-2.0, -1.0], [2.0, -1.0], [2.0, 1.0], [-2.0, 1.0]])
-        >>> contact_s(car_m, car_m + [14.0, 0.5], np.array([[-20.0, 0.0], [-20.0, 5.0], [5.0, 0.0]])).tolist()
+        >>> compute_contact_time_s(car_m, car_m + [14.0, 0.5], np.array([[-20.0, 0.0], [-20.0, 5.0], [5.0, 0.0]])).tolist()
         [0.5, inf, inf]
     """
     # Differences first: coordinates may be of UTM size.

@@ -29,7 +29,7 @@ class HeightField(NamedTuple):
 
     Example:
         >>> field = HeightField(np.zeros(2), np.array([[0.0, 1.0], [2.0, 3.0]]), 10.0)
-        >>> field.heights_m(np.array([[5.0, 0.0], [0.0, 5.0], [10.0, 10.0]]))
+        >>> field.compute_heights_m(np.array([[5.0, 0.0], [0.0, 5.0], [10.0, 10.0]]))
         array([0.5, 1. , 3. ])
     """
 

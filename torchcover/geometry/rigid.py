@@ -26,7 +26,7 @@ def build_transform(rotation: ArrayLike, translation_m: ArrayLike) -> Matrix:
         (..., 4, 4) float64 matrix.
 
     Example:
-        >>> rigid(np.eye(3), [1.0, 2.0, 3.0])[:3, 3]
+        >>> build_transform(np.eye(3), [1.0, 2.0, 3.0])[:3, 3]
         array([1., 2., 3.])
     """
     matrix = np.zeros((*np.shape(translation_m)[:-1], 4, 4))
@@ -40,7 +40,7 @@ def invert(destination_T_source: Matrix) -> Matrix:
     """Invert a rigid transform, or each of (..., 4, 4): `source_T_destination`, by transposing the rotation.
 
     Example:
-        >>> world_T_vehicle = rigid(convert_euler_to_rotation(90.0, 0.0, 0.0), [5.0, 0.0, 0.0])
+        >>> world_T_vehicle = build_transform(convert_euler_to_rotation(90.0, 0.0, 0.0), [5.0, 0.0, 0.0])
         >>> bool(np.allclose(invert(world_T_vehicle) @ world_T_vehicle, np.eye(4)))
         True
     """
@@ -211,7 +211,7 @@ def transform_points(destination_T_source: Matrix, points_m: NDArray[np.floating
         (N, 3) float64 points in the destination frame.
 
     Example:
-        >>> transform(rigid(np.eye(3), [0.0, 0.0, 1.7]), np.zeros((1, 3)))
+        >>> transform_points(build_transform(np.eye(3), [0.0, 0.0, 1.7]), np.zeros((1, 3)))
         array([[0. , 0. , 1.7]])
     """
     rotation, translation = destination_T_source[:3, :3], destination_T_source[:3, 3]
@@ -227,7 +227,7 @@ def iterate_blocks(num_points: int) -> Iterator[slice]:
     """Parts of a cloud, one after the other, for which memory is fast.
 
     Example:
-        >>> [(rows.start, rows.stop) for rows in blocks(5000)]
+        >>> [(rows.start, rows.stop) for rows in iterate_blocks(5000)]
         [(0, 4096), (4096, 5000)]
     """
     start = 0

@@ -95,7 +95,7 @@ class PooledMean(Aggregation):
     """The mean radius over all points of all steps; a step with many points in a cell weighs more.
 
     Example:
-        >>> PooledMean().states(cells=3)["weight"].initial
+        >>> PooledMean().create_states(num_cells=3)["weight"].initial
         tensor([0., 0., 0.], dtype=torch.float64)
     """
 
