@@ -30,7 +30,7 @@ from torchcover.recordings.recording import Recording
 from torchcover.recordings.sweep_window import compute_voxel_indices, find_first_occurrences
 from torchcover.recordings.vehicle_cloud import find_points_in_box
 from torchcover.simulation.height_field import GroundHeightField
-from torchcover.simulation.recorded.run import split_at_gaps
+from torchcover.simulation.recorded.excerpt import split_at_gaps
 from torchcover.simulation.shapes import Mesh
 
 # Parameters of the reference that separates static points from moving ones.

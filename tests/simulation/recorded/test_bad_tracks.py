@@ -71,10 +71,10 @@ def test_recordings_without_objects_over_time(tmp_path):
 
 def test_an_ego_that_is_not_there(tmp_path, table):
     path, keys = table
-    fails(scenario(path), "ego_id: the recording has no ego of its own; name one of its tracks, 'a1', 'a2'")
-    fails(scenario(path, ego_id="a11"), "ego_id: there is no 'a11' in the recording, but 'a1'")
+    fails(scenario(path), "ego_id: the recording has no ego vehicle; name one of its tracks: 'a1', 'a2'")
+    fails(scenario(path, ego_id="a11"), "ego_id: there is no 'a11' in the recording; it has 'a1'")
     fails(scenario(path, ego_id="a1", **keys), "ego_id and ego_trajectory exclude each other")
-    fails(scenario(path, ego_id="a1", ego_T_vehicle={"x_m": 1.0}), "ego_T_vehicle: is for an ego without a box")
+    fails(scenario(path, ego_id="a1", ego_T_vehicle={"x_m": 1.0}), "ego_T_vehicle: only an ego vehicle without a box")
     log = write_argoverse2(tmp_path / "log")
     fails(scenario(log, ego_id=7), "there is no '7' in the recording")
 

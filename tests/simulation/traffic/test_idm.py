@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from torchcover.simulation.traffic.idm import (
-    HARDEST_BRAKING_MPS2,
+    AccelerationLimits,
     Driver,
     compute_acceleration_mps2,
     compute_gap_ratio,
@@ -69,7 +69,7 @@ def test_brakes_at_about_the_comfortable_deceleration():
 
 def test_braking_is_bounded_and_finite_at_contact():
     wanted = acceleration(DRIVER, np.array([20.0, 20.0]), np.array([0.0, -1.0]), np.array([20.0, 20.0]))
-    np.testing.assert_array_equal(wanted, -HARDEST_BRAKING_MPS2)
+    np.testing.assert_array_equal(wanted, -AccelerationLimits().max_braking_mps2)
 
 
 def test_no_step_leads_backwards_or_through_the_one_ahead():

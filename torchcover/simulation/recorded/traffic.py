@@ -25,7 +25,13 @@ from torchcover.simulation.recorded.bodies import (
     find_visible_sides,
     fit_ground,
 )
-from torchcover.simulation.recorded.run import Excerpt, build_pose_matrices, choose_ego, choose_time_span, split_at_gaps
+from torchcover.simulation.recorded.excerpt import (
+    Excerpt,
+    build_pose_matrices,
+    choose_ego,
+    choose_time_span,
+    split_at_gaps,
+)
 from torchcover.simulation.shapes import Mesh, MeshFile
 from torchcover.simulation.traffic.assemble import HORIZON_M
 from torchcover.simulation.traffic.fleet import EGO, load_bodies

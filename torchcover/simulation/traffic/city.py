@@ -9,7 +9,7 @@ import shapely
 
 from torchcover.geometry.arrays import Float64
 from torchcover.simulation.shapes import Mesh
-from torchcover.simulation.traffic.alignment import SAMPLE_EVERY_M, Alignment, StreetCorridor
+from torchcover.simulation.traffic.alignment import Alignment, StreetCorridor
 from torchcover.simulation.traffic.fleet import Fleet
 from torchcover.simulation.traffic.frontage import RoadsideDensity, StreetSide, Zone, place_scenery
 from torchcover.simulation.traffic.hills import PIECE_M, Bounds, BuildingSite, Hills
@@ -244,7 +244,7 @@ class CityBuilder(NamedTuple):
         foreign = np.zeros(len(x), dtype=bool)
         for y in (kerb_m, kerb_m + CORNER_DEPTH_M):
             nearest_m = self.corridor.find_nearest_stations_m(street.compute_poses(x, side * y)[:, :2])
-            foreign |= np.abs(nearest_m - middle_m) > half_m + SAMPLE_EVERY_M
+            foreign |= np.abs(nearest_m - middle_m) > half_m + self.corridor.sample_spacing_m
         foreign &= np.abs(x) > half_m
         before, behind = x[foreign & (x < 0.0)], x[foreign & (x > 0.0)]
         x_m = max([span_m[0], *before.tolist()]) + 5.0, min([span_m[1], *behind.tolist()]) - 5.0

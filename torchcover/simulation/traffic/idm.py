@@ -1,7 +1,7 @@
-"""The Intelligent Driver Model: how hard a driver accelerates behind another.
+"""Intelligent Driver Model (IDM): longitudinal acceleration of a driver behind another road user.
 
 Treiber, Hennecke and Helbing, "Congested traffic states in empirical observations and microscopic simulations",
-Physical Review E 62 (2000). People on foot queue by the same law with other numbers.
+Physical Review E 62 (2000). Pedestrians queue by the same law with other parameters.
 """
 
 from collections.abc import Sequence
@@ -14,21 +14,53 @@ from torchcover.geometry.arrays import Float64
 
 FloatOrArray = float | Float64
 
-# What tyres give on a dry road; the model itself would ask for more when somebody appears right ahead.
-HARDEST_BRAKING_MPS2 = 9.0
-# Two bodies that touch would ask for infinite braking.
-SMALLEST_GAP_M = 0.01
-# The lorry that slopes are designed for, 120 kg to a kilowatt (AASHTO, "A Policy on Geometric Design of Highways and
-# Streets"), with usual rolling resistance, and the drag of 40 t behind 6 m2.
-LADEN_W_PER_KG, ROLLING, DRAG_PER_M, GRAVITY_MPS2 = 1000.0 / 120.0, 0.006, 9e-5, 9.81
+
+@dataclass(frozen=True)
+class AccelerationLimits:
+    """Limits that keep the accelerations of the model finite and physical.
+
+    Args:
+        max_braking_mps2: Largest deceleration: the grip of tires on a dry road. The model alone asks for more when a
+            road user appears directly ahead.
+        min_gap_m: Smallest gap that the model divides by; vehicles that touch would demand infinite braking.
+    """
+
+    max_braking_mps2: float = 9.0
+    min_gap_m: float = 0.01
+
+
+@dataclass(frozen=True)
+class TruckParams:
+    """Laden truck that limits the speed on grades.
+
+    Args:
+        power_w_per_kg: Engine power per mass: the truck of 120 kg/kW that slopes are designed for (AASHTO, "A Policy on
+            Geometric Design of Highways and Streets").
+        rolling_resistance: Usual rolling resistance coefficient of truck tires.
+        drag_per_m: Air drag per mass and squared speed in 1/m, of 40 t behind a front of 6 m2.
+        gravity_mps2: Gravitational acceleration.
+    """
+
+    power_w_per_kg: float = 1000.0 / 120.0
+    rolling_resistance: float = 0.006
+    drag_per_m: float = 9e-5
+    gravity_mps2: float = 9.81
 
 
 @dataclass(frozen=True, eq=False)
 class Driver:
-    """How somebody drives; one number for one driver, or arrays (N,) for N of them.
+    """Parameters of one driver (numbers) or of N drivers (arrays (N,)).
 
-    Speed and acceleration are those on an empty road, the gap is that in a queue, bumper to bumper, beyond which the
-    headway is kept; the deceleration is comfortable.
+    Args:
+        desired_speed_mps: Speed on an empty road; must be positive.
+        headway_s: Time gap to the vehicle ahead, in addition to `standstill_gap_m`.
+        standstill_gap_m: Gap in a standing queue, bumper to bumper.
+        acceleration_mps2: Acceleration from standstill on an empty road.
+        deceleration_mps2: Comfortable deceleration.
+
+    Example:
+        >>> Driver.stack([Driver(10.0), Driver(14.0)]).desired_speed_mps
+        array([10., 14.])
     """
 
     desired_speed_mps: FloatOrArray
@@ -39,82 +71,129 @@ class Driver:
 
     def __post_init__(self) -> None:
         desired = self.desired_speed_mps
-        # There are thousands in a world.
-        if not (desired > 0.0 if isinstance(desired, float) else np.all(np.asarray(desired) > 0.0)):
+        # A scene has thousands of drivers: the comparison of a float avoids an array for each of them.
+        is_positive = desired > 0.0 if isinstance(desired, float) else np.all(np.asarray(desired) > 0.0)
+        if not is_positive:
             raise ValueError(f"a driver needs a desired speed above 0 m/s; got {self.desired_speed_mps}")
 
     @classmethod
     def stack(cls, drivers: Sequence["Driver"]) -> "Driver":
-        """N drivers as one, with arrays (N,)."""
-        return cls(
-            *(np.array([getattr(one, name) for one in drivers], np.float64) for name in cls.__dataclass_fields__)
-        )
+        """Combine N drivers into one object with arrays (N,)."""
+        columns = {}
+        for name in cls.__dataclass_fields__:
+            columns[name] = np.array([getattr(driver, name) for driver in drivers], np.float64)
+        return cls(**columns)
 
     @cached_property
-    def _braking_mps2(self) -> FloatOrArray:
+    def _interaction_mps2(self) -> FloatOrArray:
         return 2 * np.sqrt(self.acceleration_mps2 * self.deceleration_mps2)
 
 
-def compute_gap_ratio(driver: Driver, speed_mps: Float64, gap_m: Float64, closing_speed_mps: Float64) -> Float64:
-    """The gap that N drivers would like to have as a multiple of the one that they have, which may be infinite.
+def compute_gap_ratio(
+    driver: Driver,
+    speed_mps: Float64,
+    gap_m: Float64,
+    closing_speed_mps: Float64,
+    limits: AccelerationLimits = AccelerationLimits(),
+) -> Float64:
+    """Compute the desired gap of N drivers divided by their actual gap.
 
-    `closing_speed_mps` (N,) is their own speed minus that of the one ahead.
+    Args:
+        driver: Parameters of the N drivers.
+        speed_mps: (N,) speeds.
+        gap_m: (N,) gaps to the road user or stop line ahead; may be infinite.
+        closing_speed_mps: (N,) own speed minus the speed of the road user ahead.
+        limits: Smallest gap that counts.
+
+    Returns:
+        (N,) ratios; 0 for an infinite gap.
     """
-    # In place, here and below: what is written anew has to come from farther away than what was read just now.
+    # Arrays are updated in place, here and below: new arrays would have to come from slower memory.
     gaps = speed_mps * closing_speed_mps
-    gaps /= driver._braking_mps2
+    gaps /= driver._interaction_mps2
     gaps += speed_mps * driver.headway_s
     np.maximum(gaps, 0.0, out=gaps)
     gaps += driver.standstill_gap_m
-    gaps /= np.maximum(gap_m, SMALLEST_GAP_M)
+    gaps /= np.maximum(gap_m, limits.min_gap_m)
     return gaps
 
 
 def compute_acceleration_mps2(
-    driver: Driver, speed_mps: Float64, gap_ratio: Float64, desired_speed_mps: FloatOrArray
+    driver: Driver,
+    speed_mps: Float64,
+    gap_ratio: Float64,
+    desired_speed_mps: FloatOrArray,
+    limits: AccelerationLimits = AccelerationLimits(),
 ) -> Float64:
-    """(N,) acceleration of N drivers, at least -9 m/s²; of several things ahead the largest tightness counts.
+    """Compute the acceleration of N drivers.
 
-    `desired_speed_mps` is what they want to drive here: less than elsewhere in a curve.
+    Args:
+        driver: Parameters of the N drivers.
+        speed_mps: (N,) speeds.
+        gap_ratio: (N,) ratios from `compute_gap_ratio`; the largest one if there are several obstacles ahead.
+        desired_speed_mps: Desired speed at this position, which is lower in a curve than elsewhere.
+        limits: Largest deceleration.
+
+    Returns:
+        (N,) accelerations, at least `-limits.max_braking_mps2`.
     """
-    wanted = speed_mps / desired_speed_mps
-    # To the fourth by products, which are the same on every processor; of powers not even NumPy's own are.
-    wanted *= wanted
-    wanted *= wanted
-    np.subtract(1.0, wanted, out=wanted)
-    wanted -= gap_ratio**2
-    wanted *= driver.acceleration_mps2
-    return np.maximum(wanted, -HARDEST_BRAKING_MPS2, out=wanted)
+    speed_ratio = speed_mps / desired_speed_mps
+    # Products give the same fourth power on every processor; the powers of NumPy do not.
+    speed_ratio *= speed_ratio
+    speed_ratio *= speed_ratio
+    acceleration_mps2 = np.subtract(1.0, speed_ratio, out=speed_ratio)
+    acceleration_mps2 -= gap_ratio**2
+    acceleration_mps2 *= driver.acceleration_mps2
+    return np.maximum(acceleration_mps2, -limits.max_braking_mps2, out=acceleration_mps2)
 
 
-def compute_max_truck_acceleration_mps2(speed_mps: Float64, slope: Float64) -> Float64:
-    """(N,) the hardest that laden lorries accelerate at (N,) speeds up (N,) slopes, by their power.
+def compute_max_truck_acceleration_mps2(
+    speed_mps: Float64, slope: Float64, params: TruckParams = TruckParams()
+) -> Float64:
+    """Compute the largest acceleration that the engine power of a laden truck permits.
+
+    Args:
+        speed_mps: (N,) speeds.
+        slope: (N,) slopes, positive uphill.
+        params: Power and resistance of the truck.
+
+    Returns:
+        (N,) accelerations; negative where the truck cannot hold its speed.
 
     Example:
-        >>> bool(compute_max_truck_acceleration_mps2(np.array(20.0), np.array(0.04)) < 0.0 < compute_max_truck_acceleration_mps2(np.array(20.0), np.array(0.02)))
+        >>> speed_mps = np.array(20.0)
+        >>> bool(compute_max_truck_acceleration_mps2(speed_mps, np.array(0.04)) < 0.0)
         True
     """
-    resisted_mps2 = GRAVITY_MPS2 * (slope + ROLLING) + DRAG_PER_M * speed_mps**2
-    return np.asarray(LADEN_W_PER_KG / np.maximum(speed_mps, 1.0) - resisted_mps2)
+    resistance_mps2 = params.gravity_mps2 * (slope + params.rolling_resistance) + params.drag_per_m * speed_mps**2
+    return np.asarray(params.power_w_per_kg / np.maximum(speed_mps, 1.0) - resistance_mps2)
 
 
 def integrate_motion(
     speed_mps: Float64, acceleration_mps2: Float64, free_distance_m: Float64, time_step_s: float
 ) -> tuple[Float64, Float64]:
-    """(N,) ways in metres and (N,) new speeds after one step of constant acceleration (the ballistic update).
+    """Integrate one time step of constant acceleration (the ballistic update).
 
-    A driver who comes to a stop within the step stays there instead of driving backwards, and nobody goes farther than
-    the room (N,) that was free when the step began: those ahead do not drive backwards either, so no step of any length
-    leads through them.
+    A driver who stops within the step stays there instead of driving backwards. No driver goes farther than the
+    distance that was free when the step began, so that a step of any length leads through no other road user.
+
+    Args:
+        speed_mps: (N,) speeds at the beginning of the step.
+        acceleration_mps2: (N,) accelerations.
+        free_distance_m: (N,) distances to the road user ahead.
+        time_step_s: Duration of the step.
+
+    Returns:
+        (N,) distances in meters and (N,) speeds at the end of the step.
     """
-    end_speed = acceleration_mps2 * time_step_s
-    end_speed += speed_mps
-    (stops,) = (end_speed < 0.0).nonzero()
-    end_speed[stops] = 0.0
-    way = speed_mps + end_speed
-    way /= 2
-    way *= time_step_s
-    way[stops] = speed_mps[stops] ** 2 / (-2 * acceleration_mps2[stops])
-    room = np.maximum(free_distance_m, 0.0)
-    end_speed[way > room] = 0.0
-    return np.minimum(way, room, out=way), end_speed
+    end_speed_mps = acceleration_mps2 * time_step_s
+    end_speed_mps += speed_mps
+    (stopping,) = (end_speed_mps < 0.0).nonzero()
+    end_speed_mps[stopping] = 0.0
+    distance_m = speed_mps + end_speed_mps
+    distance_m /= 2
+    distance_m *= time_step_s
+    distance_m[stopping] = speed_mps[stopping] ** 2 / (-2 * acceleration_mps2[stopping])
+    max_distance_m = np.maximum(free_distance_m, 0.0)
+    end_speed_mps[distance_m > max_distance_m] = 0.0
+    return np.minimum(distance_m, max_distance_m, out=distance_m), end_speed_mps

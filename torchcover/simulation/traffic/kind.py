@@ -1,4 +1,4 @@
-"""Traffic of a scenario, recorded or generated, and the base of all kinds that are generated from a seed."""
+"""Base classes of the traffic of a scenario: recorded traffic, and traffic generated from a seed."""
 
 from abc import abstractmethod
 from collections.abc import Mapping
@@ -15,75 +15,95 @@ from torchcover.simulation.traffic.fleet import Fleet, load_bodies
 from torchcover.simulation.traffic.scenery import Scenery
 from torchcover.simulation.world import Actor, Scene, count_time_steps
 
-MIN_TIME_STEP_S = 0.01
-
 
 class Traffic(Document):
-    """What makes a world with an ego in it, and says how long a run through it is.
+    """Description of traffic that builds scenes with an ego vehicle.
 
     Args:
-        time_step_s: Time between two frames.
+        time_step_s: Time between two frames, at least 0.01 s.
     """
 
-    # Whether a run is followed by the same again, which says nothing new, or by another world.
+    # True if each run repeats the same scene, which adds no information; False if each run has another scene.
     is_repeating: ClassVar[bool]
 
-    time_step_s: Annotated[float, Field(ge=MIN_TIME_STEP_S)] = 0.1
+    time_step_s: Annotated[float, Field(ge=0.01)] = 0.1
 
     @property
     def sampling_note(self) -> str:
-        """What of a recording was not recorded, for results; no words where all is drawn, or nothing."""
+        """Note for results on sampled parts of a recorded scene; empty if everything or nothing is sampled."""
         return ""
 
     @property
     @abstractmethod
     def num_time_steps(self) -> int:
-        """Number of instants of a run."""
+        """Number of frames of a run."""
 
     def check(self) -> None:
-        """Find out before a run whether a world can be built; ImportError if something is not installed."""
+        """Check before a run that scenes can be built.
+
+        Raises:
+            ImportError: A package is missing; the message names it.
+        """
 
     @abstractmethod
     def build_scene(self, seed: int, ego_mesh: Mesh | None = None) -> Scene:
-        """Build the world; the same for the same seed of whatever is drawn, and ego, the built-in SUV if not given."""
+        """Build the scene of one run.
+
+        Args:
+            seed: Seed of all sampled parts; the same seed gives the same scene.
+            ego_mesh: Body of the ego vehicle in the vehicle frame; the built-in SUV if None.
+
+        Returns:
+            Static meshes, ego vehicle and actors.
+        """
 
 
-# Streets are as long as the ego's way: what moves on them grows with the square of the duration.
-MAX_DURATION_S = 3600.0
-# To a kilometre of a lane; more have no room.
+# Road users per kilometer of lane; higher densities leave no room.
 VehiclesPerKm = Annotated[float, Field(ge=0.0, le=200.0)]
 PeoplePerKm = Annotated[float, Field(ge=0.0, le=1000.0)]
-# What rests, the ego, and who else moves.
+# Static scenery, the ego vehicle, and the other moving actors.
 SceneParts = tuple[Scenery, Actor, tuple[Actor, ...]]
 
 
 class ProceduralTraffic(Traffic):
-    """Traffic that is made from parameters and a seed.
+    """Traffic that is generated from parameters and a seed.
 
     Args:
-        duration_s: Length of the run.
-        time_step_s: Time between two frames.
+        duration_s: Length of the run, at most an hour.
+        time_step_s: Time between two frames, at least 0.01 s.
     """
 
     is_repeating: ClassVar[bool] = False
 
-    duration_s: Annotated[float, Field(gt=0.0, le=MAX_DURATION_S)] = 60.0
+    # Streets are as long as the path of the ego vehicle: the traffic on them grows with the square of the duration.
+    duration_s: Annotated[float, Field(gt=0.0, le=3600.0)] = 60.0
 
     def build_scene(self, seed: int, ego_mesh: Mesh | None = None, bodies: Mapping[str, Mesh] | None = None) -> Scene:
-        """Build the world; the same for the same seed and meshes, of the ego and of each kind in `CATEGORIES`.
+        """Build the scene of one run.
 
-        Those that are not given are built in. Without hills the ground is z = 0; nobody ever overlaps anybody, and the
-        ego is followed closely enough for sensors of up to 250 m range.
+        The ground is at z = 0 without hills, and road users never overlap. Traffic is simulated around the ego vehicle
+        far enough for sensors with a range of 250 m.
+
+        Args:
+            seed: Seed of all sampled parts; the same seed and meshes give the same scene.
+            ego_mesh: Body of the ego vehicle in the vehicle frame; the built-in SUV if None.
+            bodies: Mesh of each kind in `CATEGORIES`; the built-in ones if None.
+
+        Returns:
+            Static meshes, ego vehicle and actors.
+
+        Raises:
+            ValueError: `bodies` lacks a kind.
         """
         generator = np.random.default_rng(seed)
         fleet = Fleet(load_bodies() if bodies is None else bodies, ego_mesh, generator)
-        steps = max(1, int(np.ceil(self.duration_s / self.time_step_s - 1e-9)))
-        times_s = self.time_step_s * np.arange(steps + 1, dtype=np.float64)
-        scenery, driver, others = self._build(fleet, times_s, generator)
+        num_intervals = max(1, int(np.ceil(self.duration_s / self.time_step_s - 1e-9)))
+        times_s = self.time_step_s * np.arange(num_intervals + 1, dtype=np.float64)
+        scenery, ego, actors = self._build(fleet, times_s, generator)
         return Scene(
             static_meshes=scenery.static_meshes,
-            ego=driver,
-            actors=others,
+            ego=ego,
+            actors=actors,
             time_step_s=self.time_step_s,
             duration_s=self.duration_s,
             static_actors=tuple(fleet.parked),
@@ -92,14 +112,14 @@ class ProceduralTraffic(Traffic):
         )
 
     def collect_content(self) -> dict[str, Any]:
-        """Its keys, and the vehicles that may be in it."""
+        """Return the settings and the hashes of the vehicles that determine the scenes."""
         return {**super().collect_content(), "vehicles": hash_builtin_documents("vehicles")}
 
     @property
     def num_time_steps(self) -> int:
-        """Number of instants."""
+        """Number of frames of a run."""
         return count_time_steps(self.duration_s, self.time_step_s)
 
     @abstractmethod
     def _build(self, fleet: Fleet, times_s: Float64, generator: np.random.Generator) -> SceneParts:
-        """What rests, the ego, and who else moves, at (T,) times from 0 to the end, T >= 2."""
+        """Build static scenery, ego vehicle and actors at (T,) times from 0 to the end, T >= 2."""
