@@ -11,7 +11,7 @@ from torchcover.simulation.traffic.alignment import Alignment, OffsetPath, Stree
 from torchcover.simulation.traffic.city import CityBuilder
 from torchcover.simulation.traffic.fleet import Fleet, load_bodies
 from torchcover.simulation.traffic.flow import LIMIT_EVERY_M
-from torchcover.simulation.traffic.hills import SQUARE_M, Hills
+from torchcover.simulation.traffic.hills import Hills
 from torchcover.simulation.traffic.scenery import build_slab
 from torchcover.simulation.traffic.streets import (
     APART_M,
@@ -170,7 +170,7 @@ def test_hills_are_what_their_slopes_say_and_their_mesh_is_near():
     starts = np.column_stack([places, np.full(500, 50.0)]).astype(np.float32)
     hits = RayCaster([mesh]).cast_from_each(starts, down, np.full(500, 100.0, dtype=np.float32))
     np.testing.assert_allclose(50.0 - hits.range_m, height, atol=0.03)
-    assert SQUARE_M == 10.0
+    assert np.diff(np.unique(mesh.vertices_m[:, 0])).min() == 10.0
 
 
 def test_hills_of_a_motorway_are_high_and_nowhere_too_steep():

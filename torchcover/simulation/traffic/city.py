@@ -12,7 +12,7 @@ from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.traffic.alignment import Alignment, StreetCorridor
 from torchcover.simulation.traffic.fleet import Fleet
 from torchcover.simulation.traffic.frontage import RoadsideDensity, StreetSide, Zone, place_scenery
-from torchcover.simulation.traffic.hills import PIECE_M, Bounds, BuildingSite, Hills
+from torchcover.simulation.traffic.hills import BlockParams, Bounds, BuildingSite, Hills
 from torchcover.simulation.traffic.scenery import Scenery, build_ground_plane, build_sidewalk, merge_by_kind
 from torchcover.simulation.traffic.streets import LONGEST_HALF_M, StreetPlan
 
@@ -100,7 +100,7 @@ class CityBuilder(NamedTuple):
         # A little apart, so that no outline meets itself.
         rest = shapely.union_all(aprons, grid_size=SNAPPED_M).difference(nets).buffer(-APART_M, join_style="bevel")
         rest = shapely.get_parts(shapely.set_precision(rest, SNAPPED_M))
-        blocks.append(build_sidewalk(shapely.segmentize(rest, PIECE_M), self.hills.compute_heights_m))
+        blocks.append(build_sidewalk(shapely.segmentize(rest, BlockParams().segment_m), self.hills.compute_heights_m))
         self._park([(site, self._parked(front)) for site, front in fronts])
         stood = place_scenery(
             sides,
