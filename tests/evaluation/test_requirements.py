@@ -348,7 +348,12 @@ def test_times_to_collision_are_the_latest_of_all_phases(box):
 
 def test_who_is_seen_from_the_beginning_may_have_been_before(box):
     """So more than that is neither kept nor not, with a sensor lost, too; and nothing has more than the whole."""
-    way = {"name": "a", "ego": {"speed_kmh": 20}, "road_user": {"body": "adult", "speed_kmh": 5}, "duration_s": 1.2}
+    way = {
+        "name": "a",
+        "ego": {"speed_kmh": 20},
+        "road_user": {"body": "adult", "speed_kmh": 5},
+        "max_lead_time_s": 1.2,
+    }
     one = {
         "encounters": {"name": "short", "encounters": [way]},
         "points": 2,

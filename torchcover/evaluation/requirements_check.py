@@ -304,7 +304,7 @@ def _check_durations(requirement: EncounterRequirement, scenario: Scenario) -> N
             raise ValueError(
                 f"ttc_s: {requirement.ttc_s:g} s are required, and {encounter.description} of "
                 f"{requirement.encounters.name!r} lasts {duration_s:.2f} s; require less, or start the encounter "
-                "earlier (duration_s, road_user.approach_distance_m)"
+                "earlier (max_lead_time_s, road_user.approach_distance_m)"
             )
 
 
