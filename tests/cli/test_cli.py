@@ -256,7 +256,10 @@ def test_too_few_steps_for_errors_are_told_and_a_recording_has_no_reference_sens
             ["evaluate", "front_roof_128", "--num-rays", "99999999999"],
             "rays a step (230,400 of the rig's sensors, 99,999",
         ),
-        (["evaluate", "front_roof_128", "--num-frames", "9" * 20], "steps: a number from 1 to 1,000,000,000 is needed"),
+        (
+            ["evaluate", "front_roof_128", "--num-frames", "9" * 20],
+            "num_frames: a number from 1 to 1,000,000,000 is needed",
+        ),
         (
             ["evaluate", "front_roof_128", "--num-workers", "1000000"],
             "1,000,000 workers: 3e+05 GB of memory are needed",

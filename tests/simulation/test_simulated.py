@@ -67,7 +67,10 @@ def test_an_index_outside_is_an_index_error(index):
 
 @pytest.mark.parametrize(
     ("changes", "message"),
-    [({"steps": 0}, "steps: a number from 1 to 1,000,000,000 is needed; got 0"), ({"seed": -1}, "seed: .* got -1")],
+    [
+        ({"num_frames": 0}, "num_frames: a number from 1 to 1,000,000,000 is needed; got 0"),
+        ({"seed": -1}, "seed: .* got -1"),
+    ],
 )
 def test_impossible_requests_are_refused(changes, message):
     with pytest.raises(ValueError, match=message):
@@ -109,7 +112,7 @@ def test_several_rigs_see_the_same_instant_and_share_the_reference():
         alone = frames(rig=name)[1]
         assert torch.equal(both.clouds[name], alone.sensor)
         assert torch.equal(both.reference, alone.reference)
-    with pytest.raises(ValueError, match=r"clouds of 2 rigs \(front_grille_128, front_roof_128\): say which"):
+    with pytest.raises(ValueError, match=r"clouds of 2 rigs \(front_grille_128, front_roof_128\): name one"):
         _ = both.sensor
 
 

@@ -1,4 +1,4 @@
-"""Frames of a simulated world, and the reference sensor that a rig is measured against in it."""
+"""Simulated frames: sensor and reference points of rigs in a scenario, and the choice of the reference sensor."""
 
 import copy
 import hashlib
@@ -10,6 +10,7 @@ from typing import Any, Self
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from torchcover.coverage.quantities import MEASURED_WITHIN_M
 from torchcover.detection.boxes import Boxes
@@ -30,53 +31,50 @@ from torchcover.simulation.simulator import Observation, Simulator
 from torchcover.simulation.surface_reference import SurfaceReference
 
 DEFAULT_REFERENCE = "surface"
-# With so many points on an object, of which half are seen, its visibility has a standard error of 0.09 at most.
-OBJECT_POINTS = 64
-# What takes years.
+# Larger numbers of frames would take years.
 MAX_STEPS = 1_000_000_000
 
 
 class SimulatedFrames(FrameDataset):
-    """What a rig and the random reference sensor see of a scenario, step by step. A map-style torch Dataset.
+    """Sensor and reference points of rigs in a scenario, frame by frame. A map-style torch Dataset.
 
-    A frame depends on the scenario, the rig, the seed and its index, and on nothing else: not on workers, threads or
-    the order of access. Frames are cast on as many threads as torch uses (`torch.set_num_threads`; one in a
-    DataLoader worker). The points of the ego itself are in neither cloud; `Frame.counts` says how many rays they took.
+    A frame depends only on the scenario, the rig, the seed and its index, not on workers, threads or the order of
+    access. Rays are cast on as many threads as torch uses (`torch.set_num_threads`; one in a DataLoader worker). Points
+    on the ego vehicle are in neither cloud; `Frame.counts` has the number of their rays.
 
-    With `rigs` the reference is cast once a step, and every rig sees the same instant: comparisons are paired.
+    With `rigs`, the reference points are computed once per frame and all rigs observe the same scene, so that their
+    differences are paired.
 
     Args:
-        scenario: The world, the name of a built-in one, or the path of a YAML file.
-        rig: The sensors, the name of a built-in rig, or the path of a YAML file.
-        rigs: Several rigs instead, by the name under which `Frame.clouds` has their clouds; `{}`: the reference alone.
-        num_frames: Number of frames. Beyond the end of a scenario its traffic starts anew with other random numbers; without
-            traffic, the same instants are seen again, which `Frame.block_index` and `Frame.counts` say.
-        seed: Seed of the traffic and of the reference sensor's poses.
-        reference_sensor: The reference sensor, such as `PaperReference()`. If not given, a `SurfaceReference` that is
-            aimed at the usual regions: `create_reference_sensor`, and `create_object_reference` with boxes, at up to twice the
-            time.
-        frame_interval_s: Time between one frame and the next, a multiple of the scenario's time step; that step if not given.
-            Steps that follow each other are alike: with the same number of frames, a longer time shows more, and in
-            traffic, which starts anew, the frames are spread over more cities.
-        boxes: Whether frames have `boxes`: one for each object within the reference's range, with how many points each
-            rig has in it, and how many the reference drew on it. An object's name is its own within a run of the
-            scenario.
-        vehicle: What carries the rigs: a built-in vehicle, the YAML file of one, or a mesh file. Not given: the
-            scenario's own ego, else the vehicle that the rigs name, else an SUV.
-        max_cached_bytes: As in `Simulator`.
-        within_m: As in `Simulator`: the clouds have the points near the reference, and hardly any others.
-        no_cache: As in `Simulator`.
-        device: As in `Simulator`.
+        scenario: Scenario, name of a built-in one, or path of a YAML file.
+        rig: Rig, name of a built-in one, or path of a YAML file.
+        rigs: Several rigs by the name that `Frame.clouds` uses, in place of `rig`; `{}` for the reference alone.
+        num_frames: Number of frames. Beyond the end of a scenario, procedural traffic starts again with other random
+            numbers; other scenarios repeat, see `Frame.block_index` and `Frame.counts`.
+        seed: Seed of traffic, reference sensor and sensor noise.
+        reference_sensor: Reference sensor, such as `PaperReference()`. None for a `SurfaceReference` over the default
+            regions: that of `create_reference_sensor`, or with boxes that of `create_object_reference`, which takes up
+            to twice the time.
+        frame_interval_s: Time between two frames, a multiple of the time step of the scenario; None for one time step.
+            Consecutive time steps are correlated: a longer interval covers more of the scenario with as many frames.
+        boxes: True if frames have `boxes`: one for each object in range of the reference, with the number of points of
+            each rig and of the reference on it. Names of objects are unique within a run of the scenario.
+        vehicle: Vehicle that carries the rigs: built-in name, YAML file, or mesh file. None for the ego vehicle of the
+            scenario, else the vehicle that the rigs name, else an SUV.
+        max_cached_bytes: See `Simulator`.
+        search_radius_m: See `Simulator`: clouds then contain hardly more than the points close to the reference.
+        no_cache: See `Simulator`.
+        device: See `Simulator`.
 
     Raises:
         FileNotFoundError: An unknown name or file.
-        ValueError: A document that is not valid, neither or both of `rig` and `rigs`, rigs that name different vehicles
-            in a scenario that leaves it to them, a number of steps below 1, a negative seed, a time that is no multiple
-            of the time step. From indexing: a sensor inside a body or below the ground, an actor that overlaps the ego.
+        ValueError: An invalid document, neither or both of `rig` and `rigs`, rigs that name different vehicles in a
+            scenario without one, fewer than one frame, a negative seed, or an interval that is no multiple of the time
+            step. When indexing: a sensor inside a body or below the ground, an actor that overlaps the ego vehicle.
 
     Example:
-        >>> frames = SimulatedFrames("courtyard", "front_roof_128", steps=2, seed=0)
-        >>> len(frames), frames[0].sensor.shape[1], frames[0].reference.dtype, frames.square_metres
+        >>> frames = SimulatedFrames("courtyard", "front_roof_128", num_frames=2, seed=0)
+        >>> len(frames), frames[0].sensor.shape[1], frames[0].reference.dtype, frames.has_area_weights
         (2, 3, torch.float32, True)
     """
 
@@ -98,16 +96,17 @@ class SimulatedFrames(FrameDataset):
         device: str | None = None,
     ) -> None:
         if not 1 <= num_frames <= MAX_STEPS:
-            raise ValueError(f"steps: a number from 1 to {MAX_STEPS:,} is needed; got {num_frames}")
-        carried = _rigs(rig, rigs)
-        world = set_ego(scenario if isinstance(scenario, Scenario) else Scenario.load(scenario), carried, vehicle)
+            raise ValueError(f"num_frames: a number from 1 to {MAX_STEPS:,} is needed; got {num_frames}")
+        rigs_by_name = _load_rigs(rig, rigs)
+        scenario = scenario if isinstance(scenario, Scenario) else Scenario.load(scenario)
+        scenario = set_ego(scenario, rigs_by_name, vehicle)
         if reference_sensor is None:
-            asked = RegionsOfInterest().build_query_plan(world.compute_ego_box().outline_m)
-            reference_sensor = create_object_reference(asked) if boxes else create_reference_sensor(query_plan=asked)
+            plan = RegionsOfInterest().build_query_plan(scenario.compute_ego_box().outline_m)
+            reference_sensor = create_object_reference(plan) if boxes else create_reference_sensor(query_plan=plan)
         self.simulator = Simulator(
-            world,
-            carried,
-            _fit_to_rigs(reference_sensor, carried, world),
+            scenario,
+            rigs_by_name,
+            _fit_to_rigs(reference_sensor, rigs_by_name, scenario),
             seed=seed,
             frame_interval_s=frame_interval_s,
             max_cached_bytes=max_cached_bytes,
@@ -120,67 +119,75 @@ class SimulatedFrames(FrameDataset):
 
     @property
     def scenario(self) -> Scenario:
-        """The world."""
+        """Scenario with its ego vehicle."""
         return self.simulator.scenario
 
     @property
     def rigs(self) -> Mapping[str, Rig]:
-        """The sensors, by the name under which `Frame.clouds` has their clouds."""
+        """Rigs by the name that `Frame.clouds` uses."""
         return self.simulator.rigs
 
     @property
     def reference_sensor(self) -> ReferenceSensor:
-        """The reference sensor."""
+        """Reference sensor, fitted to the rigs."""
         return self.simulator.reference_sensor
 
     @property
     def seed(self) -> int:
-        """Seed of the traffic and of the reference sensor's poses."""
+        """Seed of traffic, reference sensor and sensor noise."""
         return self.simulator.seed
 
     @property
     def frame_interval_s(self) -> float:
-        """Time between one frame and the next."""
+        """Time between two frames."""
         return self.simulator.frame_interval_s
 
     @property
     def sensors(self) -> Mapping[str, Sequence[Sensor]]:
-        """The sensors of each rig."""
+        """Sensors of each rig."""
         return {name: rig.sensors for name, rig in self.rigs.items()}
 
     @property
     def sensor_names(self) -> Mapping[str, Sequence[str]]:
-        """The names of the sensors of each rig."""
+        """Names of the sensors of each rig."""
         return {name: [sensor.name for sensor in rig.sensors] for name, rig in self.rigs.items()}
 
     def get_scene_id(self, index: int) -> int:
-        """Which world a frame is of; of one that plays again and again every process has it whole: the index."""
+        """Get the scene of a frame; the index itself if the scenario repeats, since every process holds that scene.
+
+        Args:
+            index: Index of the frame.
+        """
         return index if self.scenario.is_repeating else self.simulator.get_run_index(index)
 
     def get_block_index(self, index: int) -> int:
-        """As `Simulator.block_index`."""
+        """Get the block of a frame, see `Simulator.get_block_index`.
+
+        Args:
+            index: Index of the frame.
+        """
         return self.simulator.get_block_index(index)
 
     def has_boxes(self) -> bool:
-        """Whether they were asked for."""
+        """Return True if frames have boxes."""
         return self.boxes
 
     def has_heights(self) -> bool:
-        """Whether the reference sensor finds them."""
+        """Return True if reference points have heights above the local ground."""
         return self.reference_sensor.band_frame == "ground"
 
     def get_ego_mesh(self) -> Mesh:
-        """What carries the rigs, in the vehicle frame; no world is built for it."""
+        """Build the mesh of the ego vehicle in the vehicle frame, without building a scene."""
         return self.scenario.build_ego_mesh()
 
     @property
     def ego_outline_m(self) -> Float64:
-        """(4, 2) corners x, y of the ego as seen from above, counter-clockwise; no world is built for it."""
+        """(4, 2) corners x, y of the ego vehicle in bird's-eye view, counter-clockwise."""
         return self.scenario.compute_ego_box().outline_m
 
     @property
     def description(self) -> Mapping[str, object]:
-        """The names of the scenario and of the vehicle, what sensors make of their hits, and the seed."""
+        """Names of scenario and vehicle, sensor models, weather, and seed, for `summary.json`."""
         return {
             "scenario": self.scenario.name,
             "vehicle": self.scenario.ego_name,
@@ -192,28 +199,28 @@ class SimulatedFrames(FrameDataset):
 
     @property
     def has_area_weights(self) -> bool:
-        """Whether the reference sensor gives the square metres of its points."""
+        """True if reference points have area weights in m²."""
         return self.reference_sensor.has_area_weights
 
     @property
     def reference_record(self) -> Mapping[str, object]:
-        """The reference sensor, the time between two frames; notes on ground, traffic and rays that the ego ends."""
-        traffic, ego = self.scenario.traffic, self.get_ego_mesh()
-        words = [self.simulator.ground_note, traffic.sampling_note if traffic else ""]
+        """Reference sensor, frame interval, and notes on ground, traffic and self hits, for `summary.json`."""
+        traffic, ego_mesh = self.scenario.traffic, self.get_ego_mesh()
+        notes = [self.simulator.ground_note, traffic.sampling_note if traffic else ""]
         if getattr(self.reference_sensor, "is_over_areas", False):
-            words.append("Reference positions: anywhere in the regions, for the rig is on a mast and not on a vehicle.")
+            notes.append("Reference positions: anywhere in the regions, for the rig is on a mast and not on a vehicle.")
         for name, rig in self.rigs.items():
-            self_hits = describe_self_hits(rig.sensors, rig.build_occluder_mesh(ego))
-            words.append(f"{name}: {self_hits}" if self_hits and len(self.rigs) > 1 else self_hits)
+            self_hits = describe_self_hits(rig.sensors, rig.build_occluder_mesh(ego_mesh))
+            notes.append(f"{name}: {self_hits}" if self_hits and len(self.rigs) > 1 else self_hits)
         return {
             "sensor": self.reference_sensor.name,
             "frame_interval_s": self.frame_interval_s,
-            "notes": list(filter(None, words)),
+            "notes": [note for note in notes if note],
         }
 
     @property
     def content(self) -> Mapping[str, object]:
-        """What stands in the documents and in the files that they name, and the settings.
+        """Content of all documents and of the files that they name, and the settings.
 
         Raises:
             FileNotFoundError: A file is missing.
@@ -231,7 +238,14 @@ class SimulatedFrames(FrameDataset):
         }
 
     def replace_reference_sensor(self, reference_sensor: ReferenceSensor) -> Self:
-        """The same instants as another reference sensor sees them; the geometry is built once for both."""
+        """Copy the frames with another reference sensor; both share the geometry of the scenes.
+
+        Args:
+            reference_sensor: Reference sensor.
+
+        Raises:
+            ValueError: The sensor cannot be used for a roadside rig.
+        """
         other = copy.copy(self)
         fitted = _fit_to_rigs(reference_sensor, self.rigs, self.scenario)
         other.simulator = self.simulator.replace_reference_sensor(fitted)
@@ -244,7 +258,12 @@ class SimulatedFrames(FrameDataset):
         return self.build_frame(self.simulator.simulate_frame(position), position)
 
     def build_frame(self, observation: Observation, index: int) -> Frame:
-        """The frame of what the simulator saw at a step."""
+        """Build the frame of an observation.
+
+        Args:
+            observation: Result of the simulator.
+            index: Index of the frame.
+        """
         weights, heights_m = observation.reference_weights, observation.reference_heights_m
         frame = Frame(
             **build_rig_fields(self.rigs, observation.scans),
@@ -275,7 +294,7 @@ class SimulatedFrames(FrameDataset):
 
 
 def _fit_to_rigs(sensor: ReferenceSensor, rigs: Mapping[str, Rig], scenario: Scenario) -> ReferenceSensor:
-    """The reference sensor, with positions over all regions if a rig is on a mast beside the road."""
+    """Extend the reference sensor to positions over all regions if a rig is on a mast at the roadside."""
     if not is_roadside(rigs.values(), scenario.compute_ego_box()):
         return sensor
     if isinstance(sensor, PaperReference):
@@ -287,58 +306,70 @@ def _fit_to_rigs(sensor: ReferenceSensor, rigs: Mapping[str, Rig], scenario: Sce
 
 
 def build_rig_fields(rigs: Mapping[str, Rig], scans: Mapping[str, Sequence[SensorScan]]) -> dict[str, Any]:
-    """What a `Frame` says of its rigs: clouds, what was measured of them, and which points are of which sensor."""
-    clouds = {name: torch.from_numpy(np.concatenate([one.points for one in seen])) for name, seen in scans.items()}
-    measured = {
-        name: Measurement(
-            torch.from_numpy(
-                np.concatenate([one.points if one.measured_points is None else one.measured_points for one in seen])
-            ),
-            torch.from_numpy(np.concatenate([_error_m(one) for one in seen])),
-        )
-        for name, seen in scans.items()
-        if any(one.measured_points is not None for one in seen)
-    }
-    points = {
-        name: {sensor.name: len(one.points) for sensor, one in zip(rigs[name].sensors, seen, strict=True)}
-        for name, seen in scans.items()
-    }
-    return {"clouds": clouds, "measurements": measured, "sensor_point_counts": points}
+    """Build the fields of a `Frame` that concern its rigs: clouds, measurements and point counts per sensor.
+
+    Args:
+        rigs: Rigs by name.
+        scans: Scans of the sensors of each rig, in the order of its sensors.
+    """
+    clouds: dict[str, Tensor] = {}
+    measurements: dict[str, Measurement] = {}
+    point_counts: dict[str, dict[str, int]] = {}
+    for name, rig_scans in scans.items():
+        clouds[name] = torch.from_numpy(np.concatenate([scan.points for scan in rig_scans]))
+        sensor_names = [sensor.name for sensor in rigs[name].sensors]
+        point_counts[name] = dict(zip(sensor_names, [len(scan.points) for scan in rig_scans], strict=True))
+        if any(scan.measured_points is not None for scan in rig_scans):
+            measured_points = [
+                scan.points if scan.measured_points is None else scan.measured_points for scan in rig_scans
+            ]
+            errors_m = [_get_range_errors_m(scan) for scan in rig_scans]
+            measurements[name] = Measurement(
+                torch.from_numpy(np.concatenate(measured_points)), torch.from_numpy(np.concatenate(errors_m))
+            )
+    return {"clouds": clouds, "measurements": measurements, "sensor_point_counts": point_counts}
 
 
 def add_boxes(frame: Frame, boxes: Boxes, rigs: Mapping[str, Rig]) -> Frame:
-    """The frame with its objects, and how many points each of its rigs has on them."""
+    """Add boxes to a frame, with the number of points of each rig in each box.
+
+    Args:
+        frame: Frame with the clouds of the rigs.
+        boxes: Boxes of the frame.
+        rigs: Rigs by name.
+    """
     clouds = {name: frame.get_cloud(name, max_error_m=MEASURED_WITHIN_M) for name in frame.clouds}
-    counts_as = {}
+    multiplicities = {}
     for name, rig in rigs.items():
         if any(sensor.pixels_per_sample > 1 for sensor in rig.sensors):
-            of_sensors = frame.get_clouds_by_sensor(name, max_error_m=MEASURED_WITHIN_M).values()
-            each = torch.tensor([sensor.pixels_per_sample for sensor in rig.sensors], device="cpu")
-            counts_as[name] = each.repeat_interleave(torch.tensor([len(cloud) for cloud in of_sensors], device="cpu"))
-    return replace(frame, boxes=add_point_counts(boxes, clouds, counts_as))
+            sensor_clouds = frame.get_clouds_by_sensor(name, max_error_m=MEASURED_WITHIN_M).values()
+            pixels_per_sample = torch.tensor([sensor.pixels_per_sample for sensor in rig.sensors], device="cpu")
+            num_points = torch.tensor([len(cloud) for cloud in sensor_clouds], device="cpu")
+            multiplicities[name] = pixels_per_sample.repeat_interleave(num_points)
+    return replace(frame, boxes=add_point_counts(boxes, clouds, multiplicities))
 
 
-def _error_m(scan: SensorScan) -> Float32:
+def _get_range_errors_m(scan: SensorScan) -> Float32:
     return np.zeros(len(scan.points), dtype=np.float32) if scan.range_error_m is None else scan.range_error_m
 
 
 def create_reference_sensor(
     name: str | None = None, num_rays: int | None = None, query_plan: QueryPlan | None = None
 ) -> ReferenceSensor:
-    """A reference sensor by its name, aimed at what is asked about.
+    """Create a reference sensor for a query plan.
 
     Args:
-        name: One of `torchcover.simulation.REFERENCE_SENSORS`; "surface" if not given.
-        num_rays: About how many rays at each step; the sensor's own number if not given.
-        query_plan: Regions, height bands and grid, as `RegionsOfInterest.around` gives them; those of `torchcover.evaluate`
-            without the near field, for the vehicle is unknown, if not given.
+        name: Name in `torchcover.simulation.REFERENCE_SENSORS`; None for "surface".
+        num_rays: Approximate number of rays per frame; None for the default of the sensor.
+        query_plan: Result of `RegionsOfInterest.build_query_plan`; None for the default regions of `evaluate`
+            without the near field, since the vehicle is unknown.
 
     Raises:
         ValueError: Another name, or too few rays.
 
     Example:
         >>> sensor = create_reference_sensor()
-        >>> sensor.name, sensor.rays, sensor.square_metres
+        >>> sensor.name, sensor.num_rays, sensor.has_area_weights
         ('surface', 16384, True)
     """
     kind = REFERENCE_SENSORS.get(DEFAULT_REFERENCE if name is None else name)
@@ -348,28 +379,29 @@ def create_reference_sensor(
 
 
 def create_object_reference(query_plan: QueryPlan | None = None) -> SurfaceReference:
-    """The default reference sensor with 64 points for each object in range: one that knows how visible they are.
+    """Create the default reference sensor with 64 additional points on each object in range, to measure its visibility.
 
-    `query_plan` is as in `create_reference_sensor`.
+    With 64 points, of which half are visible, the standard error of the visibility is at most 0.09.
+
+    Args:
+        query_plan: See `create_reference_sensor`.
 
     Example:
-        >>> create_object_reference().object_points
+        >>> create_object_reference().points_per_object
         64
     """
-    return replace(
-        SurfaceReference.from_query_plan(query_plan or RegionsOfInterest().build_query_plan(), None),
-        points_per_object=OBJECT_POINTS,
-    )
+    plan = query_plan or RegionsOfInterest().build_query_plan()
+    return replace(SurfaceReference.from_query_plan(plan, None), points_per_object=64)
 
 
-def _rigs(rig: Rig | str | Path | None, rigs: Mapping[str, Rig | str | Path] | None) -> dict[str, Rig]:
+def _load_rigs(rig: Rig | str | Path | None, rigs: Mapping[str, Rig | str | Path] | None) -> dict[str, Rig]:
     if (rig is None) == (rigs is None):
         raise ValueError("give one rig, or several as rigs={name: rig}")
     if rig is not None:
-        only = _load(rig)
-        return {only.name: only}
-    return {name: _load(given) for name, given in (rigs or {}).items()}
+        loaded = _load_rig(rig)
+        return {loaded.name: loaded}
+    return {name: _load_rig(rig_or_name) for name, rig_or_name in (rigs or {}).items()}
 
 
-def _load(rig: Rig | str | Path) -> Rig:
+def _load_rig(rig: Rig | str | Path) -> Rig:
     return rig if isinstance(rig, Rig) else Rig.load(rig)
