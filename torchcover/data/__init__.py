@@ -1,6 +1,6 @@
-"""Datasets of frames: simulated worlds, recordings, and the readers of cloud files.
+"""Datasets of frames: simulated scenes, recordings and readers of cloud files.
 
-The door to the rooms `frames`, `recordings` and `simulation`: a name loads its own room only, when it is first used.
+Names come from the packages `frames`, `recordings` and `simulation`, which are loaded on first use.
 """
 
 import ast
@@ -8,14 +8,17 @@ from importlib import import_module
 from pathlib import Path
 
 _stub = ast.parse(Path(__file__).with_suffix(".pyi").read_text(encoding="utf-8"))
-_ROOM_OF = {one.name: str(line.module) for line in _stub.body if isinstance(line, ast.ImportFrom) for one in line.names}
-__all__ = list(_ROOM_OF)
+_package_by_name = {}
+for _statement in _stub.body:
+    if isinstance(_statement, ast.ImportFrom):
+        _package_by_name |= dict.fromkeys((_alias.name for _alias in _statement.names), str(_statement.module))
+__all__ = list(_package_by_name)
 
 
 def __getattr__(name: str) -> object:
-    if name not in _ROOM_OF:
+    if name not in _package_by_name:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(_ROOM_OF[name]), name)
+    return getattr(import_module(_package_by_name[name]), name)
 
 
 def __dir__() -> list[str]:

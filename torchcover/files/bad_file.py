@@ -59,7 +59,7 @@ def guard_reader(content: str) -> Callable[[Reader[Arguments, Content]], Guarded
 
     Example:
         >>> import tempfile
-        >>> read = reads("a number")(lambda path: float(path.read_text()))
+        >>> read = guard_reader("a number")(lambda path: float(path.read_text()))
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     path = Path(folder, "number.txt")
         ...     _ = path.write_text("7.5")

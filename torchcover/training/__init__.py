@@ -1,6 +1,6 @@
-"""Coverage beside the training of a detector: callbacks, loggers, adapters to other frameworks.
+"""Logging of coverage during the training of a detector: callbacks, loggers and adapters to frameworks.
 
-The names are imported when first used: this needs neither Lightning nor MMEngine, TensorBoard or matplotlib.
+Names are imported on first use, so the package needs neither Lightning nor MMEngine, TensorBoard or matplotlib.
 """
 
 import lazy_loader

@@ -1,16 +1,26 @@
-"""What the adapters to all frameworks need of batches and frames."""
+"""Construction of frames from batches, shared by the adapters to all frameworks."""
 
 from torch import Tensor
 
 from torchcover.frames import Frame
 from torchcover.geometry import transform_points_tensor
 
-# In place of the index of a frame that only has a name, or not even that.
+# Index of a frame that has no number.
 UNKNOWN_INDEX = -1
 
 
 def extract_frames(batch: object) -> tuple[Frame, ...]:
-    """The frames of a `FrameBatch` or another object with `frames`, of a sequence of `Frame`, or one `Frame`."""
+    """Return the frames of a batch.
+
+    Args:
+        batch: `FrameBatch` or another object with `frames`, a sequence of `Frame`, or one `Frame`.
+
+    Returns:
+        The frames in order.
+
+    Raises:
+        TypeError: Another type of batch.
+    """
     frames = getattr(batch, "frames", batch)
     if isinstance(frames, Frame):
         return (frames,)
@@ -23,26 +33,32 @@ def extract_frames(batch: object) -> tuple[Frame, ...]:
 
 
 def build_frame(sensor: Tensor, reference: Tensor, name: object, vehicle_T_lidar: Tensor | None) -> Frame:
-    """A frame out of another framework's (N, 3 + ...) points of the rig and (M, 3 + ...) of the reference sensor.
+    """Build a frame from the points of another framework.
 
-    `name` is what that calls the sample, and its index if it is a number; None: neither is known. Without
-    `vehicle_T_lidar` the points are in the vehicle frame already.
+    Args:
+        sensor: (N, 3 + ...) points of the rig.
+        reference: (M, 3 + ...) points of the reference sensor.
+        name: Name of the sample; a number becomes its index; None if unknown.
+        vehicle_T_lidar: (4, 4) pose of the frame of the points; None: they are in the vehicle frame.
+
+    Returns:
+        Frame with the rig `rig`.
     """
     name = "" if name is None else str(name)
     return Frame(
-        {"rig": _in_vehicle_frame(sensor, vehicle_T_lidar)},
-        _in_vehicle_frame(reference, vehicle_T_lidar),
+        {"rig": _transform_to_vehicle_frame(sensor, vehicle_T_lidar)},
+        _transform_to_vehicle_frame(reference, vehicle_T_lidar),
         index=int(name) if name.isdecimal() else UNKNOWN_INDEX,
         name=name,
     )
 
 
-def _in_vehicle_frame(points: Tensor, vehicle_T_lidar: Tensor | None) -> Tensor:
+def _transform_to_vehicle_frame(points: Tensor, vehicle_T_lidar: Tensor | None) -> Tensor:
     if points.ndim != 2 or points.shape[1] < 3:
         raise ValueError(f"points of shape (N, 3 + ...) are needed; got {tuple(points.shape)}")
     if vehicle_T_lidar is None:
         return points[:, :3].float()
     if vehicle_T_lidar.shape != (4, 4):
         raise ValueError(f"vehicle_T_lidar: shape (4, 4) is needed; got {tuple(vehicle_T_lidar.shape)}")
-    # From the points as they came: rounded first, UTM-sized ones would lose decimetres.
+    # The transform precedes the conversion to float32, in which UTM coordinates would lose decimeters.
     return transform_points_tensor(vehicle_T_lidar, points[:, :3].double()).float()

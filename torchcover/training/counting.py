@@ -1,4 +1,4 @@
-"""Which frames of a batch to count: in an epoch each frame once, on whatever process it turns up."""
+"""Deduplication of frames: each frame of an epoch counts once over all processes."""
 
 import hashlib
 from collections.abc import Sequence
@@ -12,10 +12,12 @@ from torchcover.training.batches import UNKNOWN_INDEX
 
 
 class Shard(NamedTuple):
-    """How samples are dealt out: number k of a process is number `k * processes + process` of all.
+    """Distribution of samples over processes: sample k of a process has the number `k * num_processes + process_index`.
 
-    `process_index`: rank of this process; `num_processes`: number of processes; `num_samples`: number of different samples; what is
-    dealt out beyond it repeats the first ones. None as long as it is not known.
+    Args:
+        process_index: Rank of this process.
+        num_processes: Number of processes.
+        num_samples: Number of different samples; later numbers repeat the first samples. None if not yet known.
     """
 
     process_index: int
@@ -23,12 +25,19 @@ class Shard(NamedTuple):
     num_samples: int | None
 
     def is_padding(self, position: int) -> bool:
-        """Whether a sample of this process, by its position among them, repeats one of the first of all samples."""
+        """Return whether a sample of this process repeats one of the first samples.
+
+        Args:
+            position: Position of the sample in this process.
+
+        Returns:
+            True for padding; False while the number of samples is unknown.
+        """
         return self.num_samples is not None and position * self.num_processes + self.process_index >= self.num_samples
 
 
 class FrameDeduplicator:
-    """Leaves out the frames that this or another process counts, without talking to the other processes.
+    """Filter of frames that this or another process already counts, without communication between processes.
 
     A `torch.utils.data.DistributedSampler` deals out the same number of samples to every process and fills the last
     round with the first samples again. The position of a sample in the whole deal tells, whatever the order of the
@@ -48,10 +57,10 @@ class FrameDeduplicator:
         >>> import torch
         >>> frames = [Frame({"rig": torch.zeros(5, 3)}, torch.zeros(9, 3), index=k, name="a") for k in (0, 1, 0)]
         >>> once = FrameDeduplicator()
-        >>> [frame.index for frame in once.new(frames)]
+        >>> [frame.index for frame in once.select_new(frames)]
         [0, 1]
         >>> once.start_epoch()
-        >>> [frame.index for frame in once.new(frames[:2], Shard(process=1, processes=2, samples=3))]
+        >>> [frame.index for frame in once.select_new(frames[:2], Shard(process_index=1, num_processes=2, num_samples=3))]
         [0]
     """
 
@@ -70,7 +79,7 @@ class FrameDeduplicator:
         self._held_back: dict[int, Sequence[Frame]] = {}
 
     def select_new(self, frames: Sequence[Frame], shard: Shard | None = None, loader_index: int = 0) -> list[Frame]:
-        """The frames of the next batch that are to be counted.
+        """Select the frames of the next batch that count.
 
         Args:
             frames: One for each sample of the batch, in order.
@@ -93,13 +102,13 @@ class FrameDeduplicator:
     def _is_new(self, frame: Frame, loader: int) -> bool:
         if frame.index == UNKNOWN_INDEX and not frame.name:
             return True
-        identity = _identity(frame, loader)
+        identity = _hash_frame(frame, loader)
         seen = identity in self._counted
         self._counted.add(identity)
         return not seen
 
     def state_dict(self) -> dict[str, Any]:
-        """What `load_state_dict` takes, plain numbers: the frames that all processes have counted.
+        """Return the frames that all processes have counted, as plain numbers for `load_state_dict`.
 
         With `torch.distributed` in use, every process must call it.
         """
@@ -111,15 +120,19 @@ class FrameDeduplicator:
         return {"counted": sorted(counted), "position": dict(self._position)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on within an epoch."""
+        """Continue within an epoch.
+
+        Args:
+            state: Result of `state_dict`.
+        """
         self._counted, self._position = set(state["counted"]), dict(state["position"])
 
 
 def find_shard(loader: object) -> Shard | None:
-    """How a DataLoader's samples are dealt out to processes.
+    """Find how a DataLoader distributes its samples over processes.
 
     Args:
-        loader: A DataLoader, or whatever gives the batches.
+        loader: DataLoader, or another iterable of batches.
 
     Returns:
         None without a `DistributedSampler`.
@@ -128,7 +141,7 @@ def find_shard(loader: object) -> Shard | None:
         >>> from torch.utils.data import DataLoader
         >>> sampler = DistributedSampler(range(5), num_replicas=2, rank=1)
         >>> find_shard(DataLoader(range(5), sampler=sampler))
-        Shard(process=1, processes=2, samples=5)
+        Shard(process_index=1, num_processes=2, num_samples=5)
     """
     sampler = getattr(getattr(loader, "batch_sampler", None), "sampler", None) or getattr(loader, "sampler", None)
     if not isinstance(sampler, DistributedSampler):
@@ -137,11 +150,11 @@ def find_shard(loader: object) -> Shard | None:
 
 
 def is_distributed() -> bool:
-    """Whether this is one of several processes that `torch.distributed` connects."""
+    """Return whether `torch.distributed` is initialized."""
     return torch.distributed.is_available() and torch.distributed.is_initialized()
 
 
-def _identity(frame: Frame, loader: int) -> int:
+def _hash_frame(frame: Frame, loader: int) -> int:
     # Two datasets side by side have frames of the same index, and of the same name if only their seed differs. Flips
     # and rotations change coordinates, but no number of points.
     sizes = [len(frame.reference), *(len(cloud) for cloud in frame.clouds.values())]

@@ -1,4 +1,4 @@
-"""Coverage in a Lightning run: measured beside the model, logged beside its metrics."""
+"""Lightning callback that evaluates and logs coverage during training and validation."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -59,7 +59,7 @@ class CoverageCallback(Callback):
 
     Example:
         >>> from torchcover import BevGrid
-        >>> metric = CoverageMetric(BevGrid(x=(0.0, 20.0), y=(-5.0, 5.0)), max_radius=25.0)
+        >>> metric = CoverageMetric(BevGrid(x_m=(0.0, 20.0), y_m=(-5.0, 5.0)), max_radius_m=25.0)
         >>> CoverageCallback(metric, every_n_epochs=5).tag
         'coverage/val'
     """

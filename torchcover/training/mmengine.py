@@ -68,7 +68,7 @@ class MMEngineCoverage(BaseMetric):  # type: ignore[misc]  # MMEngine has no typ
         coverage: The last `Coverage` that was evaluated; None before.
 
     Example:
-        >>> metric = MMEngineCoverage({"grid": {"x": (0.0, 20.0), "y": (-5.0, 5.0)}, "max_radius": 25.0})
+        >>> metric = MMEngineCoverage({"grid": {"x_m": (0.0, 20.0), "y_m": (-5.0, 5.0)}, "max_radius_m": 25.0})
         >>> points = torch.tensor([[3.0, 1.0, 0.0], [7.0, 0.0, 0.0]])
         >>> sample = {"sample_idx": 0, "reference_points": torch.tensor([[3.0, 1.0, 0.3]])}
         >>> metric.process({"inputs": {"points": [points]}}, [sample])
