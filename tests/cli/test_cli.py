@@ -287,7 +287,7 @@ def test_too_few_steps_for_errors_are_told_and_a_recording_has_no_reference_sens
         ),
         (
             ["evaluate", "front_roof_128", "--reference", "paper", "--set", "average=area"],
-            "average area: it needs the",
+            "average area: it needs area weights of the reference points",
         ),
         (["evaluate", "front_roof_128", "--num-rays", "0"], "--num-rays"),
         (

@@ -33,8 +33,8 @@ def test_rigs_side_by_side_in_words_and_files(torchcover, worlds, monkeypatch):
         "child: yaw_deg 90",
         "child: yaw_deg -90",
         "too late",
-        "In time up to",
-        "worst to lose",
+        "Highest tested speed with timely",
+        "most critical",
         "1 points of LiDARs",
     ):
         assert words in printed
@@ -45,7 +45,7 @@ def test_rigs_side_by_side_in_words_and_files(torchcover, worlds, monkeypatch):
         ("child: yaw_deg 90", 10.0, "low"), ("child: yaw_deg 90", 10.0, "both")]  # fmt: skip
     assert len(record["rows"]) == len((out / "encounters.csv").read_text().splitlines()) - 1 == 8
     assert record["rows"][0]["interval_low"] is None
-    assert {one["in_time_up_to_kmh"] for one in record["speeds"]} == {10.0}
+    assert {one["max_speed_kmh"] for one in record["speeds"]} == {10.0}
     assert "In time? low, both" in (out / "report.html").read_text()
 
 

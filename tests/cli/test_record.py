@@ -28,7 +28,7 @@ def test_a_recording_has_the_numbers_of_the_simulation(torchcover, worlds, tmp_p
     assert (code, "test_targets: not for recordings" in told) == (2, True)
     first, second = (Coverage.load(folder / "coverage.npz") for folder in (measured, read))
     assert first.average == second.average == "area"
-    for name in ("radius", "detection", "observed_frames", "points"):
+    for name in ("radius", "detection", "observed_frames", "point_counts"):
         np.testing.assert_array_equal(getattr(first, name), getattr(second, name), err_msg=name)
     np.testing.assert_array_equal(first.errors["radius_m"], second.errors["radius_m"])
     rows = [json.loads((folder / "summary.json").read_text())["rows"] for folder in (measured, read)]

@@ -122,7 +122,7 @@ def test_who_asks_about_other_regions_asks_for_bodies_by_name_or_has_none():
 
 
 @pytest.mark.parametrize(
-    ("probe", "message"), [(["none", "child"], "none, or bodies"), (["child", "child_110cm"], "twice")]
+    ("probe", "message"), [(["none", "child"], "none, or targets"), (["child", "child_110cm"], "twice")]
 )
 def test_bodies_that_make_no_sense_are_refused(probe, message):
     with pytest.raises(ValueError, match=message):

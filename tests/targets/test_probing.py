@@ -39,7 +39,7 @@ def probed(frames, indices=None, body="pole", **budget):
 
 def numbers(probes, region, rig="small"):
     bodies = probes.get_target_sums(rig)
-    return list(bodies.estimate(bodies.regions[region], bodies.target_names[0]).numbers().values())
+    return list(bodies.estimate(bodies.regions[region], bodies.target_names[0]).to_numbers().values())
 
 
 @pytest.mark.parametrize(("name", "bodies"), [("child", ()), ("pole", (WALL,))], ids=["free space", "a wall"])

@@ -169,7 +169,7 @@ def _weather(given: "Weather | str | Path | Sequence[Weather | str | Path]") -> 
 def _probes(given: "str | Path | Iterable[str | Path] | None") -> "tuple[str | Path, ...] | None":
     each = (given,) if isinstance(given, str | Path) else None if given is None else tuple(given)
     if each and "none" in each and len(each) > 1:
-        raise ValueError(f"probe: none, or bodies; got {', '.join(map(str, each))}")
+        raise ValueError(f"test_targets: none, or targets; got {', '.join(map(str, each))}")
     return () if each == ("none",) else each
 
 
