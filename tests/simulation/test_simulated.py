@@ -12,8 +12,8 @@ from torchcover.simulation import PaperReference
 SMALL = PaperReference(rows=48, columns=64)
 
 
-def frames(seed=3, steps=6, rig="front_grille_128"):
-    return SimulatedFrames("courtyard", rig, num_frames=steps, seed=seed, reference_sensor=SMALL)
+def frames(seed=3, num_frames=6, rig="front_grille_128"):
+    return SimulatedFrames("courtyard", rig, num_frames=num_frames, seed=seed, reference_sensor=SMALL)
 
 
 def same(a, b):

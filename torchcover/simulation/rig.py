@@ -143,8 +143,9 @@ class Rig(BuiltInDocument):
             return self
         sensors: list[Sensor] = []
         for sensor in self.sensors:
-            is_lidar = isinstance(sensor, Lidar)
-            sensors.append(sensor.model_copy(update={"range_at_10_percent_m": None}) if is_lidar else sensor)
+            if isinstance(sensor, Lidar):
+                sensor = sensor.model_copy(update={"range_at_10_percent_m": None})
+            sensors.append(sensor)
         return self.model_copy(update={"sensors": tuple(sensors)})
 
     def collect_content(self) -> dict[str, Any]:
