@@ -72,9 +72,9 @@ class SumoTraffic(ProceduralTraffic):
         begin_s: Time of the simulation at which the run begins, at the earliest: the ego has to be there. After a
             minute if not given, or with the floating car data.
         built_share: Share of the streets' sides that have houses.
-        roadside_density: How many times as much of what stands beside streets, but houses, there is than usually; or of some
-            kinds of it, such as `{hedge: 2, lamp: 0}`.
-        parked_share: Share of the parking bays that are taken: lanes that nobody may use.
+        roadside_density: Factor on the usual density of roadside objects other than houses, or factors for some kinds,
+            such as `{hedge: 2, lamp: 0}`.
+        parked_share: Share of the parking bays (lanes that no vehicle may use) that are occupied.
     """
 
     type: Literal["sumo"] = "sumo"

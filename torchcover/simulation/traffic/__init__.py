@@ -1,4 +1,4 @@
-"""Worlds with traffic, made from a few parameters and a seed."""
+"""Scene generators for traffic that is sampled from a few parameters and a seed."""
 
 from torchcover.simulation.traffic.highway import HighwayTraffic
 from torchcover.simulation.traffic.parking import ParkingTraffic

@@ -35,10 +35,10 @@ WAY_EVERY_M = 40.0
 
 
 class Frontage(NamedTuple):
-    """A side of a street, the left (1) or the right (-1), from one station to another, behind the kerb.
+    """One side of a street between two stations, behind the curb.
 
-    `turn_spans_m` are stations between which the street turns, towards this side. `junction_indices` are the numbers of those at
-    its ends; none if it is the block between two streets that meet the main street in a turn.
+    `side` is 1 on the left and -1 on the right. The street turns towards this side within `turn_spans_m`.
+    `junction_indices` are the junctions at both ends; empty for a block between two streets that meet in a turn.
     """
 
     span_m: Bounds
@@ -49,7 +49,7 @@ class Frontage(NamedTuple):
 
 
 class CityBuilder(NamedTuple):
-    """Builds the part of a city that the ego gets to see, and parks cars in it."""
+    """Builder of the part of a city around the path of the ego vehicle, with parked cars."""
 
     streets: StreetPlan
     corridor: StreetCorridor

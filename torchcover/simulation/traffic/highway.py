@@ -249,9 +249,9 @@ class HighwayTraffic(ProceduralTraffic):
     """Traffic on a motorway.
 
     Args:
-        traffic_per_km: Vehicles to a kilometre of lane.
-        ego_lane: In which the ego starts: 1 is the lane at the shoulder, 3 the one at the median.
-        hill_height_std_m: Height of the hills, as a standard deviation; 0 is a plain, and no grade is above 4 %.
+        traffic_per_km: Vehicles per kilometer of lane.
+        ego_lane: Lane in which the ego vehicle starts: 1 is next to the shoulder, 3 next to the median.
+        hill_height_std_m: Standard deviation of the ground height; 0 is a plane. Grades stay below 4 %.
     """
 
     type: Literal["highway"] = "highway"

@@ -180,15 +180,15 @@ PATHS_APART_M = 1.2
 
 
 class ParkingTraffic(ProceduralTraffic):
-    """A parking lot.
+    """Traffic in a parking lot.
 
     Args:
-        speed_mps: What the ego wants to drive; the others are a little slower.
-        num_moving_cars: Others that drive around.
-        parked_share: Share of the stalls that are taken.
-        crossings_per_aisle: Places at each of the two aisles where two people cross.
-        built_share: Share of its sides, but that of the market, that have houses.
-        roadside_density: As in `Urban`, of what stands around it.
+        speed_mps: Desired speed of the ego vehicle; other cars are slightly slower.
+        num_moving_cars: Number of other moving cars.
+        parked_share: Share of the stalls that are occupied.
+        crossings_per_aisle: Positions along each of the two aisles at which two people cross.
+        built_share: Share of the sides of the lot that have houses, except the side of the market.
+        roadside_density: Factor on the usual density of objects around the lot; see `UrbanTraffic`.
     """
 
     type: Literal["parking"] = "parking"

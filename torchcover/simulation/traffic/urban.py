@@ -1,4 +1,4 @@
-"""A city: the ego follows a main street that bends and turns, behind others and past parked cars and people."""
+"""City traffic: the ego vehicle follows a main street with bends, turns, parked cars and pedestrians."""
 
 from collections.abc import Sequence
 from typing import Literal
@@ -74,20 +74,20 @@ class UrbanTraffic(ProceduralTraffic):
     """Traffic in a city.
 
     Args:
-        num_lanes: Of the ego's street, both directions together; two or four are drawn for each run if not given. The
-            streets that cross it have two or four.
-        speed_mps: What drivers want to drive, about.
-        traffic_per_km: Vehicles to a kilometre of lane.
-        cross_traffic_share: Streets that cross the ego's have this share of that.
-        cyclists_per_km: To a kilometre of bicycle lane.
-        people_per_km: On foot, to a kilometre of sidewalk in each direction.
-        parked_share: Share of the parking bays that are taken.
-        built_share: Share of the blocks' sides that have houses; 0 is open country.
-        roadside_density: How many times as much of what stands beside streets, but houses, there is than usually; or of some
-            kinds of it, such as `{hedge: 2, lamp: 0}`.
-        max_bend_deg: How much the ego's street may bend between two junctions; 0 is straight.
-        turn_share: Share of the junctions at which the ego's street turns.
-        hill_height_std_m: Height of the hills, as a standard deviation; 0 is a plain.
+        num_lanes: Lanes of the main street in both directions together; sampled for each run (2 or 4) if None. Cross
+            streets have 2 or 4 lanes.
+        speed_mps: Usual desired speed of drivers.
+        traffic_per_km: Vehicles per kilometer of lane.
+        cross_traffic_share: Traffic density of cross streets as a share of `traffic_per_km`.
+        cyclists_per_km: Cyclists per kilometer of bicycle lane.
+        people_per_km: Pedestrians per kilometer of sidewalk in each direction.
+        parked_share: Share of the parking bays that are occupied.
+        built_share: Share of the block sides that have houses; 0 is open country.
+        roadside_density: Factor on the usual density of roadside objects other than houses, or factors for some kinds,
+            such as `{hedge: 2, lamp: 0}`.
+        max_bend_deg: Largest bend of the main street between two junctions; 0 is straight.
+        turn_share: Share of the junctions at which the main street turns.
+        hill_height_std_m: Standard deviation of the ground height; 0 is a plane.
     """
 
     type: Literal["urban"] = "urban"
