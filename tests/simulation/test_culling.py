@@ -38,7 +38,7 @@ def at_every_body(instant, vehicle_T_sensor, tiles, max_range_m):
         directions = rotate(vehicle_T_sensor[:3, :3], tile.directions)
         limit_m = np.full(directions.shape[1], max_range_m, dtype=np.float32)
         hits = cast_from_vehicle(instant.static, instant.static_T_vehicle, origin_m, directions, limit_m)
-        moving = instant.moving
+        moving = instant.moving_bodies
         for caster, part_T_vehicle, body in zip(moving.casters, moving.part_T_vehicle, moving.body, strict=True):
             nearer = cast_from_vehicle(caster, part_T_vehicle, origin_m, directions, hits.range_m)
             hits.range_m[:] = nearer.range_m
@@ -59,7 +59,7 @@ def assert_same_bits(scan, expected):
 @pytest.mark.parametrize("step", [0, 170, 399])
 @pytest.mark.parametrize("sensor", ["roof", "bumper", "paper"])
 def test_a_scan_is_that_of_every_ray_cast_at_every_body(scene, step, sensor):
-    instant, generator = scene.at(step, within_m=150.0), np.random.default_rng(step)
+    instant, generator = scene.get_snapshot(step, max_distance_m=150.0), np.random.default_rng(step)
     if sensor == "paper":
         reference = PaperReference(rows=60, columns=90)
         pose, tiles = reference.sample_pose(EGO, generator), split_into_tiles(reference.compute_directions())
@@ -67,7 +67,7 @@ def test_a_scan_is_that_of_every_ray_cast_at_every_body(scene, step, sensor):
         pose, tiles = ROOF if sensor == "roof" else Pose(x_m=2.6, z_m=0.4, pitch_deg=3).to_matrix(), SPHERE
     seen = instant.scan(pose, tiles, max_range_m=150.0)
     assert_same_bits(seen, at_every_body(instant, pose, tiles, 150.0))
-    assert seen.body_casts < 0.5 * seen.rays * len(instant.moving)
+    assert seen.num_body_casts < 0.5 * seen.rays * len(instant.moving_bodies)
 
 
 def test_bodies_of_one_kind_are_cast_at_together_from_a_place_on_one_of_them_too():

@@ -149,7 +149,7 @@ def planes_of(mesh):
 def test_rays_leave_all_faces_that_meet_where_they_start(shape):
     """From places on edges and in corners: outwards to the walls of a room, inwards to the other side of the body."""
     mesh, generator = (
-        shape.mesh().moved(build_transform(convert_euler_to_rotation(10.0, 20.0, 30.0), [1.0, 2.0, 3.0])),
+        shape.mesh().transform(build_transform(convert_euler_to_rotation(10.0, 20.0, 30.0), [1.0, 2.0, 3.0])),
         NUMBERS(5),
     )
     room = box_at(0.0, size=40.0)
@@ -283,7 +283,7 @@ def test_a_place_between_bodies_that_touch_is_inside_one_however_they_are_turned
     )
     slabs = stacked([(20, 20, 1), (20, 20, 2), (24, 16, 1)])
     order = numbers.permutation(3)
-    caster = RayCaster([slabs[k].moved(turn) for k in order])
+    caster = RayCaster([slabs[k].transform(turn) for k in order])
     for height_m, expected in ((0.5, [0]), (2.0, [1]), (3.5, [2]), (4.5, []), (-0.5, [])):
         for beside_m in ((0.0, 0.0), (0.3, -4.2), (7.0, 7.0)):
             place_m = turn[:3, :3] @ [*beside_m, height_m] + turn[:3, 3]

@@ -37,12 +37,12 @@ def disk(monkeypatch, tmp_path):
         built.append(episode)
         return world(self, seed, episode, ego)
 
-    monkeypatch.setattr(Scenario, "world", counted)
+    monkeypatch.setattr(Scenario, "build_scene", counted)
     return lambda: sorted((tmp_path / "cache" / "torchcover" / "scenes").glob("*")), built
 
 
 def world_of(scenario, run=0, seed=0, **keys):
-    return SceneCache(scenario, seed, **keys).build(run, scenario.ego_mesh())
+    return SceneCache(scenario, seed, **keys).build(run, scenario.build_ego_mesh())
 
 
 def same(one, other):
@@ -334,7 +334,7 @@ def test_a_world_with_doubts_is_not_kept_but_doubted_each_time(disk, monkeypatch
         warnings.warn("three lorries left out", stacklevel=2)
         return world(self, *args)
 
-    monkeypatch.setattr(Scenario, "world", doubtful)
+    monkeypatch.setattr(Scenario, "build_scene", doubtful)
     for _ in range(2):
         with pytest.warns(UserWarning, match="three lorries"):
             world_of(lot())

@@ -157,7 +157,7 @@ def test_the_housing_of_a_sensor_is_in_the_way_of_the_others_alone(traffic):
 
     def azimuths_deg(sensor, others=()):
         points_m = MountedSensor(sensor, scene, 40.0, other_sensors=others).scan(scene.get_snapshot(0), EXACT).points
-        x, y, _ = (points_m - sensor.mount.matrix()[:3, 3]).T
+        x, y, _ = (points_m - sensor.mount.to_matrix()[:3, 3]).T
         return set(np.round(np.rad2deg(np.arctan2(y, x)), 1).tolist())
 
     assert azimuths_deg(front, (rear,)) == azimuths_deg(front)

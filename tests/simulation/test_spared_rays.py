@@ -41,14 +41,14 @@ def scene():
 
 def is_near(scan, balls):
     """(N,) of its points, which ones lie in a ball."""
-    away_m = np.linalg.norm(scan.points[:, None].astype(float) - balls.centres_m, axis=2)
+    away_m = np.linalg.norm(scan.points[:, None].astype(float) - balls.centers_m, axis=2)
     return (away_m <= balls.radius_m).any(axis=1)
 
 
 @pytest.mark.parametrize("name", SENSORS)
 @pytest.mark.parametrize("radius_m", [0.1, 0.4, 2.0])
 def test_points_near_what_is_asked_about_are_the_same_to_the_bit(scene, name, radius_m):
-    instant, sensor = scene.at(30, within_m=90.0), SENSORS[name]
+    instant, sensor = scene.get_snapshot(30, max_distance_m=90.0), SENSORS[name]
     mounted = MountedSensor(sensor, scene, sensor.max_range_m)
 
     def scan(**asked):
@@ -58,10 +58,10 @@ def test_points_near_what_is_asked_about_are_the_same_to_the_bit(scene, name, ra
     full, generator = scan(), np.random.default_rng(8)
     places_m = full.points[generator.choice(len(full.points), 12)] + generator.normal(0, radius_m / 2, (12, 3))
     balls = SearchSpheres(places_m.astype(np.float32), radius_m)
-    spared = scan(within=balls)
+    spared = scan(search_spheres=balls)
     of_full, of_spared = is_near(full, balls), is_near(spared, balls)
     assert of_full.sum() > 0
-    for column in ("points", "ray", "range_m", "error_m", "landed"):
+    for column in ("points", "ray_indices", "range_m", "range_error_m", "measured_points"):
         one, other = getattr(full, column), getattr(spared, column)
         assert (one is None) == (other is None)
         if one is not None:
@@ -92,7 +92,7 @@ def test_a_ray_is_met_exactly_if_it_passes_through_a_ball():
 @pytest.mark.parametrize("name", ["lidar", "camera"])
 def test_of_many_places_neighbours_are_looked_at_together(scene, name):
     """All rays of their own are among those of balls that hold them; where nearly all are, none is spared."""
-    sensor, instant = SENSORS[name], scene.at(0, within_m=90.0)
+    sensor, instant = SENSORS[name], scene.get_snapshot(0, max_distance_m=90.0)
     mounted, generator = MountedSensor(sensor, scene, 90.0), np.random.default_rng(9)
     full = mounted.scan(instant, SensorNoise(np.random.default_rng(7), num_rays=len(mounted.ray_pixel_indices)))
     ahead = full.points[(full.points[:, 0] > 2) & (np.abs(full.points[:, 1]) < 4)]
@@ -116,9 +116,9 @@ def test_of_many_places_neighbours_are_looked_at_together(scene, name):
 
 
 def test_an_instant_is_placed_once_for_several_rigs_and_few_are_kept(scene):
-    first = scene.at(0, within_m=90.0)
-    assert scene.at(0, within_m=90.0) is first
-    assert scene.at(0, within_m=80.0) is not first
+    first = scene.get_snapshot(0, max_distance_m=90.0)
+    assert scene.get_snapshot(0, max_distance_m=90.0) is first
+    assert scene.get_snapshot(0, max_distance_m=80.0) is not first
     for step in range(1, 9):
-        scene.at(step, within_m=90.0)
-    assert scene.at(0, within_m=90.0) is not first
+        scene.get_snapshot(step, max_distance_m=90.0)
+    assert scene.get_snapshot(0, max_distance_m=90.0) is not first

@@ -14,7 +14,7 @@ SHORT = Scenario.model_validate(
     {
         "name": "lot",
         "ego": {"shape": {"type": "box", "size_m": [4, 2, 1.5]}},
-        "traffic": {"type": "parking", "duration_s": 1.0, "time_step_s": 0.2, "crossings": 0, "parked_share": 0.1},
+        "traffic": {"type": "parking", "duration_s": 1.0, "time_step_s": 0.2, "crossings_per_aisle": 0, "parked_share": 0.1},
     }
 )
 ORDER = np.random.default_rng(0).permutation(24).tolist()
@@ -29,7 +29,7 @@ def built(monkeypatch):
         episodes.append(episode)
         return world(self, seed, episode, ego)
 
-    monkeypatch.setattr(Scenario, "world", counted)
+    monkeypatch.setattr(Scenario, "build_scene", counted)
     return episodes
 
 
@@ -39,8 +39,8 @@ def simulator():
 
 def places(made):
     """Of each step in a shuffled order, where the ego is in its world."""
-    scenes = {index: made.scene_of(index) for index in ORDER}
-    return {index: scene.world.ego.trajectory.positions_m[step] for index, (scene, step) in scenes.items()}
+    scenes = {index: made.get_scene_geometry(index) for index in ORDER}
+    return {index: scene.scene.ego.trajectory.positions_m[step] for index, (scene, step) in scenes.items()}
 
 
 def test_shuffled_steps_build_each_world_once(built):
