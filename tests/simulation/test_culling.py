@@ -67,7 +67,7 @@ def test_a_scan_is_that_of_every_ray_cast_at_every_body(scene, step, sensor):
         pose, tiles = ROOF if sensor == "roof" else Pose(x_m=2.6, z_m=0.4, pitch_deg=3).to_matrix(), SPHERE
     seen = instant.scan(pose, tiles, max_range_m=150.0)
     assert_same_bits(seen, at_every_body(instant, pose, tiles, 150.0))
-    assert seen.num_body_casts < 0.5 * seen.rays * len(instant.moving_bodies)
+    assert seen.num_body_casts < 0.5 * seen.num_rays * len(instant.moving_bodies)
 
 
 def test_bodies_of_one_kind_are_cast_at_together_from_a_place_on_one_of_them_too():

@@ -60,7 +60,7 @@ def ground_of(static, places=((0.0, 0.0, 0.0),)):
 
 
 def heights(ground, *points):
-    return ground.heights_m(np.array(points, dtype=np.float64)).tolist()
+    return ground.compute_heights_m(np.array(points, dtype=np.float64)).tolist()
 
 
 PLANE = sheet(lambda x, y: 0 * x)
@@ -290,7 +290,7 @@ def test_frames_carry_heights_everywhere_they_go(tmp_path):
     assert torch.equal(frame.to("cpu").reference_heights_m, frame.reference_heights_m)
     batch = collate_frames([frame, frames[1]])
     assert [len(h) for h in batch.get_heights_m("ground")] == [len(points) for points in batch.reference]
-    with pytest.raises(ValueError, match=r"drawn for bands over the ground; use the band frame ground$"):
+    with pytest.raises(ValueError, match=r"sampled for bands above the ground; use the band frame ground$"):
         batch.get_heights_m("vehicle")
     unknown = dataclasses.replace(frame, reference_heights_m=None)
     with pytest.raises(ValueError, match=r"courtyard step 0.* are unknown; use the band frame vehicle$"):
@@ -348,7 +348,7 @@ def test_what_cannot_be_ground_is_refused():
 def test_the_courtyard_says_what_would_have_been_found():
     world = Scenario.load("courtyard").build_scene()
     said, found = (
-        SceneGeometry(dataclasses.replace(world, ground=known)).ground_masks
+        SceneGeometry(dataclasses.replace(world, ground_mesh_indices=known)).ground_masks
         for known in (world.ground_mesh_indices, None)
     )
     assert [mask.tolist() for mask in said] == [mask.tolist() for mask in found]

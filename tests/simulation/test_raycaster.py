@@ -149,7 +149,7 @@ def planes_of(mesh):
 def test_rays_leave_all_faces_that_meet_where_they_start(shape):
     """From places on edges and in corners: outwards to the walls of a room, inwards to the other side of the body."""
     mesh, generator = (
-        shape.mesh().transform(build_transform(convert_euler_to_rotation(10.0, 20.0, 30.0), [1.0, 2.0, 3.0])),
+        shape.build_mesh().transform(build_transform(convert_euler_to_rotation(10.0, 20.0, 30.0), [1.0, 2.0, 3.0])),
         NUMBERS(5),
     )
     room = box_at(0.0, size=40.0)

@@ -59,7 +59,7 @@ def edge_counts(mesh):
     ],
 )
 def test_solids_are_closed_face_outwards_and_have_their_volume(shape, volume):
-    mesh = shape.mesh()
+    mesh = shape.build_mesh()
     edges, distinct, paired = edge_counts(mesh)
     assert edges == distinct
     assert paired
@@ -112,7 +112,7 @@ CAR = Box(type="box", size_m=(4.9, 1.94, 1.63))
 
 @pytest.mark.parametrize("shape", [CAR, Cylinder(type="cylinder", radius_m=2, height_m=5)])
 def test_closed_meshes_give_no_warning_however_they_are_written(tmp_path, shape):
-    mesh = shape.mesh()
+    mesh = shape.build_mesh()
     # Warnings are errors here: what is read without one has all its faces.
     assert len(mesh_file(tmp_path, ply_of(mesh)).build_mesh().faces) == len(mesh.faces)
     # Each face with corners of its own, as STL has it; then with half of the faces flipped.

@@ -114,11 +114,11 @@ def test_the_ego_is_at_its_own_place_to_the_last_bit():
 def test_a_hit_lies_on_the_face_that_it_says_at_the_angle_that_it_says(ego_moves, actor_moves, origin_m):
     made = world(ego_moves, actor_moves, origin_m)
     bar, ground = made.static_meshes
-    bar = bar._replace(material=np.arange(len(bar.faces), dtype=np.uint8))
-    car = replace(made.actors[0], mesh=made.actors[0].mesh._replace(material=np.full(12, 77, dtype=np.uint8)))
+    bar = bar._replace(material_indices=np.arange(len(bar.faces), dtype=np.uint8))
+    car = replace(made.actors[0], mesh=made.actors[0].mesh._replace(material_indices=np.full(12, 77, dtype=np.uint8)))
     turning = Trajectory.from_arrays([0.0, 10.0], [origin_m, np.add(origin_m, (3, 1, 0))], [[0, 0, 0], [40, 0, 0]])
     ego = replace(made.ego, trajectory=turning if ego_moves else made.ego.trajectory)
-    scene, time_s = SceneGeometry(replace(made, static=(bar, ground), actors=(car,), ego=ego)), 3.0
+    scene, time_s = SceneGeometry(replace(made, static_meshes=(bar, ground), actors=(car,), ego=ego)), 3.0
     scan = afresh(scene.get_snapshot(3))
     struck, origin = scan.find_attributes(), LIDAR.mount.to_matrix()[:3, 3]
     vehicle_T_world = invert(ego.trajectory.interpolate(time_s))

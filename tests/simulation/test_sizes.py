@@ -96,7 +96,7 @@ def test_more_steps_and_bodies_than_there_is_memory_for_are_refused(small):
 )
 def test_more_traffic_than_there_is_memory_for_is_refused_before_anybody_is_made(small, traffic):
     with pytest.raises(ValueError, match=r"traffic of about [\d,]+ for [\d,]+ time steps: .* shorten the duration"):
-        traffic.world(0)
+        traffic.build_scene(0)
 
 
 def test_an_actor_that_will_get_into_the_ego_is_known_before_the_run(tmp_path):

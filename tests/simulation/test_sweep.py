@@ -115,7 +115,7 @@ def test_a_sweep_moves_a_point_by_speed_times_time(car_mps):
     """The rear of a car ahead, 8 m before an ego at 20 m/s, at the frame's time: three clouds in closed form."""
     made = world(ego_mps=20.0)
     car = Actor("car", "car", box(4, 6, 1.5), driving((20.0 - car_mps / 2, 0, 0), (5 * car_mps, 0, 0)))
-    mounted, seen = swept(replace(made, static=made.static_meshes[:1], actors=(car,)))
+    mounted, seen = swept(replace(made, static_meshes=made.static_meshes[:1], actors=(car,)))
     pixel = mounted.ray_pixel_indices[seen.ray_indices]
     time_s = LIDAR.compute_ray_times_s().reshape(-1)[pixel]
     directions = LIDAR.mount.to_matrix()[:3, :3] @ LIDAR.compute_directions().reshape(3, -1)[:, pixel]
@@ -133,7 +133,7 @@ def test_a_sweep_moves_a_point_by_speed_times_time(car_mps):
 def test_the_first_frame_of_a_world_is_as_its_second():
     """Before a world begins it is told from how it goes on."""
     made = world(ego_mps=20.0)
-    made = replace(made, static=made.static_meshes[:1], actors=())
+    made = replace(made, static_meshes=made.static_meshes[:1], actors=())
     (_, first), (_, later), (_, at_once) = (
         swept(made, time_s, lidar)
         for time_s, lidar in ((0.0, LIDAR), (0.5, LIDAR), (0.0, LIDAR.model_copy(update={"scan": None})))
@@ -150,13 +150,13 @@ def test_the_first_frame_of_a_world_is_as_its_second():
     ],
 )
 def test_columns_of_a_lidar_and_rows_of_a_camera_follow_each_other(sensor, axis):
-    times_s = sensor.times_s()
-    assert times_s.shape == sensor.directions().shape[1:]
+    times_s = sensor.compute_ray_times_s()
+    assert times_s.shape == sensor.compute_directions().shape[1:]
     assert (np.diff(times_s, axis=axis) > 0).all()
     assert (np.diff(times_s, axis=1 - axis) == 0).all()
     assert -0.1 < times_s.min() < times_s.max() < 0.0
-    assert sensor.model_copy(update={"scan": None}).times_s() is None
-    later = sensor.model_copy(update={"scan": ScanTimes(period_s=0.1, start_s=0.02)}).times_s()
+    assert sensor.model_copy(update={"scan": None}).compute_ray_times_s() is None
+    later = sensor.model_copy(update={"scan": ScanTimes(period_s=0.1, start_s=0.02)}).compute_ray_times_s()
     np.testing.assert_allclose(later, times_s + 0.12)
 
 
