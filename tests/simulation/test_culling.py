@@ -37,15 +37,15 @@ def at_every_body(instant, vehicle_T_sensor, tiles, max_range_m):
     for tile in tiles:
         directions = rotate(vehicle_T_sensor[:3, :3], tile.directions)
         limit_m = np.full(directions.shape[1], max_range_m, dtype=np.float32)
-        hits = cast_from_vehicle(instant.static, instant.static_T_vehicle, origin_m, directions, limit_m)
+        hits = cast_from_vehicle(instant.static_caster, instant.static_T_vehicle, origin_m, directions, limit_m)
         moving = instant.moving_bodies
-        for caster, part_T_vehicle, body in zip(moving.casters, moving.part_T_vehicle, moving.body, strict=True):
+        for caster, part_T_vehicle, body in zip(moving.casters, moving.part_T_vehicle, moving.body_indices, strict=True):
             nearer = cast_from_vehicle(caster, part_T_vehicle, origin_m, directions, hits.range_m)
             hits.range_m[:] = nearer.range_m
             hits.body_indices[nearer.body_indices >= 0] = body
-        seen = (hits.body_indices >= 0) & (hits.body_indices != instant.ego)
+        seen = (hits.body_indices >= 0) & (hits.body_indices != instant.ego_index)
         points = (directions * hits.range_m + origin_m.astype(np.float32)[:, None])[:, seen]
-        answers.append((points.T, np.count_nonzero(hits.body_indices == instant.ego)))
+        answers.append((points.T, np.count_nonzero(hits.body_indices == instant.ego_index)))
     points, self_hits = zip(*answers, strict=True)
     return np.concatenate(points), sum(self_hits)
 
