@@ -144,8 +144,9 @@ class Rig(BuiltInDocument):
         sensors: list[Sensor] = []
         for sensor in self.sensors:
             if isinstance(sensor, Lidar):
-                sensor = sensor.model_copy(update={"range_at_10_percent_m": None})
-            sensors.append(sensor)
+                sensors.append(sensor.model_copy(update={"range_at_10_percent_m": None}))
+            else:
+                sensors.append(sensor)
         return self.model_copy(update={"sensors": tuple(sensors)})
 
     def collect_content(self) -> dict[str, Any]:
