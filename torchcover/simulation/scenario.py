@@ -110,8 +110,8 @@ class Scenario(BuiltInDocument):
     Args:
         name: Name in tables and maps.
         description: Description of the surroundings.
-        ego: Vehicle that carries the rig; only its shape if there is traffic. Without a shape, the vehicle of the rig or
-            an SUV is used.
+        ego: Vehicle that carries the rig; only its shape if there is traffic. Without a shape, the vehicle of the rig
+            or an SUV is used.
         bodies: Static bodies, in the world frame.
         actors: Bodies that move or have a category.
         boxes: File of recorded boxes, relative to the document; they become actors with bodies as those of traffic of

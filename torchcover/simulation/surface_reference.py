@@ -50,8 +50,8 @@ class SurfaceReference:
         bands_m: Height bands (low, high) in meters; half-open, as areas are; they may overlap.
         shell_m: Thickness of the shell; with `is_over_areas`, largest distance of a position from the ego vehicle.
         max_range_m: Farther points are not visible.
-        points_per_object: Minimum number of additional points on each object (`Scene.objects`) within range, in any area
-            and at any height, over all positions together; they are not part of `num_rays`.
+        points_per_object: Minimum number of additional points on each object (`Scene.objects`) within range, in any
+            area and at any height, over all positions together; they are not part of `num_rays`.
         band_frame: Frame of the height bands: "ground" for the local ground (`LocalGround`), "vehicle" for z = 0 of the
             vehicle frame.
         is_over_areas: Sample positions uniformly over all areas, up to the height of the ego vehicle, as for a rig on a
