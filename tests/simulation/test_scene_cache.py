@@ -33,9 +33,9 @@ def disk(monkeypatch, tmp_path):
 
     built, world = [], Scenario.build_scene
 
-    def counted(self, seed=0, episode=0, ego=None):
-        built.append(episode)
-        return world(self, seed, episode, ego)
+    def counted(self, seed=0, run_index=0, ego_mesh=None):
+        built.append(run_index)
+        return world(self, seed, run_index, ego_mesh)
 
     monkeypatch.setattr(Scenario, "build_scene", counted)
     return lambda: sorted((tmp_path / "cache" / "torchcover" / "scenes").glob("*")), built

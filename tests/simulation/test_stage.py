@@ -25,9 +25,9 @@ def built(monkeypatch):
     """The numbers of the runs whose worlds were built, in order."""
     episodes, world = [], Scenario.build_scene
 
-    def counted(self, seed=0, episode=0, ego=None):
-        episodes.append(episode)
-        return world(self, seed, episode, ego)
+    def counted(self, seed=0, run_index=0, ego_mesh=None):
+        episodes.append(run_index)
+        return world(self, seed, run_index, ego_mesh)
 
     monkeypatch.setattr(Scenario, "build_scene", counted)
     return episodes
