@@ -55,7 +55,7 @@ def test_what_is_asked_on_the_command_line_in_a_file_and_in_python_is_the_same(e
         grid={"x_m": (-10.0, 10.0), "y_m": (-10.0, 10.0)},
     )
     settings = {"num_frames": 9, "cell_m": 0.5, "thresholds_m": 2.0, "num_rays": 1024}
-    result = package.evaluate(worlds / "both.yaml", worlds / "yard.yaml", ask=ask, **settings)
+    result = package.evaluate(worlds / "both.yaml", worlds / "yard.yaml", regions=ask, **settings)
     loaded = Coverage.load(worlds / "out" / "coverage.npz")
     np.testing.assert_array_equal(result.coverage.radius, loaded.radius)
     assert loaded.regions[0] == Region("behind", (-6.0, -2.0), (-2.0, 2.0))
@@ -155,7 +155,7 @@ def test_a_region_within_the_vehicle_is_unknown_and_a_line_says_why(evaluate, wo
 def test_where_nothing_was_seen_no_sensor_is_called_dispensable(evaluate, worlds):
     asked = write_regions(worlds, regions="{sky: {x_m: [2, 6], y_m: [-2, 2]}}", heights="{sky: [50, 60]}")
     code, printed, _ = evaluate(*asked, "--redundancy")
-    assert (code, "unknown: nothing that was asked about was seen." in " ".join(printed.split())) == (0, True)
+    assert (code, "Single point of failure unknown: no surface in the regions was observed." in " ".join(printed.split())) == (0, True)
     assert "No single point of failure" not in printed
 
 
@@ -163,8 +163,8 @@ def test_where_nothing_is_detected_no_sensor_is_called_dispensable_either(torchc
     scene = ("--scenario", worlds / "yard.yaml", "--out", worlds / "out", "--num-frames", 2, "--num-rays", 1024)
     asked = ("--set", "cell_m=0.5", "--region", "ahead:2,6,-2,2", "--thresholds-m", 2e-3, "--redundancy")
     code, printed, _ = torchcover("evaluate", worlds / "both.yaml", *scene, *asked)
-    assert (code, "Nothing of what was asked about is detected" in " ".join(printed.split())) == (0, True)
-    assert "No single point of failure" not in printed
+    assert (code, "No single point of failure: nothing in the regions is detected with all sensors." in " ".join(printed.split())) == (0, True)
+    assert "No single point of failure: no failure of a sensor" not in " ".join(printed.split())
 
 
 def test_bands_over_the_ground_and_over_z_agree_on_level_ground(torchcover, evaluate, worlds):
@@ -193,5 +193,5 @@ def test_a_recording_keeps_the_heights(torchcover, worlds):
     scenario = ["--scenario", worlds / "yard.yaml", "--out", recorded]
     assert torchcover("record", worlds / "both.yaml", *scenario, *SMALL[:2])[0] == 0
     assert package.evaluate(frames=recorded, cell_m=4.0).coverage.band_frame == "ground"
-    with pytest.raises(ValueError, match=r"drawn for bands over the ground; use the band frame ground$"):
+    with pytest.raises(ValueError, match=r"sampled for bands above the ground; use the band frame ground$"):
         package.evaluate(frames=recorded, cell_m=4.0, band_frame="vehicle")

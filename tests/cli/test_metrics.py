@@ -122,7 +122,7 @@ def test_taus_have_intervals_over_worlds_that_are_drawn_the_same_again(worlds):
             num_rays=2048,
             metrics="k_cover",
         )
-        return [tau for tau in result.metrics.taus() if tau.first == "k_cover_1_2m"]
+        return [tau for tau in result.metrics.compute_taus() if tau.first == "k_cover_1_2m"]
 
     first = taus()
     known = [tau for tau in first if not np.isnan(tau.low)]
