@@ -331,6 +331,18 @@ def test_an_array_that_its_header_describes_wrongly_is_refused(tmp_path, change,
         read_state(path, header, "one")
 
 
+def test_an_array_that_is_listed_often_counts_as_often(tmp_path, monkeypatch):
+    path = tmp_path / "a.npz"
+    header = {"identity": {}, "run": {"steps": 1, "counts": {}, "skipped": [], "seconds": 0.0}}
+    write_checkpoint(path, header, {"one": {"of it": torch.zeros(100_000)}})
+    header = read_header(path)
+    states = header["states"]["one"]["dict"]
+    states["others"] = {"list": 30 * [states["of it"]]}
+    monkeypatch.setenv("TORCHCOVER_MAX_FILE_GB", "0.01")
+    with pytest.raises(BadFileError, match=r"reading it takes 0\.0124 GB of memory, more than the 0\.01 GB"):
+        read_state(path, header, "one")
+
+
 def test_a_damaged_checkpoint_is_named(frame_of, path):
     measured(Drive(frame_of), path, steps=3)
     data = bytearray(path.read_bytes())

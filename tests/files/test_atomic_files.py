@@ -1,6 +1,7 @@
 """Files and folders are old, new, or reported as incomplete; nothing is written through links."""
 
 import errno
+import hashlib
 import json
 import os
 import re
@@ -240,10 +241,15 @@ def test_a_manifest_that_lists_others_deletes_nothing(tmp_path, name):
     (out / "a").mkdir()
     mine.write_text("mine")
     (out / "edited.txt").write_text("edited on purpose")
-    listed = {str(mine) if name == "ABSOLUTE" else name: {"bytes": 4}, "edited.txt": {"bytes": 17, "sha256": "0"}}
+    (out / ".hidden").write_text("mine")
+    (out / "of_this_size.txt").write_text("mine")
+    entry = {"bytes": 4, "sha256": hashlib.sha256(b"mine").hexdigest()}
+    listed = {str(mine) if name == "ABSOLUTE" else name: entry, "edited.txt": {"bytes": 17, "sha256": "0"}}
+    listed |= {".hidden": entry, "of_this_size.txt": {"bytes": 4}}
     (out / "summary.json").write_text(json.dumps({"files": listed}))
     publish(out, NUMBERS)
-    assert list_files(tmp_path) == {"mine.txt", "out/edited.txt", "out/a.txt", "out/b.txt", "out/summary.json"}
+    others = {f"out/{other}" for other in ("edited.txt", ".hidden", "of_this_size.txt")}
+    assert list_files(tmp_path) == {"mine.txt", *others, "out/a.txt", "out/b.txt", "out/summary.json"}
 
 
 def special(path, kind, target):

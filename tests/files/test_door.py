@@ -1,11 +1,21 @@
 """What the readers of every room share."""
 
 import re
+import time
 
 import numpy as np
 import pytest
 
-from torchcover.files import BadFileError, TooLargeError, check_memory, read_npz, read_short_text, reads
+from torchcover.files import (
+    BadFileError,
+    TooLargeError,
+    check_memory,
+    read_csv,
+    read_json_table,
+    read_npz,
+    read_short_text,
+    reads,
+)
 from torchcover.files.bad_file import MAX_SHORT_BYTES
 
 
@@ -94,3 +104,18 @@ def test_text_that_is_parsed_slowly_is_short(tmp_path):
     path.write_bytes(b"a" * (MAX_SHORT_BYTES + 1))
     with pytest.raises(ValueError, match="1000001 bytes; at most 1000000 are read"):
         read_short_text(path)
+
+
+def test_a_table_of_many_columns_is_refused_at_once(tmp_path):
+    (tmp_path / "a.csv").write_text("t," * 200_000 + "x\n1\n")
+    start_s = time.process_time()
+    with pytest.raises(BadFileError, match="there twice: t"):
+        read_csv(tmp_path / "a.csv", ["t", "x"])
+    assert time.process_time() - start_s < 5.0
+
+
+def test_json_is_bounded_by_its_objects(tmp_path, monkeypatch):
+    (tmp_path / "a.json").write_text(f"[{'{},' * 10_000}{{}}]")  # 30 kB, which take 800 kB
+    monkeypatch.setenv("TORCHCOVER_MAX_FILE_GB", "0.0005")
+    with pytest.raises(BadFileError, match=r"reading it takes 0\.00\d+ GB .* more than the 0\.0005 GB"):
+        read_json_table(tmp_path / "a.json")

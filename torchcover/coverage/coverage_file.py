@@ -25,7 +25,7 @@ from torchcover.coverage.redundancy import Redundancy, redundancy_quantities
 from torchcover.coverage.region_sums import PlaceNumbers, PlaceSums
 from torchcover.coverage.regions import Region
 from torchcover.estimation import Quantity
-from torchcover.files import TooLargeError, check_kind, check_memory, read_npz, reads, write_npz
+from torchcover.files import TooLargeError, check_kind, check_memory, parse_json, read_npz, reads, write_npz
 from torchcover.metrics.blocks import FINER
 
 if TYPE_CHECKING:
@@ -87,7 +87,7 @@ def read_coverage(path: Path) -> dict[str, Any]:
     """Read what `write_coverage` wrote: the arguments of `Coverage`."""
     try:
         arrays = read_npz(path, partial(check_kind, "fiuU"))  # numbers, and one text: the header
-        header: dict[str, Any] = json.loads(str(arrays.pop("header")))
+        header: dict[str, Any] = parse_json(str(arrays.pop("header")))
         version = header.pop("format")
         parts = _parts(header, arrays) if version == FORMAT_VERSION else None
     except (TooLargeError, MemoryError):

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchcover.evaluation.observers import CoverageObserver, Stateful
-from torchcover.files import check_kind, check_memory, read_npz, reads, write_atomically
+from torchcover.files import check_kind, check_memory, parse_json, read_npz, reads, write_atomically
 
 EVERY_S = 60.0
 # Writing takes at most this share of the time, though it may take seconds.
@@ -174,7 +174,7 @@ def read_header(path: Path) -> dict[str, Any]:
     FileNotFoundError: no such file. BadFileError: not a checkpoint, a damaged one, or one of another version.
     """
     text = str(_read(path, HEADER))
-    header: dict[str, Any] = json.loads(text)
+    header: dict[str, Any] = parse_json(text)
     if header.get("format") != FORMAT_VERSION:
         raise ValueError(f"checkpoint format {header.get('format')}; this torchcover reads format {FORMAT_VERSION}")
     with zipfile.ZipFile(path) as archive:
@@ -192,7 +192,9 @@ def read_state(path: Path, header: Mapping[str, Any], name: str) -> dict[str, An
 
     BadFileError: it is damaged, or takes more memory than `TORCHCOVER_MAX_FILE_GB` allows.
     """
-    state: dict[str, Any] = _unpacked(header["states"][name], path)
+    node = header["states"][name]
+    check_memory(_count_bytes(node))
+    state: dict[str, Any] = _unpacked(node, path)
     return state
 
 
@@ -255,12 +257,25 @@ def _unpacked(node: Any, path: Path) -> Any:  # noqa: ANN401  (a tree)
     return torch.from_numpy(_array(content, path))
 
 
-def _array(content: Mapping[str, Any], path: Path) -> Array:
-    dtype, shape, name = np.dtype(content["dtype"]), tuple(content["shape"]), content["name"]
+def _count_bytes(node: Any) -> int:  # noqa: ANN401
+    """Return the size of all tensors of a state together, as the header claims it; the same array may be listed often.
+
+    Raises:
+        ValueError: A tensor of another type, or with a negative size.
+    """
+    if not isinstance(node, dict):
+        return 0
+    ((kind, content),) = node.items()
+    if kind != "tensor":
+        return sum(map(_count_bytes, content.values() if kind == "dict" else content))
+    dtype, shape = np.dtype(content["dtype"]), tuple(content["shape"])
     if dtype.kind not in KINDS or min(shape, default=0) < 0:
         raise ValueError(f"an array of {dtype} and the shape {shape}")
-    check_memory(math.prod(shape) * dtype.itemsize)
-    array: Array = _read(path, name).view(dtype).reshape(shape)
+    return math.prod(shape) * dtype.itemsize
+
+
+def _array(content: Mapping[str, Any], path: Path) -> Array:
+    array: Array = _read(path, content["name"]).view(content["dtype"]).reshape(content["shape"])
     return array
 
 

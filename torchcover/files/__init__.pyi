@@ -36,6 +36,7 @@ from .tables import NpyHeader as NpyHeader
 from .tables import check_kind as check_kind
 from .tables import csv_text as csv_text
 from .tables import npz_headers as npz_headers
+from .tables import parse_json as parse_json
 from .tables import read_csv as read_csv
 from .tables import read_json_table as read_json_table
 from .tables import read_npy as read_npy

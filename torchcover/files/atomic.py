@@ -84,7 +84,7 @@ def list_written(start_s: float) -> list[Path]:
 SUMMARY = "summary.json"  # of a result
 RECORDING = "recording.json"
 WRITING = "writing"  # key of a manifest while its files are written
-MAX_MANIFEST_BYTES = 100_000_000  # larger files are not manifests; a million files of a recording take 60 MB
+MAX_MANIFEST_BYTES = 70_000_000  # larger files are not manifests; a million files take 60 MB, and 2 GB as empty lists
 MAX_NAME_BYTES = 255  # of a listed path; what file systems allow for a name
 FOLDER_DEPTH = 3  # files are listed at most this deep
 
@@ -92,8 +92,8 @@ FOLDER_DEPTH = 3  # files are listed at most this deep
 def read_manifest(path: Path) -> dict[str, Any] | None:
     """Read a manifest: `files` by name, each with `bytes` and `sha256`, and its record.
 
-    Returns None where there is none: no regular file, or another content. Entries that lead out of the folder are
-    dropped.
+    Returns None where there is none: no regular file, or another content. Entries of hidden files, and of files outside
+    of the folder, are dropped.
     """
     try:
         status = path.lstat()
@@ -117,18 +117,19 @@ def _parse_manifest(path: Path, *_: int) -> dict[str, Any] | None:
 
 def _is_entry(name: str, entry: object) -> bool:
     is_short = len(os.fsencode(name)) <= MAX_NAME_BYTES
-    is_within = is_short and "\0" not in name and {"", ".", ".."}.isdisjoint(name.split("/"))
-    return is_within and isinstance(entry, dict) and isinstance(entry.get("bytes"), int)
+    is_within = is_short and "\0" not in name and all(part[:1] not in ("", ".") for part in name.split("/"))
+    is_whole = isinstance(entry, dict) and isinstance(entry.get("bytes"), int) and isinstance(entry.get("sha256"), str)
+    return is_within and is_whole
 
 
 def matches_entry(path: Path, entry: Mapping[str, Any]) -> bool:
-    """Return whether a path is a regular file with the listed size and, where one is listed, SHA-256."""
+    """Return whether a path is a regular file with the listed size and SHA-256."""
     try:
         status = path.lstat()
         if not stat.S_ISREG(status.st_mode) or status.st_size != entry["bytes"]:
             return False
         with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW), "rb") as file:
-            return entry.get("sha256") in (None, hashlib.file_digest(file, "sha256").hexdigest())
+            return hashlib.file_digest(file, "sha256").hexdigest() == str(entry["sha256"])
     except OSError:
         return False
 

@@ -20,8 +20,7 @@ Door = Callable[Concatenate[str | os.PathLike[str], Arguments], Content]
 common_link_roots: list[Path] = []  # folders that links in any recording may lead to
 _link_roots: dict[Path, list[Path]] = {}  # folders that links in each recording may lead to
 
-# Libraries quote what they choke on, which may be the whole file.
-MAX_REASON_CHARS = 500
+MAX_REASON_CHARS = 500  # libraries may quote the whole file
 VARIABLE = "TORCHCOVER_MAX_FILE_GB"
 # A scan takes megabytes; a saved result with eight thresholds in the command line's grid, which is much, twice a
 # thousand of them.

@@ -13,14 +13,11 @@ from yaml.nodes import MappingNode, Node, ScalarNode
 
 from torchcover.files.bad_file import check_memory, decode
 
-# Far above what people write, and read in seconds.
-MAX_CHARACTERS = 1_000_000
+MAX_CHARACTERS = 1_000_000  # far above what people write, and read in seconds
 # Keys, values and lists, each alias counted as what it stands for: anchors of anchors double with every line.
 MAX_NODES = 200_000
-# Lists and mappings within each other; Python's own limit is near 300 of them.
-MAX_DEPTH = 64
-# Of what arrived, in a message.
-MAX_QUOTED = 60
+MAX_DEPTH = 64  # of lists and mappings within each other; Python's own limit is near 300
+MAX_QUOTED = 60  # characters of what arrived, in a message
 
 TAG = "tag:yaml.org,2002:"
 # As YAML 1.2 and JSON write them. YAML 1.1 would read 0100 as 64, 1:40 as 100, and 1e-3 and `on` as what they are not.
@@ -197,8 +194,7 @@ def _quoted(value: Any) -> str:  # noqa: ANN401
     return repr(text if len(text) <= MAX_QUOTED else f"{text[:MAX_QUOTED]}...")
 
 
-# A tree of elements takes about so many times the bytes of its text.
-TREE_PER_BYTE = 20
+TREE_PER_BYTE = 20  # memory of a tree of elements for each byte of its text
 
 
 def parse_xml(path: Path) -> ElementTree.Element:

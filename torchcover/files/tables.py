@@ -7,6 +7,7 @@ import math
 import re
 import warnings
 import zipfile
+from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
@@ -20,11 +21,9 @@ from torchcover.files.bad_file import check_memory, decode, reads
 
 # Of terminals: control characters, and marks that turn the direction of what follows. Lines and tabs may stay.
 CONTROLS = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
-# What makes a formula of a cell in spreadsheets.
-FORMULA = re.compile(r"[=+\-@\t\r]")
+FORMULA = re.compile(r"[=+\-@\t\r]")  # at the start of a cell of a spreadsheet
 NUMBER = re.compile(r"[+-]?(\d+(\.\d*)?(e[+-]?\d+)?|inf)", re.IGNORECASE)
-# What makes text of it again.
-QUOTE = "'"
+QUOTE = "'"  # in front of a formula, makes text of it
 
 
 def shown(text: str) -> str:
@@ -56,8 +55,7 @@ def _is_formula(text: str) -> bool:
     return FORMULA.match(text.lstrip(QUOTE)) is not None and NUMBER.fullmatch(text) is None
 
 
-# Of a word of a row, once it is an object of Python, for each byte of the file.
-BYTES_PER_BYTE = 20
+BYTES_PER_BYTE = 20  # of the words of a row, as objects of Python, for each byte of the file
 
 
 class CsvTable(NamedTuple):
@@ -117,7 +115,7 @@ def _check_names(names: Sequence[str], needed: Sequence[str], optional: Sequence
         names, optional = [name for name in names if name in needed], ()
     missing = [name for name in needed if name not in names]
     unknown = [name for name in names if name not in (*needed, *optional)]
-    doubled = sorted({name for name in names if names.count(name) > 1})
+    doubled = sorted(name for name, count in Counter(names).items() if count > 1)
     for what, which in (("missing", missing), ("unknown", unknown), ("there twice", doubled)):
         if which:
             raise ValueError(f"the first line has to name the columns {', '.join(needed)}; {what}: {', '.join(which)}")
@@ -139,8 +137,8 @@ def _is_finite(word: str) -> bool:
         return False
 
 
-# Python's objects take about so many times the bytes of their text.
-OBJECTS_PER_BYTE = 8
+# Bytes of the object of Python that begins at each mark of JSON; a character takes up to 4.
+JSON_OBJECT_BYTES = {"{": 240, "[": 96, ",": 64, ":": 64}
 
 
 class JsonTable(NamedTuple):
@@ -157,18 +155,23 @@ class JsonTable(NamedTuple):
         return self.by_token[token]
 
 
+def parse_json(text: str) -> Any:  # noqa: ANN401  (JSON knows no types)
+    """Parse JSON whose objects fit into the memory of a file. ValueError: not JSON, or too large."""
+    check_memory(4 * len(text) + sum(size * text.count(mark) for mark, size in JSON_OBJECT_BYTES.items()))
+    return json.loads(text)
+
+
 @reads("a table of rows")
 def read_json_table(path: Path) -> JsonTable:
     """Read a JSON list of objects. BadFileError: another content."""
-    check_memory(OBJECTS_PER_BYTE * path.stat().st_size)
-    rows = json.loads(decode(path.read_bytes()))
+    check_memory(path.stat().st_size)
+    rows = parse_json(decode(path.read_bytes()))
     if not isinstance(rows, list) or not all(isinstance(row, dict) for row in rows):
         raise ValueError(f"a list of objects is needed; got {type(rows).__name__}")
     return JsonTable(path, rows, {row["token"]: row for row in rows if "token" in row})
 
 
-# Deflate spends at least 2 bits on 258 bytes.
-DEFLATE_MAX_RATIO = 1032
+DEFLATE_MAX_RATIO = 1032  # Deflate spends at least 2 bits on 258 bytes
 # How often its compressed size a member can have.
 MAX_RATIOS = {zipfile.ZIP_STORED: 1, zipfile.ZIP_DEFLATED: DEFLATE_MAX_RATIO}
 _HEADER_READERS = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}

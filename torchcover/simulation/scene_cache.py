@@ -19,7 +19,7 @@ import shapely
 from numpy.typing import NDArray
 
 from torchcover import __version__
-from torchcover.files import BadFileError, check_kind, read_npz, reads, said_gb
+from torchcover.files import BadFileError, check_kind, parse_json, read_npz, reads, said_gb
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation.builtin import builtin_names
 from torchcover.simulation.documents import builtin_hashes
@@ -171,7 +171,7 @@ def read_scene(path: Path, bodies: Mapping[str, Mesh]) -> World:
     arrays, meshes = read_npz(path, partial(check_kind, "biuf")), dict[str, Mesh]()
     for array in arrays.values():
         array.flags.writeable = False
-    key, scene = json.loads(arrays["scene"].tobytes())
+    key, scene = parse_json(arrays["scene"].tobytes().decode())
     if key != path.stem:
         raise ValueError("it holds another scene")
 
