@@ -54,3 +54,13 @@ def test_another_suffix_and_several_processes_are_refused(tmp_path):
     log = RerunLog(tmp_path / "run.rrd")
     with pytest.raises(ValueError, match="without torchrun"):
         log.merge_state(log)
+
+
+def test_it_does_not_write_through_links(tmp_path):
+    (tmp_path / "mine").write_text("mine")
+    (tmp_path / ".unfinished_run.rrd").symlink_to(tmp_path / "mine")
+    RerunLog(tmp_path / "run.rrd").update(Frame({"a": torch.zeros(1, 3)}, torch.zeros(1, 3), 0, "f"))
+    (tmp_path / "run.rrd").symlink_to(tmp_path / "mine")
+    with pytest.raises(ValueError, match=r"run\.rrd: a symbolic link; nothing is written through links"):
+        RerunLog(tmp_path / "run.rrd")
+    assert (tmp_path / "mine").read_text() == "mine"

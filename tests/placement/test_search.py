@@ -232,6 +232,24 @@ def test_a_damaged_journal_is_one_line(tmp_path):
         assert "\n" not in str(error.value)
 
 
+def test_a_journal_is_neither_written_through_links_nor_waits_for_locks(tmp_path):
+    out = tmp_path / "out"
+    (tmp_path / "out").mkdir()
+    (out / f"{JOURNAL}.lock").symlink_to("nothing")  # a killed process leaves one; Optuna would wait for its end
+    searched(out, evaluations=2)
+    (out / JOURNAL).rename(tmp_path / "mine")
+    with (tmp_path / "mine").open("a") as file:
+        file.write("a line that was not finished")
+    before = (tmp_path / "mine").read_bytes()
+    (out / JOURNAL).symlink_to(tmp_path / "mine")
+    with pytest.raises(ValueError, match=rf"{JOURNAL}: a symbolic link; nothing is written through links"):
+        searched(out, evaluations=3, resume=True)
+    (out / JOURNAL).unlink()
+    (out / JOURNAL).hardlink_to(tmp_path / "mine")
+    assert len(searched(out, evaluations=3, resume=True).search.evaluations) == 4
+    assert (tmp_path / "mine").read_bytes() == before
+
+
 def test_a_search_without_optuna_names_the_extra(monkeypatch):
     monkeypatch.setitem(sys.modules, "optuna", None)
     with pytest.raises(ImportError, match=r"needs Optuna: pip install 'torchcover\[search\]'"):

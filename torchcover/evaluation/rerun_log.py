@@ -2,7 +2,10 @@
 
 from collections.abc import Mapping
 from pathlib import Path
+from shutil import rmtree
+from tempfile import mkdtemp
 from typing import TYPE_CHECKING, Any
+from weakref import finalize
 
 import numpy as np
 from matplotlib import colormaps
@@ -12,7 +15,8 @@ from torch import Tensor
 from torchcover.coverage import BevGrid
 from torchcover.coverage.quantity import RADIUS, by_area
 from torchcover.detection import Boxes
-from torchcover.files import write_atomically
+from torchcover.files import refuse_links, write_atomically
+from torchcover.files.atomic import TEMPORARY
 from torchcover.frames import Frame
 from torchcover.neighbors import blind_spot_radius
 from torchcover.report import ColourScale, SensorView, scale_of
@@ -43,8 +47,11 @@ class RerunLog:
             import rerun as rr
         except ImportError as error:
             raise ImportError(f"{path}: rerun-sdk is needed: pip install 'torchcover[rerun]'") from error
+        refuse_links(self._path)
         self._path.parent.mkdir(parents=True, exist_ok=True)
-        self._unfinished = self._path.with_name(f".unfinished_{self._path.name}")
+        folder = Path(mkdtemp(prefix=TEMPORARY, dir=self._path.parent))
+        self._unfinished = folder / self._path.name
+        self._clean_up = finalize(self, rmtree, folder, ignore_errors=True)
         self._stream: Any = rr.RecordingStream("torchcover")  # optional, so its types are not known
         self._stream.save(self._unfinished)
         self._stream.log("", rr.ViewCoordinates.FLU, static=True)
@@ -97,6 +104,7 @@ class RerunLog:
                 self._stream.log([rig, "radius", name], _cells(values, grid, scale), static=True)
         self._stream.disconnect()
         write_atomically(self._path, self._unfinished.replace)
+        self._clean_up()
 
 
 def frustum(view: SensorView) -> list[NDArray[np.float64]]:

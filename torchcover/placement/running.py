@@ -13,7 +13,7 @@ import torch
 
 from torchcover.evaluation.checkpoint import differences
 from torchcover.evaluation.progress import Progress, held_back
-from torchcover.files import BadFileError, check_memory, lock_folder, reads
+from torchcover.files import BadFileError, check_memory, lock_folder, reads, write_atomically
 from torchcover.placement.plan import distributions_of, import_optuna, run_quietly
 from torchcover.placement.result import Finalist, SearchResult
 from torchcover.placement.search import RANDOM, START, Evaluation, PlacementSearch
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 JOURNAL = "search.journal"
 STUDY = "placement"
+JOURNAL_BYTES_PER_BYTE = 30  # memory of JSON objects that are as small as possible
 
 Clock = Callable[[], float]
 
@@ -261,21 +262,35 @@ class SearchJournal:
         return trial
 
 
+class _FolderLock:
+    """A lock that does nothing, since the folder is locked; that of Optuna waits for processes that were killed."""
+
+    def acquire(self) -> bool:
+        return True
+
+    def release(self) -> None:
+        pass
+
+
 def _storage(path: Path) -> Any:  # noqa: ANN401  (a storage of Optuna)
     journal = import_optuna().storages.journal
-    return import_optuna().storages.JournalStorage(journal.JournalFileBackend(str(path)))
+    return import_optuna().storages.JournalStorage(journal.JournalFileBackend(str(path), lock_obj=_FolderLock()))
 
 
 def drop_torn_line(path: Path) -> None:
-    """Cut off what a process was writing when it was ended: a last line without a line break."""
-    with path.open("r+b") as file:
-        file.truncate(file.read().rfind(b"\n") + 1)
+    """Replace a journal by one without a last line that has no line break, whose process was killed.
+
+    Raises:
+        ValueError: The path is a symbolic link.
+    """
+    data = path.read_bytes()
+    write_atomically(path, lambda new: new.write_bytes(data[: data.rfind(b"\n") + 1]))
 
 
 @reads("the journal of a placement search")
 def load_study(path: Path) -> tuple[Any, list[Evaluation], dict[str, str]]:
     """Return the study in a journal, its evaluations and its settings. Only JSON is read; no code is executed."""
-    check_memory(4 * path.stat().st_size)
+    check_memory(JOURNAL_BYTES_PER_BYTE * path.stat().st_size)
     optuna = import_optuna()
     study = run_quietly(optuna, lambda: optuna.load_study(storage=_storage(path), study_name=STUDY))
     settings = study.user_attrs["settings"]
