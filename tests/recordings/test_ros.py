@@ -635,10 +635,34 @@ def test_messages_are_bounded_by_what_they_become(tmp_path, monkeypatch):
         recording.scan("lidar", 0)
 
 
-def test_pipes_are_no_bags(tmp_path):
-    os.mkfifo(tmp_path / "a.bag")
+@pytest.mark.parametrize("storage", ["ros1", "mcap", "sqlite3"])
+def test_pipes_and_links_out_of_the_folder_are_no_bags(tmp_path, storage):
+    if storage == "ros1":
+        (tmp_path / "a").mkdir()
+        bags.bag1(tmp_path / "a" / "a.bag", MOUNTED + clouds())
+    else:
+        bag(tmp_path / "a", MOUNTED + clouds(), storage)
+    (file,) = (tmp_path / "a").glob("a.*")
+    file.rename(tmp_path / file.name)
+    file.symlink_to(tmp_path / file.name)
+    with pytest.raises(BadFileError, match=rf"{file.name}: a link to .*, outside of the recording"):
+        open_recording(tmp_path / "a")
+    assert open_recording(tmp_path / "a", link_roots=[tmp_path]).sensors == ("lidar",)
+    file.unlink()
+    os.mkfifo(file)
     with pytest.raises(BadFileError, match="a pipe, a socket or a device; a bag has to be a regular file"):
-        RosBag(tmp_path / "a.bag")
+        RosBag(tmp_path / "a")
+
+
+@pytest.mark.parametrize("name", ["..%2Fa.db3", "a#.db3", "a?vfs=unix-dotfile&.db3"])
+def test_names_of_databases_are_no_addresses(tmp_path, name):
+    """SQLite would open another file, or create one beside it."""
+    path = bag(tmp_path / "a", MOUNTED + clouds(), "sqlite3")
+    (path / "a.db3").rename(tmp_path / "a.db3")
+    (path / name).write_bytes(b"none")
+    (path / "metadata.yaml").write_text((path / "metadata.yaml").read_text().replace("- a.db3", f"- '{name}'"))
+    with pytest.raises(BadFileError, match="for parts of an address; rename the file"):
+        RosBag(path)
 
 
 def test_an_index_that_lies_is_found_out(tmp_path):

@@ -200,10 +200,20 @@ def test_text_in_latin_1_is_read_as_it_is_in_utf_8(tmp_path):
         np.testing.assert_array_equal(mesh.vertices_m[mesh.faces[0]], [[0, 0, 0], [1, 0, 0], [0, 1, 0]])
 
 
-def test_a_package_that_is_missing_is_no_damage(tmp_path):
-    (tmp_path / "a.step").write_text("ISO-10303-21;")
-    with pytest.raises(ImportError, match=r"a\.step: \.step needs cascadio: pip install cascadio"):
-        MeshFile(type="mesh", path=tmp_path / "a.step").mesh()
+@pytest.mark.parametrize(
+    ("name", "content", "error", "told"),
+    [
+        ("a.step", "ISO-10303-21;", ImportError, r"\.step needs cascadio: pip install cascadio"),
+        ("a.gltf", "KHR_draco_mesh_compression", ImportError, r"\.gltf needs DracoPy: pip install DracoPy"),
+        ("a.gltf", "EXT_meshopt_compression", BadFileError, "compressed by EXT_meshopt_compression; export it without"),
+    ],
+)
+def test_a_package_that_is_missing_is_no_damage(tmp_path, name, content, error, told):
+    """trimesh would read compressed glTF as points that all are at the origin."""
+    text = f'{{"asset": {{}}, "extensionsRequired": ["{content}"]}}' if name == "a.gltf" else content
+    (tmp_path / name).write_text(text)
+    with pytest.raises(error, match=rf"{name}: .*{told}"):
+        MeshFile(type="mesh", path=tmp_path / name).mesh()
 
 
 @pytest.mark.parametrize(("stated", "side_m"), [("", 2.0), ("<unit name='centimeter' meter='0.01'/>", 0.02)])

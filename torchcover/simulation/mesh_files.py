@@ -7,6 +7,7 @@ import re
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
+from importlib import import_module
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any, cast
@@ -134,6 +135,8 @@ OBJ_POLYGON = re.compile(rb"^[ \t]*f(?:(?:[ \t]+[^\s#]+){4}|[^\n#]*[\s/]-)", re.
 OBJ_BACKWARDS = re.compile(rb"^[ \t]*f[^\n#]*[\s/]-", re.MULTILINE)
 OBJ_TEXTURE = re.compile(rb"/\S*")
 
+# Compressed glTF whose uncompressed accessors are placeholders; trimesh would go on with these.
+COMPRESSED_GLTF = re.compile(rb'"extensionsRequired"\s*:\s*\[[^\]]*"(KHR_draco_mesh|(?:EXT|KHR)_meshopt)_compression"')
 # How to install modules that are called otherwise than their packages.
 PACKAGES = {"collada": "'torchcover[urdf]'", "openctm": "python-openctm"}
 
@@ -188,6 +191,10 @@ def _read_parts(path: Path) -> Iterator[tuple[NDArray[np.float64], NDArray[np.in
     data = path.read_bytes()
     if kind == "obj":
         data = _obj_with_triangles(data)
+    if (compressed := COMPRESSED_GLTF.search(data)) and kind in ("glb", "gltf"):
+        if b"draco" not in compressed[1]:
+            raise ValueError(f"it is compressed by {compressed[1].decode()}_compression; export it without")
+        import_module("DracoPy")
     unit_m = _read_unit_m(data) if kind == "dae" else 1.0
     scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, process=False, resolver=_parts_of(path))
     for mesh in scene.dump():

@@ -5,6 +5,7 @@ import os
 import re
 import subprocess
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -137,6 +138,15 @@ def test_losses_of_open_drive_are_reported(old, new, told, tmp_path):
         from_opendrive(tmp_path / "road.xodr", tmp_path, leave_out_links=False)
 
 
+def test_projections_of_open_drive_name_no_files(tmp_path):
+    """PROJ would wait for a pipe without end."""
+    reference = "<geoReference><![CDATA[{}]]></geoReference></header>"
+    for words, told in (("+proj=utm +geoidgrids=/a/pipe", "'.*/a/pipe' names a file"), ("+proj=utm +zone=32", None)):
+        (tmp_path / "road.xodr").write_text(XODR.replace('"4"/>', f'"4">{reference.format(words)}', 1))
+        with nullcontext() if told is None else pytest.raises(BadFileError, match=f"the projection {told}; remove"):
+            from_opendrive(tmp_path / "road.xodr", tmp_path, leave_out_links=False)
+
+
 def test_links_of_open_drive_that_lead_nowhere_are_named_and_may_be_left_out(tmp_path):
     link = '<link><predecessor elementType="road" elementId="7" contactPoint="end"/></link>'
     nowhere = '<junction id="8" type="direct"><connection id="0" incomingRoad="1" linkedRoad="1"/></junction>'
@@ -220,6 +230,8 @@ def road(tmp_path_factory):
         ),
         ("net", '<tlLogic id="0" type="swarm" programID="p"/>', "<tlLogic> of type 'swarm' is not read"),
         ("net", '<include href="{out}"/>', "<include> is not read"),
+        ("net", '<location projParameter="+proj=utm +nadgrids=/a/pipe"/>', "/a/pipe' names a file; remove"),
+        ("net", '<location projParameter="+proj=utm +nadgrids=http://a/x"/>', "http://a/x' names a file; remove"),
     ],
 )
 def test_scenarios_name_no_outputs_and_no_addresses(road, tmp_path, where, added, told):

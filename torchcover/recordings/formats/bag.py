@@ -54,8 +54,9 @@ class Bag:
             check_metadata(path / METADATA)
         elif not files:
             check_suffix(path)
-        for database in path.glob(f"*{SUFFIXES['sqlite3']}") if path.is_dir() else [path]:
-            check_journal(database)
+        within = [file for suffix in SUFFIXES.values() for file in path.glob(f"*{suffix}")] if path.is_dir() else [path]
+        for file in files or within:
+            check_storage(file)
         with naming(path, "a bag"):
             index = read_bag_index(path)
         topics, types = index["topics"].tolist(), index["types"].tolist()
@@ -138,8 +139,13 @@ def check_suffix(path: Path) -> None:
 
 
 @reads("a bag")
-def check_journal(path: Path) -> None:
-    """Refuse a database with changes in a file beside it, where its recorder was killed or still runs."""
+def check_storage(path: Path) -> None:
+    """Refuse a file of a bag that is no regular one, or a database that SQLite would not read by its name alone.
+
+    A database may have changes in a file beside it, where its recorder was killed or still runs.
+    """
+    if path.suffix == SUFFIXES["sqlite3"] and not set("%?#").isdisjoint(str(path.absolute())):
+        raise ValueError("SQLite takes %, ? and # in a path for parts of an address; rename the file, or its folder")
     for ending in ("-wal", "-journal"):
         journal = path.with_name(path.name + ending)
         if journal.exists() and journal.stat().st_size:
@@ -170,7 +176,7 @@ def check_metadata(path: Path) -> None:
     for name in names:
         if Path(name).name != name or Path(name).suffix != suffix:
             raise ValueError(f"names of {suffix} files beside it are needed; got {name!r}")
-        if not (path.parent / name).is_file():
+        if not (path.parent / name).exists():
             raise FileNotFoundError(f"{path.parent / name}: no such file; {path} names it")
 
 

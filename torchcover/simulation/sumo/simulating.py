@@ -47,6 +47,8 @@ PARAMETERS = re.compile(
     r"|(?:junctionModel|laneChangeModel|carFollowModel|parking)\.[^:/]+"
 )
 OUTPUT = re.compile(r"(?<!pro)file|output|href|^dest$|\bport$", re.IGNORECASE)
+# A projection with a grid or a file by its path: PROJ would open it, also a pipe, which never ends.
+PATH_OF_PROJECTION = re.compile(r"=\s*\S*[/\\]")
 # Attributes that change no movement: pictures for SUMO's own windows, and files of emission models.
 LEFT_OUT = frozenset({"imgFile", "osgFile", "emissionClass"})
 
@@ -100,9 +102,15 @@ def _check_element(kind: str, name: str, attributes: Sequence[tuple[str, str]], 
                 f"the parameter {key[:80]!r} of <{parent}> is not read, for it could make SUMO write files or open "
                 "connections; remove it"
             )
+    _check_projection(given.get("projParameter", ""))
     for key in given:
         if key not in LEFT_OUT and OUTPUT.search(key):
             raise ValueError(f"the attribute {key[:80]!r} of <{name}> names a file or an address; remove it")
+
+
+def _check_projection(parameters: str) -> None:
+    if PATH_OF_PROJECTION.search(parameters):
+        raise ValueError(f"the projection {parameters.strip()[:80]!r} names a file; remove this parameter")
 
 
 # Of the simulation; bodies move straight on in between.
@@ -244,6 +252,8 @@ def from_opendrive(path: Path, folder: Path, *, leave_out_links: bool) -> Path:
     if root.tag != "OpenDRIVE":
         raise ValueError(f"an OpenDRIVE file begins with <OpenDRIVE>; got <{root.tag}>")
     _check_losses(root)
+    for reference in root.iter("geoReference"):
+        _check_projection(reference.text or "")
     network, lost = folder / "converted.net.xml", list(_lost_links(root))
     if lost and leave_out_links:
         for parent, link, _ in lost:
