@@ -62,10 +62,12 @@ def test_a_run_with_closed_streams_writes_its_results_and_nothing_into_them(worl
     assert b"\x1b" not in (worlds / "out" / "summary.csv").read_bytes()
 
 
-def test_a_reader_that_is_gone_ends_it_with_141_without_a_word():
+@pytest.mark.parametrize("arguments", ["list", "targets front_roof_32 --raster 3,5,-1,1,1 --files numbers"])
+def test_a_reader_that_is_gone_ends_it_with_141_without_a_word(arguments, tmp_path):
     reader, writer = os.pipe()
     os.close(reader)
-    done = subprocess.run([*PROGRAM, "list"], check=False, stdout=writer, stderr=subprocess.PIPE, text=True)
+    command = [*PROGRAM, *arguments.split()]
+    done = subprocess.run(command, check=False, stdout=writer, stderr=subprocess.PIPE, text=True, cwd=tmp_path)
     os.close(writer)
     assert (done.returncode, done.stderr) == (128 + signal.SIGPIPE, "")
 

@@ -1,6 +1,8 @@
 """Renderers: a table as text for a terminal and as Markdown; `RENDERERS` has all formats by name."""
 
+import errno
 import io
+import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -37,6 +39,10 @@ class Terminal(Console):
         """What is to be printed: our own control codes, such as a cursor's, are segments of their own."""
         for segment in super().render(renderable, options):
             yield segment if segment.control else segment._replace(text=shown(segment.text))
+
+    def on_broken_pipe(self) -> None:
+        """Raise BrokenPipeError, of which the program makes an exit code; rich would exit with 1."""
+        raise BrokenPipeError(errno.EPIPE, os.strerror(errno.EPIPE))
 
 
 def render_text(table: CoverageTable) -> str:
