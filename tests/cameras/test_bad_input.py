@@ -75,6 +75,7 @@ def test_pixels_that_are_none():
     [
         (np.eye(4), r"shape \(3, 3\); got \(4, 4\)"),
         ([[1.0, 0.1, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], "no skew"),
+        (np.zeros((3, 3)).tolist(), "never calibrated; calibrate it first"),
         ([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 2.0]], "0, 0, 1"),
     ],
 )

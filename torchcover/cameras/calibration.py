@@ -115,6 +115,8 @@ def split_matrix(matrix: ArrayLike, name: str) -> tuple[float, float, float, flo
     K = np.asarray(matrix, dtype=np.float64)
     if K.shape != (3, 3):
         raise ValueError(f"{name}: a camera matrix has shape (3, 3); got {K.shape}")
+    if not K.any():
+        raise ValueError(f"{name}: the camera matrix is zero, so the camera was never calibrated; calibrate it first")
     if not np.array_equal(K[2], [0.0, 0.0, 1.0]) or K[0, 1] != 0.0 or K[1, 0] != 0.0:
         raise ValueError(f"{name}: a camera matrix is [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], no skew; got {K.tolist()}")
     return float(K[0, 0]), float(K[1, 1]), float(K[0, 2]), float(K[1, 2])

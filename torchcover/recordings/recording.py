@@ -67,7 +67,7 @@ def check_times(times_s: NDArray[np.float64], count: int, source: str) -> NDArra
         first = int(bad[0])
         raise ValueError(
             f"{source}: times have to ascend; {len(bad)} do not, the first after instant {first}: "
-            f"{times_s[first]:.6f} s, then {times_s[first + 1]:.6f} s"
+            f"{times_s[first]:.6f} s, then {times_s[first + 1]:.6f} s; leave such instants out, or correct their times"
         )
     check_seconds(times_s, f"{source}: ")
     return times_s

@@ -192,7 +192,7 @@ def read_las(path: Path) -> NDArray[np.float64]:
             _check_chunks(file, header, size_bytes)
     scale, offset_m = header.scale * meters, header.offset * meters
     if header.compressed:
-        return np.asarray(laz_points(path, header.points)["xyz"] * scale + offset_m)
+        return _to_meters(laz_points(path, header.points)["xyz"], scale, offset_m)
     claimed_bytes = header.points * header.record_bytes
     if header.first_byte + claimed_bytes > size_bytes:
         raise ValueError(
@@ -201,7 +201,22 @@ def read_las(path: Path) -> NDArray[np.float64]:
         )
     columns = np.dtype({"names": ["xyz"], "formats": [("<i4", 3)], "offsets": [0], "itemsize": header.record_bytes})
     points = np.fromfile(path, columns, header.points, offset=header.first_byte)
-    return np.asarray(points["xyz"] * scale + offset_m)
+    return _to_meters(points["xyz"], scale, offset_m)
+
+
+def _to_meters(
+    stored: NDArray[np.int32], scale: NDArray[np.float64], offset_m: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Convert (N, 3) stored whole numbers; ValueError if a program cut off coordinates that do not fit into them."""
+    bounds = np.iinfo(np.int32)
+    cut_off = int(((stored == bounds.min) | (stored == bounds.max)).any(axis=1).sum())
+    if cut_off:
+        raise ValueError(
+            f"{cut_off:,} of {len(stored):,} points have coordinates at an end of 32-bit whole numbers "
+            f"({bounds.min} or {bounds.max}): the program that wrote the file cut them off; export it again with "
+            "offsets near the points"
+        )
+    return np.asarray(stored * scale + offset_m)
 
 
 def _header(data: bytes, size_bytes: int) -> _Header:

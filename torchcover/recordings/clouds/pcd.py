@@ -78,9 +78,12 @@ def _parse_header(data: bytes) -> tuple[_Header, bytes]:
         points=_whole(entries["POINTS"][0], "POINTS"),
         encoding=" ".join(entries["DATA"]),
     )
-    lengths = {len(header.fields), len(header.sizes), len(header.types), len(header.counts)}
-    if len(lengths) > 1:
-        raise ValueError("FIELDS, SIZE, TYPE and COUNT of the PCD header differ in length")
+    lengths = [len(entries) for entries in (header.fields, header.sizes, header.types, header.counts)]
+    if len(set(lengths)) > 1:
+        raise ValueError(
+            f"FIELDS, SIZE, TYPE and COUNT of the PCD header differ in length; got {', '.join(map(str, lengths))}; "
+            "give each field one entry in each line"
+        )
     if header.encoding not in ENCODINGS:
         raise ValueError(f"DATA is {header.encoding[:40]!r}; allowed are {', '.join(ENCODINGS)}")
     unknown = set(header.types) - set(TYPES)
