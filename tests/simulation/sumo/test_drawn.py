@@ -138,9 +138,15 @@ def test_losses_of_open_drive_are_reported(old, new, told, tmp_path):
         from_opendrive(tmp_path / "road.xodr", tmp_path, leave_out_links=False)
 
 
-def test_projections_of_open_drive_name_no_files(tmp_path):
+MANY = " ".join(f"a{number}='1'" for number in range(1001))  # attributes, of which SUMO compares each with each
+
+
+def test_projections_of_open_drive_name_no_files_and_attributes_are_few(tmp_path):
     """PROJ would wait for a pipe without end."""
     reference = "<geoReference><![CDATA[{}]]></geoReference></header>"
+    (tmp_path / "road.xodr").write_text(XODR.replace("<road", f"<road {MANY}", 1))
+    with pytest.raises(BadFileError, match="<road> has 1005 attributes; at most 1000 are read"):
+        from_opendrive(tmp_path / "road.xodr", tmp_path, leave_out_links=False)
     for words, told in (("+proj=utm +geoidgrids=/a/pipe", "'.*/a/pipe' names a file"), ("+proj=utm +zone=32", None)):
         (tmp_path / "road.xodr").write_text(XODR.replace('"4"/>', f'"4">{reference.format(words)}', 1))
         with nullcontext() if told is None else pytest.raises(BadFileError, match=f"the projection {told}; remove"):
@@ -216,6 +222,7 @@ def road(tmp_path_factory):
         ),
         ("root", '<include href="{out}"/>', "<include> is not read"),
         ("root", '<calibrator id="c" edge="a" pos="1" output="{out}"/>', "<calibrator> is not read"),
+        ("root", f'<vType id="t" {MANY}/>', "<vType> has 1002 attributes"),
         ("root", '<vType id="t" output="{out}"/>', "'output' of <vType> names a file or an address"),
         ("root", '<x:inductionLoop xmlns:x="a" id="e" file="{out}"/>', "<x:inductionLoop> is not read"),
         ("net", '<inductionLoop id="e" lane="a_0" pos="1" freq="1" file="{out}"/>', "<inductionLoop> is not read"),

@@ -49,6 +49,7 @@ PARAMETERS = re.compile(
 OUTPUT = re.compile(r"(?<!pro)file|output|href|^dest$|\bport$", re.IGNORECASE)
 # A projection with a grid or a file by its path: PROJ would open it, also a pipe, which never ends.
 PATH_OF_PROJECTION = re.compile(r"=\s*\S*[/\\]")
+MAX_ATTRIBUTES = 1000  # of one element; SUMO compares each with each
 # Attributes that change no movement: pictures for SUMO's own windows, and files of emission models.
 LEFT_OUT = frozenset({"imgFile", "osgFile", "emissionClass"})
 
@@ -92,6 +93,7 @@ def _check_element(kind: str, name: str, attributes: Sequence[tuple[str, str]], 
             f"<{name}> is not read: only elements of {'a network' if kind == 'network' else 'traffic demand'} are, "
             "for others can write files or open connections; remove it"
         )
+    _check_count(name, len(attributes))
     given = dict(attributes)
     if name == "tlLogic" and given.get("type", "") not in TRAFFIC_LIGHTS:
         raise ValueError(f"<tlLogic> of type {given['type'][:40]!r} is not read; take another type")
@@ -106,6 +108,11 @@ def _check_element(kind: str, name: str, attributes: Sequence[tuple[str, str]], 
     for key in given:
         if key not in LEFT_OUT and OUTPUT.search(key):
             raise ValueError(f"the attribute {key[:80]!r} of <{name}> names a file or an address; remove it")
+
+
+def _check_count(name: str, attributes: int) -> None:
+    if attributes > MAX_ATTRIBUTES:
+        raise ValueError(f"<{name[:40]}> has {attributes} attributes; at most {MAX_ATTRIBUTES} are read")
 
 
 def _check_projection(parameters: str) -> None:
@@ -252,8 +259,10 @@ def from_opendrive(path: Path, folder: Path, *, leave_out_links: bool) -> Path:
     if root.tag != "OpenDRIVE":
         raise ValueError(f"an OpenDRIVE file begins with <OpenDRIVE>; got <{root.tag}>")
     _check_losses(root)
-    for reference in root.iter("geoReference"):
-        _check_projection(reference.text or "")
+    for element in root.iter():
+        _check_count(element.tag, len(element.attrib))
+        if element.tag == "geoReference":
+            _check_projection(element.text or "")
     network, lost = folder / "converted.net.xml", list(_lost_links(root))
     if lost and leave_out_links:
         for parent, link, _ in lost:
