@@ -271,7 +271,7 @@ def _count_bytes(node: Any) -> int:  # noqa: ANN401
     dtype, shape = np.dtype(content["dtype"]), tuple(content["shape"])
     if dtype.kind not in KINDS or min(shape, default=0) < 0:
         raise ValueError(f"an array of {dtype} and the shape {shape}")
-    return math.prod(shape) * dtype.itemsize
+    return int(math.prod(shape) * dtype.itemsize)
 
 
 def _array(content: Mapping[str, Any], path: Path) -> Array:
