@@ -139,7 +139,7 @@ def test_no_imperfection_lets_a_search_prefer_a_rig(number):
     instants = CommonFrames([WORLD], {"asked": Objective(number=number, region="20m", band="ground")}, rays=1024)
     for chain in ("range noise", "drop-out", "missing returns"):
         rigs = [rig("lidar", "r", **keys) for keys in CHAINS[chain]]
-        found = [float(instants.estimates(one)["area"].value[0]) for one in rigs]
+        found = [float(instants.score(one).estimate.value[0]) for one in rigs]
         found = [-value for value in found] if number == "radius_m" else found
         assert found == sorted(found, reverse=True)
         assert found[-1] < found[0]
