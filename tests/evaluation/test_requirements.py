@@ -277,6 +277,22 @@ def test_numbers_of_regions_are_those_of_evaluate():
     assert found[0].where[0] == "near ground without front"
 
 
+@pytest.mark.parametrize(("more", "is_named"), [({}, True), ({"range_noise_share": 0.02}, False)])
+def test_requirements_of_regions_name_cameras_with_perfect_depth(more, is_named):
+    camera = {"type": "camera", "name": "eye", "mount": {"z_m": 2.0}, "width": 16, "height": 12, "fov_deg": 90.0}
+    found = check(
+        rig({**camera, "max_range_m": 50.0, **more}),
+        asked({**NEAR, "number": "detection_0.4m", "least": 0.5}),
+        "courtyard",
+        steps=1,
+        workers=0,
+    )
+    noted = found.record["notes"], found.tables()[0].notes
+    assert [any("Perfect depth is assumed for cameras of" in note for note in notes) for notes in noted] == 2 * [
+        is_named
+    ]
+
+
 @pytest.fixture
 def box(tmp_path):
     path = tmp_path / "box.yaml"

@@ -26,6 +26,7 @@ from torchcover.evaluation.requirements import (
     Verdict,
     verdicts,
 )
+from torchcover.evaluation.result import perfect_depth_words
 from torchcover.evaluation.settings import DEFAULT_SCENARIO, Settings
 from torchcover.evaluation.target_survey import free_space, in_world
 from torchcover.evaluation.task import AnyRig, AnyScenario, distinct_names, loaded, spread_s, task_of
@@ -78,7 +79,7 @@ class Checked:
     def tables(self) -> list[PageTable]:
         """One for each rig, with what the requirements say about themselves."""
         asked, worlds = self.requirements, ", ".join(map(" ".join, self.settings["worlds"].items()))
-        notes = [*filter(None, [asked.description]), f"Worlds: {worlds}.", NOTE]
+        notes = [*filter(None, [asked.description]), f"Worlds: {worlds}.", *self.settings["notes"], NOTE]
         rows = {rig: [tuple(map(Words, _row(one))) for one in each] for rig, each in self.verdicts.items()}
         return [PageTable(f"{rig}: {asked.name}", HEADINGS, each, notes=notes) for rig, each in rows.items()]
 
@@ -194,6 +195,7 @@ def check(
     worlds = {"region": name or DEFAULT_SCENARIO, "target": name or free, "encounters": free}
     kinds = [kind for kind in worlds if any(hasattr(one, kind) for one in asked.requirements)]
     told = {"worlds": {kind: worlds[kind] for kind in kinds}, "steps": steps, **own}
+    told["notes"] = perfect_depth_words({rig.name: rig.sensors for rig in called}) if "region" in kinds else []
     return Checked(asked, found, {k: str(v) if isinstance(v, Path) else v for k, v in told.items()})
 
 
