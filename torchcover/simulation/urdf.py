@@ -16,7 +16,7 @@ from torchcover.geometry import BoundingBox, rigid, rotation_from_quaternion
 from torchcover.geometry.arrays import Float64
 from torchcover.recordings.other_formats import find_remedy
 from torchcover.simulation.bodies import merge
-from torchcover.simulation.documents import explain
+from torchcover.simulation.documents import FARTHEST_M, explain
 from torchcover.simulation.gazebo_sensors import PlacedSensor, read_numbers, read_pose, read_sensors
 from torchcover.simulation.instant import encloses
 from torchcover.simulation.raycaster import RayCaster
@@ -120,10 +120,14 @@ def read_robot(path: Path, packages: Mapping[str, str | Path] | None = None) -> 
     positions = _joint_positions(joints)
     base_T_link = _link_poses(links, joints, positions)
     meshes = _read_meshes(links, path, packages or {})
-    pieces = [mesh.moved(base_T_link[name]) for name, link in links.items() for mesh in _link_meshes(link, meshes)]
+    with np.errstate(over="ignore", invalid="ignore"):  # lengths of 1e308 m: refused below
+        pieces = [mesh.moved(base_T_link[name]) for name, link in links.items() for mesh in _link_meshes(link, meshes)]
     if not pieces:
         raise ValueError("no link has a visual or collision geometry, so there is no body")
-    box = BoundingBox.around(merge(pieces).vertices_m)
+    vertices_m = merge(pieces).vertices_m
+    if not np.abs(vertices_m).max() <= FARTHEST_M:  # also refuses NaN
+        raise ValueError(f"the body reaches beyond {FARTHEST_M:g} m; check the units of its sizes, origins and meshes")
+    box = BoundingBox.around(vertices_m)
     middle_m = np.add(box.lower_m, box.upper_m) / 2
     vehicle_T_base = rigid(np.eye(3), (-middle_m[0], -middle_m[1], -box.lower_m[2]))
     pieces = [piece.moved(vehicle_T_base) for piece in pieces]
