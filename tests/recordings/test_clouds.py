@@ -14,6 +14,7 @@ from torchcover.files import BadFileError
 from torchcover.recordings import RecordingSettings, open_recording
 from torchcover.recordings.clouds import READERS, read_cloud
 from torchcover.recordings.isolated_readers import read_laz_points
+from torchcover.simulation.mesh_files import read_mesh_arrays
 
 CLOUD = np.array([[1.5, -2.25, 0.125], [-3.0, 4.0, 5.5], [70.0, 0.5, -1.75]], dtype=np.float32)
 UTM = np.array([[513248.123, 5403655.456, 260.389], [513414.844, 5403760.001, 337.601]])
@@ -377,6 +378,14 @@ def mislabelled_member():
     with zipfile.ZipFile(stream, "w") as archive:
         archive.writestr("points.npy", PNG)
     return stream.getvalue()
+
+
+def test_laz_files_are_read_after_meshes_by_the_same_process(tmp_path):
+    """Libraries look into all loaded modules, among them the one that stands in for a detector of encodings."""
+    mesh = tmp_path / "triangle.obj"
+    mesh.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    assert len(read_mesh_arrays(mesh)["faces"]) == 1
+    assert len(read_cloud(store(tmp_path, *FORMATS["laz"]))) == len(CLOUD)
 
 
 @pytest.mark.parametrize(

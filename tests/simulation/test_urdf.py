@@ -292,6 +292,8 @@ MESH = "<link name='base'><visual><geometry><mesh filename='package://p/{}.stl'/
         ([CHASSIS, on("nowhere", LIDAR.format("l", "", 1.0))], "sensor 'l' is on 'nowhere'"),
         (["<link name='base'/>"], "no link has a visual"),
         ([MESH.format("one")], "1 of 1 meshes are missing: package://p/one.stl. Name the folder"),
+        ([CHASSIS.replace("0.8", "1e308")], "the body reaches beyond 1e+09 m"),
+        ([CHASSIS.replace("0.8", "4e9")], "the body reaches beyond 1e+09 m"),
         ([CHASSIS.replace("0.8", "wide")], "box size: 3 numbers needed; got 'wide 0.6 0.4'"),
         ([CHASSIS, on("base", LIDAR.format("l", "", "far"))], "scan/horizontal/max_angle: 1 number needed; got 'far'"),
         ([CHASSIS, on("base", "<sensor name='l' type='ray'/>")], "<lidar> or <ray> is missing"),

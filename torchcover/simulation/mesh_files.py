@@ -9,8 +9,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
-from typing import Any, cast
+from types import ModuleType
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -186,8 +186,9 @@ def _read_parts(path: Path) -> Iterator[tuple[NDArray[np.float64], NDArray[np.in
         with suppress(ImportError):  # trimesh says that it is missing
             _triangulate_collada()
     # What trimesh asks for the encoding of text that is not UTF-8.
-    latin_1 = SimpleNamespace(detect=lambda _: {"encoding": "latin-1", "confidence": 0.0})
-    sys.modules["charset_normalizer"] = cast(ModuleType, latin_1)
+    latin_1 = ModuleType("charset_normalizer")
+    vars(latin_1)["detect"] = lambda _: {"encoding": "latin-1", "confidence": 0.0}
+    sys.modules["charset_normalizer"] = latin_1
     data = path.read_bytes()
     if kind == "obj":
         data = _obj_with_triangles(data)

@@ -17,6 +17,7 @@ from torchcover.geometry.arrays import Float64
 from torchcover.recordings.unsupported_formats import find_remedy
 from torchcover.simulation.bodies import merge_meshes
 from torchcover.simulation.document_errors import format_validation_error
+from torchcover.simulation.documents import FARTHEST_M
 from torchcover.simulation.gazebo_sensors import PlacedSensor, read_numbers, read_pose, read_sensors
 from torchcover.simulation.instant import is_enclosed
 from torchcover.simulation.raycaster import RayCaster
@@ -120,10 +121,14 @@ def read_robot(path: Path, packages: Mapping[str, str | Path] | None = None) -> 
     positions = _joint_positions(joints)
     base_T_link = _link_poses(links, joints, positions)
     meshes = _read_meshes(links, path, packages or {})
-    pieces = [mesh.transform(base_T_link[name]) for name, link in links.items() for mesh in _link_meshes(link, meshes)]
+    with np.errstate(over="ignore", invalid="ignore"):  # lengths of 1e308 m: refused below
+        pieces = [mesh.transform(base_T_link[name]) for name, link in links.items() for mesh in _link_meshes(link, meshes)]
     if not pieces:
         raise ValueError("no link has a visual or collision geometry, so there is no body")
-    box = BoundingBox.from_points(merge_meshes(pieces).vertices_m)
+    vertices_m = merge_meshes(pieces).vertices_m
+    if not np.abs(vertices_m).max() <= FARTHEST_M:  # also refuses NaN
+        raise ValueError(f"the body reaches beyond {FARTHEST_M:g} m; check the units of its sizes, origins and meshes")
+    box = BoundingBox.from_points(vertices_m)
     middle_m = np.add(box.lower_m, box.upper_m) / 2
     vehicle_T_base = build_transform(np.eye(3), (-middle_m[0], -middle_m[1], -box.lower_m[2]))
     pieces = [piece.transform(vehicle_T_base) for piece in pieces]
