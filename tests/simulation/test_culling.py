@@ -39,7 +39,9 @@ def at_every_body(instant, vehicle_T_sensor, tiles, max_range_m):
         limit_m = np.full(directions.shape[1], max_range_m, dtype=np.float32)
         hits = cast_from_vehicle(instant.static_caster, instant.static_T_vehicle, origin_m, directions, limit_m)
         moving = instant.moving_bodies
-        for caster, part_T_vehicle, body in zip(moving.casters, moving.part_T_vehicle, moving.body_indices, strict=True):
+        for caster, part_T_vehicle, body in zip(
+            moving.casters, moving.part_T_vehicle, moving.body_indices, strict=True
+        ):
             nearer = cast_from_vehicle(caster, part_T_vehicle, origin_m, directions, hits.range_m)
             hits.range_m[:] = nearer.range_m
             hits.body_indices[nearer.body_indices >= 0] = body

@@ -64,9 +64,7 @@ def test_a_change_of_one_step_does_not_reach_the_next():
 def test_bodies_out_of_range_change_nothing(monkeypatch):
     limited = simulator("urban", max_range_m=40.0).simulate_frame(7)
     original = SceneGeometry.get_snapshot
-    monkeypatch.setattr(
-        SceneGeometry, "get_snapshot", lambda self, step, max_distance_m: original(self, step, np.inf)
-    )
+    monkeypatch.setattr(SceneGeometry, "get_snapshot", lambda self, step, max_distance_m: original(self, step, np.inf))
     everywhere = simulator("urban", max_range_m=40.0)
     unlimited = everywhere.simulate_frame(7)
     scene, step = everywhere.get_scene_geometry(7)

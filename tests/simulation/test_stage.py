@@ -14,7 +14,13 @@ SHORT = Scenario.model_validate(
     {
         "name": "lot",
         "ego": {"shape": {"type": "box", "size_m": [4, 2, 1.5]}},
-        "traffic": {"type": "parking", "duration_s": 1.0, "time_step_s": 0.2, "crossings_per_aisle": 0, "parked_share": 0.1},
+        "traffic": {
+            "type": "parking",
+            "duration_s": 1.0,
+            "time_step_s": 0.2,
+            "crossings_per_aisle": 0,
+            "parked_share": 0.1,
+        },
     }
 )
 ORDER = np.random.default_rng(0).permutation(24).tolist()
