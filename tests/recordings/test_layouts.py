@@ -9,7 +9,7 @@ import torch
 
 from tests.recordings.drives import Drive
 from tests.recordings.layouts import LAYOUTS
-from tests.recordings.test_accumulated_reference import distances_m, moving, standing
+from tests.recordings.test_accumulated_reference import distances_m, transform_car, transform_wall
 from torchcover.data import FORMATS, AccumulatedReference, RecordedFrames, open_recording
 from torchcover.files import BadFileError
 from torchcover.geometry import invert
@@ -41,7 +41,7 @@ def test_clouds_and_reference_match_the_scene(layout, written):
     frames = RecordedFrames(recording, reference=AccumulatedReference(10.0, voxel_m=0.05))
     for number, index in enumerate(recording.key_frames):
         frame = frames[number]
-        wall_m, car_m = standing(drive, index), moving(drive, index)
+        wall_m, car_m = transform_wall(drive, index), transform_car(drive, index)
         assert distances_m(frame.sensor, np.concatenate([wall_m, car_m])).max() < 1e-3
         # Moving points follow boxes, or clusters without labels, which are exact within the diagonal of a cell.
         world_m = np.concatenate([wall_m, car_m])
