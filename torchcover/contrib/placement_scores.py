@@ -90,8 +90,8 @@ def score_placements(
 
     Example:
         >>> rigs = {name: f"place3d2024_{name}" for name in ("center", "line", "pyramid")}
-        >>> scores = score_placements(rigs, "courtyard", metrics=["point_density"], steps=1)
-        >>> [one.gains.tolist() for one in scores.rankings if one.metric == "baseline"][1:]
+        >>> scores = score_placements(rigs, "courtyard", metrics=["point_density"], num_frames=1)
+        >>> [ranking.scores.tolist() for ranking in scores.rankings if ranking.metric == "baseline"][1:]
         [[2.5, 2.2, 2.35], [16000.0, 16000.0, 16000.0]]
     """
     if len(rigs) < LEAST:

@@ -178,10 +178,10 @@ class FalseVisible(SceneRatios):
 
     Example:
         >>> from torchcover.simulation import Rig
-        >>> metric = FalseVisible(Rig.load("front_roof_32").sensors, None, BevGrid(x=(0.0, 40.0), y=(-5.0, 5.0)))
+        >>> metric = FalseVisible(Rig.load("front_roof_32").sensors, None, BevGrid(x_m=(0.0, 40.0), y_m=(-5.0, 5.0)))
         >>> hidden = torch.tensor([[30.5, 0.5, 0.0], [0.5, 0.5, 0.0]])
         >>> metric.update(Frame({"rig": torch.zeros(0, 3)}, hidden, 0, "a"))
-        >>> [(one.quantity.key, one.value) for one in metric.compute()]
+        >>> [(number.quantity.key, number.value) for number in metric.compute()]
         [('false_visible_ground_0.4m_1m', 0.5), ('false_visible_obstacle_0.4m_1m', nan)]
     """
 
@@ -240,7 +240,7 @@ def build_coarse_grid(grid: BevGrid, cell_m: float) -> BevGrid:
     """A grid of other cells, as large as the given one, or by a part of a cell larger.
 
     Example:
-        >>> build_coarse_grid(BevGrid(x=(-0.5, 2.0), y=(0.0, 1.0), cell=0.25), 1.0).x
+        >>> build_coarse_grid(BevGrid(x_m=(-0.5, 2.0), y_m=(0.0, 1.0), cell_m=0.25), 1.0).x_m
         (-1.0, 2.0)
     """
     x, y = (
@@ -264,9 +264,9 @@ def compute_field_of_view(sensors: Sequence[Sensor], grid: BevGrid, ego_mesh: Me
 
     Example:
         >>> from torchcover.simulation import Rig
-        >>> grid = BevGrid(x=(-5.0, 40.0), y=(-5.0, 5.0), cell=1.0)
-        >>> seen = compute_field_of_view(Rig.load("front_roof_32").sensors, grid)
-        >>> [bool(seen[0, 5, x]) for x in (0, 6, 30)]           # behind it, too close, and ahead
+        >>> grid = BevGrid(x_m=(-5.0, 40.0), y_m=(-5.0, 5.0), cell_m=1.0)
+        >>> in_view = compute_field_of_view(Rig.load("front_roof_32").sensors, grid)
+        >>> [bool(in_view[0, 5, x]) for x in (0, 6, 30)]        # behind, too close, ahead
         [False, False, True]
     """
     # Each band is one layer of cubes: rays are cut off at its ends and seen from above. Level ground is at z = 0.

@@ -178,7 +178,7 @@ def find_voxels_in_box(centers_m: Sequence[Float64], box_row: Float64) -> Int64:
 
     Example:
         >>> grid = VoxelGrid(BoundingBox((0.0, 0.0, 0.0), (4.0, 4.0, 1.0)), 1.0)
-        >>> find_voxels_in_box(grid.centres_m(), np.array([2.0, 0.5, 0.5, 2.0, 0.2, 1.0, 0.0]))
+        >>> find_voxels_in_box(grid.compute_centers_m(), np.array([2.0, 0.5, 0.5, 2.0, 0.2, 1.0, 0.0]))
         array([4, 8])
     """
     (x_m, y_m, z_m), reach_m = centers_m, math.hypot(box_row[3], box_row[4]) / 2 + ROUNDING_M
@@ -247,7 +247,7 @@ class SMig(FrameMetric):
         >>> from torchcover.simulation import Rig
         >>> car = Boxes.from_rows(torch.tensor([[10.0, 0.0, 0.8, 4.0, 2.0, 1.6, 0.0]]), categories=("car",))
         >>> metric = SMig(Rig.load("hu2022_center").sensors)
-        >>> for index, boxes in enumerate((car, car.of_category())):  # a car that is there in half of the frames
+        >>> for index, boxes in enumerate((car, car.select_categories())):  # a car in every second frame
         ...     metric.update(Frame({"rig": torch.zeros(0, 3)}, torch.zeros(0, 3), index, str(index), boxes=boxes))
         >>> number = metric.compute()[1]
         >>> number.quantity.key, round(number.value / np.log(2))
@@ -360,10 +360,11 @@ def describe_unequal_rays(numbers: Mapping[str, Number]) -> str | None:
         numbers: Name of the rig -> its number, of one `SMig` each.
 
     Example:
-        >>> one, two = (said("s_mig_0.2m", "nats", "boxes", rays=rays) for rays in (4000, 90))
-        >>> describe_unequal_rays({"one": one, "two": two})
-        's_mig_0.2m: the rigs have different numbers of rays (one 4,000, two 90), and fewer rays score higher'
-        >>> describe_unequal_rays({"one": one, "same": one})
+        >>> dense = describe_number("s_mig_0.2m", "nats", "boxes", rays=4000)
+        >>> sparse = describe_number("s_mig_0.2m", "nats", "boxes", rays=90)
+        >>> describe_unequal_rays({"dense": dense, "sparse": sparse})
+        's_mig_0.2m: the rigs have different numbers of rays (dense 4,000, sparse 90), and fewer rays score higher'
+        >>> describe_unequal_rays({"dense": dense, "equal": dense})
     """
     rays = {rig: number.parameters["rays"] for rig, number in numbers.items()}
     if len(set(rays.values())) < 2:

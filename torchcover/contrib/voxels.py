@@ -88,7 +88,7 @@ class VoxelGrid:
 
         Example:
             >>> grid = VoxelGrid(BoundingBox((0.0, 0.0, 0.0), (2.0, 2.0, 1.0)), 1.0)
-            >>> grid.number_of([[0.5, 0.5, 0.5], [1.0, 1.0, 0.0], [2.0, 0.0, 0.0]])
+            >>> grid.find_voxels([[0.5, 0.5, 0.5], [1.0, 1.0, 0.0], [2.0, 0.0, 0.0]])
             array([ 0,  3, -1])
         """
         at = np.floor(self.to_voxel_units(points_m))

@@ -48,7 +48,7 @@ class Criterion:
             approach_speed_mps: Of the other, along the same way towards the ego; negative if it drives ahead.
 
         Example:
-            >>> [round(Criterion().needed_s(50 / 3.6, towards_kmh / 3.6), 2) for towards_kmh in (0, 50, -20)]
+            >>> [round(Criterion().compute_braking_time_s(50 / 3.6, kmh / 3.6), 2) for kmh in (0, 50, -20)]
             [1.27, 1.66, 0.96]
         """
         closing_mps, towards = speed_mps + approach_speed_mps, approach_speed_mps > 0

@@ -157,8 +157,9 @@ class Encounter(Document):
         """How fast the other comes towards the ego, along the ego's way; negative if it drives ahead.
 
         Example:
-            >>> ways = {"ego": {"speed_kmh": 90}, "other": {"body": "hatchback", "speed_kmh": 54, "yaw_deg": 180}}
-            >>> round(Encounter.model_validate({"name": "oncoming", **ways}).towards_mps, 9)
+            >>> car = {"body": "hatchback", "speed_kmh": 54, "yaw_deg": 180}
+        >>> oncoming = {"name": "oncoming", "ego": {"speed_kmh": 90}, "road_user": car}
+            >>> round(Encounter.model_validate(oncoming).approach_speed_mps, 9)
             15.0
         """
         along_mps = self.road_user.speed_mps * math.cos(math.radians(self.road_user.yaw_deg))
@@ -205,7 +206,9 @@ class EncounterSet(BuiltInDocument):
     @classmethod
     def _expand(cls, content: Any, info: ValidationInfo) -> Any:  # noqa: ANN401  (whatever stood in the file)
         families = content.get("encounters") if isinstance(content, dict) else None
-        draws, seed = (content.get(key, usual) for key, usual in (("num_samples", 16), ("seed", 0))) if families else (16, 0)
+        draws, seed = (
+            (content.get(key, usual) for key, usual in (("num_samples", 16), ("seed", 0))) if families else (16, 0)
+        )
         sound = isinstance(draws, int) and isinstance(seed, int) and 1 <= draws <= MOST and seed >= 0
         if not isinstance(families, list | tuple) or not sound:
             return content  # which is told field by field

@@ -151,7 +151,7 @@ def describe_differences(current: Mapping[str, str], saved: Mapping[str, str]) -
     """What two runs differ in, in words; empty where they do not.
 
     Example:
-        >>> differences({"seed": "0", "scenario": "#17"}, {"seed": "1", "scenario": "#4"})
+        >>> describe_differences({"seed": "0", "scenario": "#17"}, {"seed": "1", "scenario": "#4"})
         'scenario (other content), seed (1 there, 0 here)'
     """
     names = [name for name in sorted(current.keys() | saved.keys()) if current.get(name) != saved.get(name)]

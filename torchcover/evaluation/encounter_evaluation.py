@@ -66,9 +66,11 @@ def evaluate_encounters(
         ValueError: A file that cannot be used, a number out of its bounds, an encounter that is none.
 
     Example:
-        >>> crossing = {"name": "a", "ego": {"speed_kmh": 30}, "other": {"body": "adult", "speed_kmh": 5, "from_m": 2}}
-        >>> one = EncounterSet.model_validate({"name": "one", "encounters": [crossing]})
-        >>> [(row.encounter, row.in_time) for row in encounter("front_roof_32", one, phases=2).rows]
+        >>> adult = {"body": "adult", "speed_kmh": 5, "approach_distance_m": 2}
+        >>> crossing = {"name": "a", "ego": {"speed_kmh": 30}, "road_user": adult}
+        >>> encounters = EncounterSet.model_validate({"name": "crossings", "encounters": [crossing]})
+        >>> result = evaluate_encounters("front_roof_32", encounters, num_start_offsets=2)
+        >>> [(row.encounter, row.in_time_share) for row in result.rows]
         [('a', 1.0)]
     """
     for name, value, least in (("phases", num_start_offsets, 1), ("seed", seed, 0)):

@@ -207,8 +207,8 @@ def report(
         ValueError: A file that cannot be used, a number out of its bounds, no rig or too many, several kinds of world.
 
     Example:
-        >>> found = report("front_roof_128", "courtyard", steps=8)
-        >>> print(found.verdict[0])
+        >>> result = report("front_roof_128", "courtyard", num_frames=8)
+        >>> print(result.verdict[0])
         A child of 1.10 m is seen (5 points or more) at 35 % of the places within 2 m by front_roof_128.
     """
     start_s = time.monotonic()

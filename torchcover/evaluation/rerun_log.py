@@ -112,7 +112,7 @@ def compute_frustum_lines(view: SensorView) -> list[NDArray[np.float64]]:
 
     Example:
         >>> view = SensorView("roof", np.eye(4), 360.0, (-10.0, 10.0), 50.0)
-        >>> [line.shape for line in frustum(view)]
+        >>> [line.shape for line in compute_frustum_lines(view)]
         [(33, 3), (33, 3)]
     """
     azimuth = np.deg2rad(np.linspace(-view.horizontal_fov_deg / 2, view.horizontal_fov_deg / 2, RIM_POINTS))

@@ -111,7 +111,7 @@ def build_flat_ground() -> Scenario:
     """Flat ground with nothing on it but what carries the rig.
 
     Example:
-        >>> free_space().instants
+        >>> build_flat_ground().num_distinct_time_steps
         1
     """
     ground = Body(name="ground", shape=Plane(type="plane", size_m=(GROUND_M, GROUND_M)))

@@ -310,7 +310,7 @@ def get_shape_name(shape: Shape) -> str:
     """What a picture or a table calls a body: the name of a built-in vehicle, the name of a file, or the kind of shape.
 
     Example:
-        >>> called(VehicleShape(type="vehicle", vehicle="here/my_van.yaml"))
+        >>> get_shape_name(VehicleShape(type="vehicle", vehicle="here/my_van.yaml"))
         'my_van.yaml'
     """
     if isinstance(shape, VehicleShape):

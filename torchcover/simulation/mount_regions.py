@@ -97,10 +97,10 @@ class MountRegion(Document):
     Example:
         >>> from torchcover.simulation.shapes import Box
         >>> from torchcover.simulation.mount_regions import Skin
-        >>> skin = Skin(Box(type="box", size_m=(4.0, 2.0, 1.5)).mesh())
-        >>> left = MountRegion(seen_from="left", x_m=(1.0, 2.0), z_m=(0.5, 1.0))
-        >>> point = left.on(skin, u=0.5, v=0.0)
-        >>> point.place_m, point.outward
+        >>> skin = Skin(Box(type="box", size_m=(4.0, 2.0, 1.5)).build_mesh())
+        >>> left = MountRegion(side="left", x_m=(1.0, 2.0), z_m=(0.5, 1.0))
+        >>> point = left.find_mount_point(skin, u=0.5, v=0.0)
+        >>> point.position_m, point.normal
         (array([1.5, 1. , 0.5]), array([0., 1., 0.]))
     """
 

@@ -231,7 +231,7 @@ def describe_self_hits(sensors: Sequence[Sensor], ego_mesh: Mesh) -> str:
 
     Example:
         >>> from torchcover.simulation import Rig, Scenario
-        >>> describe_self_hits(Rig.load("kitti").sensors, Scenario.load("courtyard").ego_mesh())
+        >>> describe_self_hits(Rig.load("kitti").sensors, Scenario.load("courtyard").build_ego_mesh())
         'Rays that end on the own vehicle: velodyne 32,130 of 138,240 (23.2%).'
     """
     shares = []

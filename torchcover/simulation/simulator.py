@@ -81,8 +81,8 @@ class Simulator:
         >>> from torchcover.simulation import PaperReference
         >>> rigs = {"roof": Rig.load("front_roof_128")}
         >>> simulator = Simulator(Scenario.load("courtyard"), rigs, PaperReference(rows=16, columns=16))
-        >>> seen = simulator.step(0)
-        >>> seen.counts["sensor_rays"], seen.clouds["roof"].dtype
+        >>> observation = simulator.simulate_frame(0)
+        >>> observation.counts["sensor_rays"], observation.clouds["roof"].dtype
         (230400, dtype('float32'))
     """
 
@@ -173,8 +173,8 @@ class Simulator:
         Example:
             >>> from torchcover.simulation import PaperReference
             >>> empty = Simulator(Scenario.load("courtyard"), {}, PaperReference(rows=16, columns=16))
-            >>> [roof] = empty.with_rigs({"candidate": Rig.load("front_roof_128")}).scans(0)["candidate"]
-            >>> roof.rays, roof.points.dtype
+            >>> [roof] = empty.replace_rigs({"rig": Rig.load("front_roof_128")}).simulate_scans(0)["rig"]
+            >>> roof.num_rays, roof.points.dtype
             (230400, dtype('float32'))
         """
         stage, instant = self.prepare_frame(index)
@@ -242,7 +242,7 @@ class Simulator:
 
         Example:
             >>> from torchcover.simulation import PaperReference
-            >>> Simulator(Scenario.load("urban"), {}, PaperReference(rows=16, columns=16)).ground_words
+            >>> Simulator(Scenario.load("urban"), {}, PaperReference(rows=16, columns=16)).ground_note
             ''
         """
         if self.scenario.has_ground:

@@ -44,7 +44,7 @@ def write_recording(
     Example:
         >>> import tempfile
         >>> from torchcover.data import RecordedFrames, SimulatedFrames
-        >>> frames = SimulatedFrames("courtyard", "front_roof_32", steps=1)
+        >>> frames = SimulatedFrames("courtyard", "front_roof_32", num_frames=1)
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     write_recording(frames, folder)
         ...     again = RecordedFrames(folder)[0]

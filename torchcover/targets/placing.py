@@ -71,7 +71,7 @@ class Raster:
         """All that is within a margin of a vehicle, in whole steps from its origin.
 
         Example:
-            >>> Raster.around(BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5)), 1.0, 0.5).x
+            >>> Raster.from_vehicle(BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5)), 1.0, 0.5).x_bounds_m
             (-3.0, 3.0)
         """
         (x0, y0, _), (x1, y1, _) = vehicle_box.lower_m, vehicle_box.upper_m
@@ -119,7 +119,7 @@ def find_sides(box: BoundingBox, positions_m: Float64) -> Int64:
 
     Example:
         >>> box = BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5))
-        >>> [SIDES[k] for k in side_of(box, np.array([[3.0, 1.5], [0.0, -2.0]]))]
+        >>> [SIDES[side] for side in find_sides(box, np.array([[3.0, 1.5], [0.0, -2.0]]))]
         ['front', 'right']
     """
     x, y = compute_outline_offsets_m(box, positions_m).T

@@ -32,7 +32,7 @@ class Target:
 
     Example:
         >>> child = Target.load("child")
-        >>> child.name, round(child.solid.box.size_m[2], 2)
+        >>> child.name, round(child.solid.bounding_box.size_m[2], 2)
         ('child_110cm', 1.1)
     """
 

@@ -65,8 +65,9 @@ def measure_target_visibility(
 
     Example:
         >>> courtyard, pole = Scenario.load("courtyard"), Target.load("pole")
-        >>> seen = survey(Rig.load("front_roof_128"), courtyard, pole, Raster((4.0, 8.0), (-1.0, 1.0), 1.0))
-        >>> seen.points.shape, bool((seen.points > 0).any())
+        >>> raster = Raster((4.0, 8.0), (-1.0, 1.0), 1.0)
+        >>> target_map = measure_target_visibility(Rig.load("front_roof_128"), courtyard, pole, raster)
+        >>> target_map.points.shape, bool((target_map.points > 0).any())
         ((2, 4), True)
     """
     scenario = set_ego(scenario, {rig.name: rig})
@@ -167,7 +168,11 @@ def _outline_m(scenario: Scenario) -> Float64:
 
 
 def _check(num_frames: int, seed: int, detection_points: int, threshold_m: float) -> None:
-    for name, value, least in (("num_frames", num_frames, 1), ("seed", seed, 0), ("detection_points", detection_points, 1)):
+    for name, value, least in (
+        ("num_frames", num_frames, 1),
+        ("seed", seed, 0),
+        ("detection_points", detection_points, 1),
+    ):
         if value < least:
             raise ValueError(f"{name}: a number >= {least} is needed; got {value}")
     if not 0 < threshold_m < math.inf:
