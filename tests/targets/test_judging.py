@@ -125,7 +125,11 @@ def test_the_files_hold_what_the_map_holds(tmp_path):
     with np.load(tmp_path / "targets.npz") as arrays:
         np.testing.assert_array_equal(arrays["points"], seen.points)
         np.testing.assert_array_equal(arrays["detection_border_m"], seen.compute_detection_border_m())
-        assert json.loads(str(arrays["settings"]))["raster"] == {"x_bounds_m": [-3, 3], "y_bounds_m": [-2, 2], "cell_m": 1}
+        assert json.loads(str(arrays["settings"]))["raster"] == {
+            "x_bounds_m": [-3, 3],
+            "y_bounds_m": [-2, 2],
+            "cell_m": 1,
+        }
         assert arrays["x_m"].tolist() == [-2.5, -1.5, -0.5, 0.5, 1.5, 2.5]
     rows = list(csv.DictReader((tmp_path / "targets.csv").read_text().splitlines()))
     assert len(rows) == 24
@@ -177,7 +181,7 @@ def test_names_become_bodies(tmp_path):
         ({"threshold_m": -1.0}, "threshold"),
         ({"heading": "up"}, "narrow, wide or degrees"),
         ({"target": "moon"}, "'moon' is neither"),
-        ({"num_frames": 10**9}, "use fewer steps"),
+        ({"num_frames": 10**9}, "use fewer frames"),
     ],
 )
 def test_an_option_that_cannot_be_is_an_error(options, message):
@@ -188,13 +192,13 @@ def test_an_option_that_cannot_be_is_an_error(options, message):
 @pytest.mark.parametrize(
     ("bounds", "message"),
     [
-        (((-1000.0, 1000.0), (-1000.0, 1000.0), 0.5), "16,000,000 cells; at most 1,000,000"),
-        (((0.0, 1.0), (0.0, 1.0), 0.3), "no whole number of steps"),
+        (((-1000.0, 1000.0), (-1000.0, 1000.0), 0.5), "16,000,000 cells exceed the limit of 1,000,000"),
+        (((0.0, 1.0), (0.0, 1.0), 0.3), "no whole number of cells"),
         (((1.0, 0.0), (0.0, 1.0), 0.5), "low < high"),
         (((0.0, np.inf), (0.0, 1.0), 0.5), "finite"),
-        (((0.0, 1.0), (0.0, 1.0), 0.0), "step above 0"),
-        (((0.0, 1.0), (0.0, 1.0), np.nan), "step above 0"),
-        (((0.0, 1.0), (0.0, 1.0), 9.0), "no whole number of steps"),
+        (((0.0, 1.0), (0.0, 1.0), 0.0), "cell size above 0"),
+        (((0.0, 1.0), (0.0, 1.0), np.nan), "cell size above 0"),
+        (((0.0, 1.0), (0.0, 1.0), 9.0), "no whole number of cells"),
     ],
 )
 def test_a_raster_that_cannot_be_is_an_error(bounds, message):

@@ -12,7 +12,7 @@ from torchcover.data import SimulatedFrames
 from torchcover.geometry import build_transform
 from torchcover.simulation import PaperReference
 from torchcover.simulation.regions_of_interest import build_near_field
-from torchcover.targets import NearFieldObserver, Raster, Target, counting, measure_target_visibility, probing
+from torchcover.targets import NearFieldObserver, Raster, Target, measure_target_visibility, probing, target_frames
 from torchcover.targets.probing import NearFieldTarget
 
 from .worlds import WALL, drive, lidar, rig, world
@@ -45,7 +45,7 @@ def numbers(probes, region, rig="small"):
 @pytest.mark.parametrize(("name", "bodies"), [("child", ()), ("pole", (WALL,))], ids=["free space", "a wall"])
 def test_the_numbers_are_those_of_targets_over_the_same_cells(name, bodies, monkeypatch):
     scenario, target = world(*bodies), Target.load(name)
-    for module in (counting, probing):  # its surface is looked at from random places
+    for module in (target_frames, probing):  # its surface is looked at from random places
         monkeypatch.setattr(
             module, "sample_reference_pose", lambda *_: build_transform(np.eye(3), np.array([0.3, 0.2, 1.3]))
         )
@@ -95,7 +95,9 @@ def test_a_mirror_symmetric_rig_is_symmetric_exactly_in_all_places_and_within_er
 
 def test_parts_and_other_processes_add_up_to_the_whole(tmp_path):
     path = drive(tmp_path, (0, 0, 0, 0), (2, 20, 0, 0))
-    frames = simulated(world(ego={"shape": {"type": "box", "size_m": [4, 2, 1]}, "trajectory": str(path)}), num_frames=20)
+    frames = simulated(
+        world(ego={"shape": {"type": "box", "size_m": [4, 2, 1]}, "trajectory": str(path)}), num_frames=20
+    )
     whole, parts = (
         probed(frames, frame_stride=4, positions_per_region=2),
         [probed(frames, part, frame_stride=4, positions_per_region=2) for part in (range(10), range(10, 20))],
@@ -108,7 +110,7 @@ def test_parts_and_other_processes_add_up_to_the_whole(tmp_path):
     again.load_state_dict(whole.state_dict())
     assert torch.equal(again.compute(), whole.compute())
     other = NearFieldObserver(frames.simulator, [Target.load("child")], num_blocks=8)
-    with pytest.raises(ValueError, match="different bodies"):
+    with pytest.raises(ValueError, match="different targets"):
         other.merge_state(whole)
 
 

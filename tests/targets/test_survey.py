@@ -11,7 +11,7 @@ from torchcover.simulation.bodies import merge_meshes
 from torchcover.simulation.shapes import Box
 from torchcover.targets import STATES, Raster, Target, counting, measure_target_visibility
 from torchcover.targets.placing import compute_yaws_rad
-from torchcover.targets.surface import SAMPLES, TargetSurface
+from torchcover.targets.surface import NUM_SAMPLES, TargetSurface
 
 from .worlds import EGO, RASTER, WALL, drive, lidar, on_target, rig, world
 
@@ -127,9 +127,17 @@ def test_a_place_does_not_depend_on_the_raster_the_chunks_or_the_threads(monkeyp
     part = measure_target_visibility(
         sensors, world(WALL), target, Raster((2.0, 7.0), (-2.0, 3.0), 1.0), num_frames=2, seed=3
     )
-    for name in ("sensor_points", "detecting_sensors", "detected_share", "min_points", "surface_share", "state", "visible_m2"):
+    for name in (
+        "sensor_points",
+        "detecting_sensors",
+        "detected_share",
+        "min_points",
+        "surface_share",
+        "state",
+        "visible_m2",
+    ):
         np.testing.assert_array_equal(getattr(whole, name)[..., 3:8, 9:], getattr(part, name))
-    monkeypatch.setattr(counting, "CHUNK", 7)
+    monkeypatch.setattr(counting, "CHUNK_SIZE", 7)
     threads = torch.get_num_threads()
     torch.set_num_threads(2)
     again = measure_target_visibility(sensors, world(WALL), target, RASTER, num_frames=2, seed=3)
@@ -214,7 +222,7 @@ def test_the_share_is_that_of_the_surface_which_is_near_a_measured_point():
     seen = measure_target_visibility(
         rig(level), world(ego=ego), Target("wall", mesh), raster, threshold_m=0.3, heading="wide"
     )
-    assert seen.surface_share[0, 0] == pytest.approx(0.3, abs=2.5 / np.sqrt(SAMPLES) * 0.3)
+    assert seen.surface_share[0, 0] == pytest.approx(0.3, abs=2.5 / np.sqrt(NUM_SAMPLES) * 0.3)
     assert seen.visible_m2[0, 0] == pytest.approx(8.0, rel=0.15)  # the ego hides its foot from low places
     all_of_it = measure_target_visibility(
         rig(level), world(ego=ego), Target("wall", mesh), raster, threshold_m=5.0, heading="wide"
@@ -228,7 +236,7 @@ def test_the_surface_is_spread_by_area_and_leaves_out_what_is_inside():
     surface = TargetSurface.from_target(target)
     corners = target.mesh.vertices_m[target.mesh.faces]
     whole = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
-    assert 0.6 * whole < surface.sample_area_m2 * SAMPLES < 0.97 * whole
+    assert 0.6 * whole < surface.sample_area_m2 * NUM_SAMPLES < 0.97 * whole
     hits = np.random.default_rng(0).normal(size=(500, 3))
     near = np.unpackbits(surface.find_nearby_samples(hits, 0.4), axis=1).astype(bool)
     distance = np.linalg.norm(hits[:, None] - surface.points_m, axis=2)

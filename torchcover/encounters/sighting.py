@@ -22,7 +22,8 @@ from torchcover.simulation.scene import SceneGeometry
 from torchcover.simulation.sensor import Sensor, SensorNoise
 from torchcover.simulation.sight import MountedSensor, RayEnds, compute_visibility
 from torchcover.simulation.stage import mount_sensors
-from torchcover.targets.counting import SensorBeams, SensorFrame, TargetHits, find_measured_hits, find_target_hits
+from torchcover.targets.counting import SensorBeams, TargetHits, find_measured_hits, find_target_hits
+from torchcover.targets.target_frames import SensorFrame
 
 if TYPE_CHECKING:
     from torchcover.encounters.traffic import Approach

@@ -48,7 +48,7 @@ from torchcover.simulation.documents import (
 from torchcover.simulation.kinds import SENSORS
 from torchcover.targets import SIDES, TARGETS
 from torchcover.targets.placing import find_sides
-from torchcover.targets.survey import HITS, THRESHOLD_M
+from torchcover.targets.survey import DETECTION_POINTS, THRESHOLD_M
 
 Side = Literal["front", "rear", "left", "right"]
 Corners = tuple[tuple[Coordinate, Coordinate], ...]
@@ -248,7 +248,7 @@ class TargetRequirement(_Requirement):
         Discriminator(lambda content: "(name)" if isinstance(content, str) else "(positions)"),
     ]
     counted_sensors: Annotated[Names, Field(min_length=1)] = SENSOR_KINDS
-    detection_points: PositiveInt = HITS
+    detection_points: PositiveInt = DETECTION_POINTS
     points: PositiveFloat | None = None
     pixels: PositiveFloat | None = None
     sensors: PositiveInt | None = None
@@ -284,7 +284,7 @@ class TargetRequirement(_Requirement):
         text = f"{target}, {positions}"
         if self.counted_sensors != SENSOR_KINDS:
             text += f", by {', '.join(self.counted_sensors)}"
-        if self.detection_points != HITS:
+        if self.detection_points != DETECTION_POINTS:
             text += f", detection_points {self.detection_points}"
         return self.format_text(text)
 

@@ -1,4 +1,4 @@
-"""What a rig sees of a body, for every place around the vehicle."""
+"""Visibility of test targets around the vehicle: which positions a rig detects, and how much of the target."""
 
 import lazy_loader
 

@@ -7,9 +7,9 @@ from .result import PositionVisibility as PositionVisibility
 from .result import SideShare as SideShare
 from .result import TargetMap as TargetMap
 from .result import TargetPosition as TargetPosition
-from .result import write_arrays as write_arrays
-from .result import write_csv as write_csv
 from .surface import TARGETS as TARGETS
 from .surface import Target as Target
 from .survey import measure_target_visibility as measure_target_visibility
 from .survey import measure_visibility_at_positions as measure_visibility_at_positions
+from .writing import write_arrays as write_arrays
+from .writing import write_csv as write_csv

@@ -1,4 +1,4 @@
-"""Where a target is put: cells around the vehicle, how it stands in each, and whether there is room for it."""
+"""Positions of test targets: cells around the vehicle, poses on the ground, and free space at these poses."""
 
 import math
 from dataclasses import dataclass
@@ -10,24 +10,41 @@ from torchcover.geometry import BoundingBox, find_overlaps
 from torchcover.geometry.arrays import Bools, Float64, Int64
 from torchcover.simulation.instant import SceneSnapshot
 
-MARGIN_M = 5.0
 SIDES = ("front", "rear", "left", "right")
-STEP_M = 0.2
-# Takes minutes, and less than 1 GB.
+# "narrow" turns the narrower side of the target's box to the vehicle, "wide" the wider one; numbers are yaws in degrees.
+Heading = Literal["narrow", "wide"] | float
+
+# Default side of a cell: less than half of the width of a person.
+CELL_M = 0.2
+# A run with this number of target positions takes minutes and less than 1 GB.
 MAX_POSITIONS = 1_000_000
 
 
 @dataclass(frozen=True)
-class Raster:
-    """Equal cells in the vehicle frame; a target stands in the middle of one.
+class CollisionParams:
+    """Tolerances of the test whether a target position is free.
 
     Args:
-        x_bounds_m: Bounds forward in metres, low and high.
-        y_bounds_m: Bounds to the left.
-        cell_m: Side of a cell; the bounds are a whole number of them apart.
+        max_step_m: Obstacles below this height do not block a target: curbs, rising ground.
+        contact_share: Obstacles may enter the outermost part of a target by this share of the distance to its center,
+            so that a wall may touch it.
+    """
+
+    max_step_m: float = 0.2
+    contact_share: float = 0.05
+
+
+@dataclass(frozen=True)
+class Raster:
+    """Grid of equal square cells in the vehicle frame; the center of each cell is a target position.
+
+    Args:
+        x_bounds_m: Lower and upper bound forward.
+        y_bounds_m: Lower and upper bound to the left.
+        cell_m: Side of a cell; the extent in x and y is a whole number of cells.
 
     Raises:
-        ValueError: Bounds or a step that are none, or more than a million cells.
+        ValueError: Invalid bounds or cell size, or more than a million cells.
 
     Example:
         >>> raster = Raster((-1.0, 1.0), (0.0, 1.0), 0.5)
@@ -37,89 +54,94 @@ class Raster:
 
     x_bounds_m: tuple[float, float]
     y_bounds_m: tuple[float, float]
-    cell_m: float = STEP_M
+    cell_m: float = CELL_M
 
     def __post_init__(self) -> None:
         if not 0 < self.cell_m < math.inf:
-            raise ValueError(f"raster: a step above 0 m is needed; got {self.cell_m}")
+            raise ValueError(f"raster: a cell size above 0 m is needed; got {self.cell_m}")
+        extents_m = []
         for name, (low, high) in (("x", self.x_bounds_m), ("y", self.y_bounds_m)):
             if not -math.inf < low < high < math.inf:
                 raise ValueError(f"raster: {name} needs finite bounds, low < high; got {low} and {high}")
-        if (self.x_bounds_m[1] - self.x_bounds_m[0]) * (self.y_bounds_m[1] - self.y_bounds_m[0]) > (
-            MAX_POSITIONS + 0.5
-        ) * self.cell_m**2:
-            cells = (
-                (self.x_bounds_m[1] - self.x_bounds_m[0])
-                / self.cell_m
-                * (self.y_bounds_m[1] - self.y_bounds_m[0])
-                / self.cell_m
-            )
+            extents_m.append(high - low)
+        if extents_m[0] * extents_m[1] > (MAX_POSITIONS + 0.5) * self.cell_m**2:
+            num_cells = extents_m[0] / self.cell_m * extents_m[1] / self.cell_m
             raise ValueError(
-                f"raster: {cells:,.0f} cells; at most {MAX_POSITIONS:,} are placed in one run: take a larger step or "
-                "a smaller area"
+                f"raster: {num_cells:,.0f} cells exceed the limit of {MAX_POSITIONS:,} per run; use larger cells "
+                "or a smaller area"
             )
         for name, (low, high) in (("x", self.x_bounds_m), ("y", self.y_bounds_m)):
-            cells = (high - low) / self.cell_m
-            if round(cells) < 1 or abs(cells - round(cells)) > 1e-6:
+            num_cells = (high - low) / self.cell_m
+            if round(num_cells) < 1 or abs(num_cells - round(num_cells)) > 1e-6:
                 raise ValueError(
-                    f"raster: {name} from {low:g} to {high:g} m is no whole number of steps of {self.cell_m:g} m; "
-                    "change the bounds or the step"
+                    f"raster: {name} from {low:g} to {high:g} m is no whole number of cells of {self.cell_m:g} m; "
+                    "change the bounds or the cell size"
                 )
 
     @classmethod
-    def from_vehicle(cls, vehicle_box: BoundingBox, margin_m: float = MARGIN_M, cell_m: float = STEP_M) -> Self:
-        """All that is within a margin of a vehicle, in whole steps from its origin.
+    def from_vehicle(cls, vehicle_box: BoundingBox, margin_m: float = 5.0, cell_m: float = CELL_M) -> Self:
+        """Create the raster that covers a vehicle and a margin around it, aligned with the vehicle's origin.
+
+        Args:
+            vehicle_box: Bounding box of the vehicle in the vehicle frame.
+            margin_m: Distance from the box that is covered at least.
+            cell_m: Side of a cell.
+
+        Returns:
+            The raster; its bounds are multiples of `cell_m`.
 
         Example:
             >>> Raster.from_vehicle(BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5)), 1.0, 0.5).x_bounds_m
             (-3.0, 3.0)
         """
-        (x0, y0, _), (x1, y1, _) = vehicle_box.lower_m, vehicle_box.upper_m
-
-        def bounds(low: float, high: float) -> tuple[float, float]:
+        bounds_m = []
+        for low, high in zip(vehicle_box.lower_m[:2], vehicle_box.upper_m[:2], strict=True):
             first, last = math.floor((low - margin_m) / cell_m + 1e-9), math.ceil((high + margin_m) / cell_m - 1e-9)
-            return first * cell_m, last * cell_m
-
-        return cls(bounds(x0, x1), bounds(y0, y1), cell_m)
+            bounds_m.append((first * cell_m, last * cell_m))
+        return cls(bounds_m[0], bounds_m[1], cell_m)
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows along y and columns along x."""
-        return round((self.y_bounds_m[1] - self.y_bounds_m[0]) / self.cell_m), round(
-            (self.x_bounds_m[1] - self.x_bounds_m[0]) / self.cell_m
-        )
+        """Number of rows along y and of columns along x."""
+        (x_low, x_high), (y_low, y_high) = self.x_bounds_m, self.y_bounds_m
+        return round((y_high - y_low) / self.cell_m), round((x_high - x_low) / self.cell_m)
 
     @property
     def x_m(self) -> Float64:
-        """(X,) middles of the columns."""
-        return _middles_m(self.x_bounds_m[0], self.cell_m, self.shape[1])
+        """(X,) centers of the columns."""
+        return compute_cell_centers_m(self.x_bounds_m[0], self.cell_m, self.shape[1])
 
     @property
     def y_m(self) -> Float64:
-        """(Y,) middles of the rows."""
-        return _middles_m(self.y_bounds_m[0], self.cell_m, self.shape[0])
+        """(Y,) centers of the rows."""
+        return compute_cell_centers_m(self.y_bounds_m[0], self.cell_m, self.shape[0])
 
     @property
     def positions_m(self) -> Float64:
-        """(Y * X, 2) middles of the cells, row by row."""
+        """(Y * X, 2) centers of the cells, row by row."""
         x, y = np.meshgrid(self.x_m, self.y_m)
         return np.stack([x.ravel(), y.ravel()], axis=1)
 
 
-def _middles_m(low_m: float, step_m: float, count: int) -> Float64:
-    middles_m: Float64 = low_m + step_m * (np.arange(count, dtype=np.float64) + 0.5)
-    # A cell that was meant to be at 0.1 is not at 0.09999999999999998.
-    return middles_m.round(9)
+def compute_cell_centers_m(low_m: float, cell_m: float, num_cells: int) -> Float64:
+    """Compute the (num_cells,) centers of cells along one axis, from its lower bound and the side of a cell."""
+    centers_m: Float64 = low_m + cell_m * (np.arange(num_cells, dtype=np.float64) + 0.5)
+    return centers_m.round(9)  # 0.1 instead of 0.09999999999999998
 
 
 def find_sides(box: BoundingBox, positions_m: Float64) -> Int64:
-    """(P,) number in `SIDES` of the side of a box that each of (P, 2) places is on; -1 within it.
+    """Find the side of a vehicle on which positions lie; the sides are separated by lines of 45 degrees at the corners.
 
-    Sides meet at 45 degrees from the corners.
+    Args:
+        box: Bounding box of the vehicle.
+        positions_m: (P, 2) positions in the vehicle frame.
+
+    Returns:
+        (P,) index in `SIDES`; -1 within the box.
 
     Example:
         >>> box = BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5))
-        >>> [SIDES[side] for side in find_sides(box, np.array([[3.0, 1.5], [0.0, -2.0]]))]
+        >>> [SIDES[index] for index in find_sides(box, np.array([[3.0, 1.5], [0.0, -2.0]]))]
         ['front', 'right']
     """
     x, y = compute_outline_offsets_m(box, positions_m).T
@@ -129,7 +151,14 @@ def find_sides(box: BoundingBox, positions_m: Float64) -> Int64:
 
 
 def compute_outline_offsets_m(box: BoundingBox, positions_m: Float64) -> Float64:
-    """(P, 2) how far along x and y each of (P, 2) places is from the nearest point of a box, seen from above.
+    """Compute the offsets of positions from the nearest point of a box in bird's-eye view.
+
+    Args:
+        box: The box.
+        positions_m: (P, 2) positions in the frame of the box.
+
+    Returns:
+        (P, 2) offsets along x and y; 0 within the box.
 
     Example:
         >>> box = BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5))
@@ -140,38 +169,47 @@ def compute_outline_offsets_m(box: BoundingBox, positions_m: Float64) -> Float64
     return np.asarray(positions_m - nearest_m)
 
 
-# "narrow" turns the narrower side of the target's box to the vehicle, "wide" the wider one; degrees are its yaw.
-Heading = Literal["narrow", "wide"] | float
-
-# Where a target may stand above the plane of the vehicle: near it, and at the end of a slope that leads there.
-NEAR_M, STEEPEST_WAY = 1.0, 0.15
-LEVEL_M = 1e-3
-# A kerb, and ground that rises: what is lower than this under a target takes no room from it.
-STEP_UP_M = 0.2
-# A wall may touch the outermost of a target: by this share of the way from its middle.
-TOUCHING_SHARE = 0.05
-
-
 def compute_yaws_rad(
     heading: Heading, target_box: BoundingBox, vehicle_box: BoundingBox, positions_m: Float64
 ) -> Float64:
-    """(P,) yaw of a target in radians at (P, 2) places, by the boxes of both.
+    """Compute the yaw of a target at positions around a vehicle.
 
-    The "narrow" or "wide" side is turned to the nearest point of the vehicle; degrees are about z, 0 as the vehicle.
+    Args:
+        heading: "narrow" or "wide" turns this side of the target to the nearest point of the vehicle; a number is the
+            yaw in degrees, 0 for the heading of the vehicle.
+        target_box: Bounding box of the target in its own frame.
+        vehicle_box: Bounding box of the vehicle in the vehicle frame.
+        positions_m: (P, 2) positions of the target in the vehicle frame.
+
+    Returns:
+        (P,) yaw in radians.
+
+    Raises:
+        ValueError: `heading` is neither "narrow", "wide" nor a finite number.
     """
     if heading in ("narrow", "wide"):
-        towards_m = 0.0 - compute_outline_offsets_m(vehicle_box, positions_m)  # no -0.0, which is another angle
+        # 0.0 - x instead of -x: the arctangent of -0.0 is another angle.
+        towards_vehicle_m = 0.0 - compute_outline_offsets_m(vehicle_box, positions_m)
         length_m, width_m, _ = target_box.size_m
-        # Whoever looks along the longer side sees the narrow one.
-        along_x = (length_m >= width_m) == (heading == "narrow")
-        return np.asarray(np.arctan2(towards_m[:, 1], towards_m[:, 0]) - (0.0 if along_x else math.pi / 2))
+        # The narrow side faces a viewer who looks along the longer side.
+        is_along_x = (length_m >= width_m) == (heading == "narrow")
+        offset_rad = 0.0 if is_along_x else math.pi / 2
+        return np.asarray(np.arctan2(towards_vehicle_m[:, 1], towards_vehicle_m[:, 0]) - offset_rad)
     if isinstance(heading, str) or not math.isfinite(heading):
         raise ValueError(f"heading: narrow, wide or degrees are needed; got {heading!r}")
     return np.full(len(positions_m), math.radians(heading))
 
 
 def build_poses(positions_m: Float64, yaw_rad: Float64) -> Float64:
-    """(P, 4, 4) `vehicle_T_target` of targets on the plane z = 0 of the vehicle frame, until the ground is known."""
+    """Build poses on the plane z = 0 of the vehicle frame.
+
+    Args:
+        positions_m: (P, 2) positions.
+        yaw_rad: (P,) yaw angles.
+
+    Returns:
+        (P, 4, 4) poses.
+    """
     matrices = np.tile(np.eye(4), (len(positions_m), 1, 1))
     cos, sin = np.cos(yaw_rad), np.sin(yaw_rad)
     matrices[:, 0, 0], matrices[:, 0, 1], matrices[:, 1, 0], matrices[:, 1, 1] = cos, -sin, sin, cos
@@ -179,72 +217,121 @@ def build_poses(positions_m: Float64, yaw_rad: Float64) -> Float64:
     return matrices
 
 
-def compute_ground_heights_m(instant: SceneSnapshot, positions_m: Float64) -> Float64:
-    """(P,) z of the ground in the vehicle frame at (P, 2) places; NaN where there is none.
-
-    Of several grounds above each other that counts which somebody walks on who comes from the vehicle: the highest that
-    is no farther above its plane than a metre and a slope of 15 %.
-    """
-    away_m = np.linalg.norm(positions_m, axis=1)
-    z_m = NEAR_M + STEEPEST_WAY * away_m
-    # The vertical of the world is not that of the vehicle: where the first look ends, a second one looks down.
-    for _ in range(2):
-        z_m = z_m - instant.compute_heights_m(np.column_stack([positions_m, z_m]))
-    # Rounding makes no slope.
-    return np.where(np.abs(z_m) < LEVEL_M, 0.0, z_m)
-
-
 def set_pose_heights(vehicle_T_target: Float64, z_m: Float64) -> Float64:
-    """(P, 4, 4) the same poses at other heights, (P,)."""
+    """Set the heights of poses.
+
+    Args:
+        vehicle_T_target: (P, 4, 4) poses.
+        z_m: (P,) heights in the vehicle frame.
+
+    Returns:
+        (P, 4, 4) copies of the poses at these heights.
+    """
     poses = vehicle_T_target.copy()
     poses[:, 2, 3] = z_m
     return poses
 
 
-def is_point_inside(box: BoundingBox, vehicle_T_target: Float64, point_m: Float64) -> Bools:
-    """(P,) whether a target's box holds a (3,) place of the vehicle frame."""
-    there_m = np.einsum("pji,pj->pi", vehicle_T_target[:, :3, :3], point_m - vehicle_T_target[:, :3, 3])
-    return np.asarray(((there_m > box.lower_m) & (there_m < box.upper_m)).all(axis=1))
+def compute_ground_heights_m(instant: SceneSnapshot, positions_m: Float64) -> Float64:
+    """Compute the height of the ground at positions around the vehicle.
 
+    Where several road levels lie above each other, the level is used that can be reached on foot from the vehicle: the
+    highest that is at most 1 m plus 15 % of the distance above the plane of the vehicle.
 
-def is_blocked(instant: SceneSnapshot, box: BoundingBox, surface_points_m: Float64, vehicle_T_target: Float64) -> Bools:
-    """(P,) whether anything but the ego takes a target's room, (P, 4, 4) poses of its box.
+    Args:
+        instant: Scene at one time.
+        positions_m: (P, 2) positions in the vehicle frame.
 
-    What moves does so with its box. Of what rests, its faces are asked: whether one lies between the middle of the
-    target and one of (M, 3) points of its surface, or the middle is behind one. Kerbs of up to 0.2 m do not count.
+    Returns:
+        (P,) z of the ground in the vehicle frame; NaN where there is none.
     """
-    taken = np.zeros(len(vehicle_T_target), dtype=bool)
-    moving, reach_m = instant.moving_bodies, float(np.linalg.norm(box.corners_m, axis=1).max())
-    away_m = np.linalg.norm(vehicle_T_target[:, None, :3, 3] - moving.center_m, axis=2)
-    near = (away_m <= moving.radius_m + reach_m) & (moving.body_indices != instant.ego_index)
-    for k in np.flatnonzero(near.any(axis=0)).tolist():
-        taken[near[:, k]] |= find_overlaps(box, vehicle_T_target[near[:, k]], moving.box_corners_m[k])
-    return taken | _meets_static(instant, box, surface_points_m, vehicle_T_target)
+    distance_m = np.linalg.norm(positions_m, axis=1)
+    z_m = 1.0 + 0.15 * distance_m
+    # The vertical axes of the world and of the vehicle differ: the second iteration starts where the first one ended.
+    for _ in range(2):
+        z_m = z_m - instant.compute_heights_m(np.column_stack([positions_m, z_m]))
+    return np.where(np.abs(z_m) < 1e-3, 0.0, z_m)  # rounding is no slope
 
 
-def _meets_static(instant: SceneSnapshot, box: BoundingBox, samples_m: Float64, vehicle_T_target: Float64) -> Bools:
-    height_m = box.upper_m[2]
-    middle_m = (np.array(box.lower_m) + np.array(box.upper_m)) / 2
-    low_m = min(STEP_UP_M, height_m / 2)
-    ends_m = np.column_stack([samples_m[:, :2], np.maximum(samples_m[:, 2], low_m)])
-    ways_m = (ends_m - middle_m) * (1 - TOUCHING_SHARE)
-    ways_m = ways_m[np.linalg.norm(ways_m, axis=1) > 0]
+def is_point_inside(box: BoundingBox, vehicle_T_target: Float64, point_m: Float64) -> Bools:
+    """Test whether a point lies inside the bounding box of a target at several poses.
+
+    Args:
+        box: Bounding box of the target in its own frame.
+        vehicle_T_target: (P, 4, 4) poses of the target.
+        point_m: (3,) point in the vehicle frame.
+
+    Returns:
+        (P,) True where the box contains the point.
+    """
+    point_in_target_m = np.einsum("pji,pj->pi", vehicle_T_target[:, :3, :3], point_m - vehicle_T_target[:, :3, 3])
+    return np.asarray(((point_in_target_m > box.lower_m) & (point_in_target_m < box.upper_m)).all(axis=1))
+
+
+def is_blocked(
+    instant: SceneSnapshot,
+    box: BoundingBox,
+    surface_points_m: Float64,
+    vehicle_T_target: Float64,
+    params: CollisionParams = CollisionParams(),
+) -> Bools:
+    """Test whether other bodies than the ego vehicle occupy the space of a target.
+
+    Moving bodies block a target if their bounding boxes overlap. Static bodies block it if one of their faces lies
+    between its center and a point of its surface, or if its center is inside one of them.
+
+    Args:
+        instant: Scene at one time, without the target.
+        box: Bounding box of the target in its own frame.
+        surface_points_m: (M, 3) points of the target's surface in its own frame.
+        vehicle_T_target: (P, 4, 4) poses of the target.
+        params: Tolerances.
+
+    Returns:
+        (P,) True where the target has no room.
+    """
+    is_occupied = find_static_collisions(instant, box, surface_points_m, vehicle_T_target, params)
+    moving = instant.moving_bodies
+    radius_m = float(np.linalg.norm(box.corners_m, axis=1).max())
+    distance_m = np.linalg.norm(vehicle_T_target[:, None, :3, 3] - moving.center_m, axis=2)
+    is_near = (distance_m <= moving.radius_m + radius_m) & (moving.body_indices != instant.ego_index)
+    for index in np.flatnonzero(is_near.any(axis=0)).tolist():
+        nearby = is_near[:, index]
+        is_occupied[nearby] |= find_overlaps(box, vehicle_T_target[nearby], moving.box_corners_m[index])
+    return is_occupied
+
+
+def find_static_collisions(
+    instant: SceneSnapshot,
+    box: BoundingBox,
+    surface_points_m: Float64,
+    vehicle_T_target: Float64,
+    params: CollisionParams,
+) -> Bools:
+    """Test whether static bodies occupy the space of a target; arguments and result as in `is_blocked`."""
+    center_m = (np.array(box.lower_m) + np.array(box.upper_m)) / 2
+    min_height_m = min(params.max_step_m, box.upper_m[2] / 2)
+    ends_m = np.column_stack([surface_points_m[:, :2], np.maximum(surface_points_m[:, 2], min_height_m)])
+    rays_m = (ends_m - center_m) * (1 - params.contact_share)
+    rays_m = rays_m[np.linalg.norm(rays_m, axis=1) > 0]
     static_T_target = instant.static_T_vehicle @ vehicle_T_target
-    starts_m = static_T_target[:, :3, :3] @ middle_m + static_T_target[:, :3, 3]
-    towards_m = np.einsum("pij,mj->pmi", static_T_target[:, :3, :3], ways_m).reshape(-1, 3)
-    length_m = np.tile(np.linalg.norm(ways_m, axis=1), len(starts_m))
-    directions = (towards_m / length_m[:, None]).T.astype(np.float32)
-    origins_m = starts_m.astype(np.float32).repeat(len(ways_m), axis=0)
-    hits = instant.static_caster.cast_from_each(origins_m, directions, length_m.astype(np.float32))
-    met: Bools = (hits.body_indices >= 0) & (hits.body_indices != instant.ego_index)
-    up = np.zeros((3, len(starts_m)), dtype=np.float32)
-    up[:] = (instant.static_T_vehicle[:3, 2])[:, None]
-    above = instant.static_caster.cast_from_each(
-        starts_m.astype(np.float32), up, np.full(len(starts_m), np.inf, dtype=np.float32)
+    centers_m = static_T_target[:, :3, :3] @ center_m + static_T_target[:, :3, 3]
+    static_rays_m = np.einsum("pij,mj->pmi", static_T_target[:, :3, :3], rays_m).reshape(-1, 3)
+    length_m = np.tile(np.linalg.norm(rays_m, axis=1), len(centers_m))
+    hits = instant.static_caster.cast_from_each(
+        centers_m.astype(np.float32).repeat(len(rays_m), axis=0),
+        (static_rays_m / length_m[:, None]).T.astype(np.float32),
+        length_m.astype(np.float32),
     )
-    inside = above.body_indices >= 0  # of something, perhaps
-    inside[inside] = [
-        (instant.static_caster.find_enclosing_bodies(place_m) != instant.ego_index).any()
-        for place_m in starts_m[inside]
-    ]
-    return np.asarray(met.reshape(len(starts_m), -1).any(axis=1) | inside)
+    is_hit: Bools = (hits.body_indices >= 0) & (hits.body_indices != instant.ego_index)
+    up = np.zeros((3, len(centers_m)), dtype=np.float32)
+    up[:] = (instant.static_T_vehicle[:3, 2])[:, None]
+    hits_above = instant.static_caster.cast_from_each(
+        centers_m.astype(np.float32), up, np.full(len(centers_m), np.inf, dtype=np.float32)
+    )
+    # Only a center with a face above it can be inside a body; the exact test is slow.
+    is_inside = hits_above.body_indices >= 0
+    for index in np.flatnonzero(is_inside).tolist():
+        enclosing = instant.static_caster.find_enclosing_bodies(centers_m[index])
+        is_inside[index] = (enclosing != instant.ego_index).any()
+    return np.asarray(is_hit.reshape(len(centers_m), -1).any(axis=1) | is_inside)

@@ -1,4 +1,4 @@
-"""What a rig sees of a target, for every place around the vehicle, and the files of such a map."""
+"""Maps of the visibility of a test target around the vehicle, and their files."""
 
 import math
 from dataclasses import dataclass
@@ -19,21 +19,31 @@ if TYPE_CHECKING:
     import xarray
     from matplotlib.figure import Figure
 
-import json
-from pathlib import Path
-
-from torchcover.files import format_csv, write_npz
-
-# What a cell is: there is room for the target in a step at least; the vehicle is there; there is none in any step.
+# States of a position: room for the target in at least one frame; overlaps the vehicle; no room in any frame.
 STATES = ("free", "occupied", "outside")
-FREE, OCCUPIED, OUTSIDE = range(3)
-WITHIN_M = (1.0, 2.0, 3.0)
-MAPS = ("distance_m", "side", "state", "free_frames", "points", "detecting_sensors", "detected_share", "min_points", "min_sensors", "surface_share",
-        "visible_m2")  # fmt: skip
+FREE = 0
+OCCUPIED = 1
+OUTSIDE = 2
+
+# Arrays of a map that have one value for each cell, in the order of the columns of tables.
+CELL_ARRAYS = (
+    "state", "free_frames", "points", "detecting_sensors", "detected_share", "min_points", "min_sensors",
+    "surface_share", "visible_m2",
+)  # fmt: skip
 
 
 class TargetPosition(NamedTuple):
-    """A target at one cell: where it stands, how far from the vehicle's outline, on which side, what is seen of it."""
+    """Visibility of a target at one position.
+
+    Args:
+        x_m: Position forward in the vehicle frame.
+        y_m: Position to the left.
+        distance_m: Distance from the bounding box of the vehicle.
+        side: Side of the vehicle in `SIDES`; empty within the box.
+        points: Mean number of points of all sensors on the target.
+        detecting_sensors: Mean number of sensors with enough points each.
+        surface_share: Share of the visible surface within the threshold of a measured point.
+    """
 
     x_m: float
     y_m: float
@@ -45,7 +55,14 @@ class TargetPosition(NamedTuple):
 
 
 class SideShare(NamedTuple):
-    """Of the cells of one side within a distance: how many are free, and the share of the steps with enough points."""
+    """Detection on one side of the vehicle, within a distance.
+
+    Args:
+        side: Side in `SIDES`.
+        max_distance_m: Largest distance from the bounding box of the vehicle.
+        free_cells: Number of cells in which the target has room.
+        detected_share: Mean share of frames in which the target is detected there; NaN without free cells.
+    """
 
     side: str
     max_distance_m: float
@@ -55,7 +72,19 @@ class SideShare(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class PositionVisibility:
-    """What some sensors get of a target at P places: the arrays of `TargetMap` that are called so, of one row."""
+    """Visibility of a target for some sensors at P positions.
+
+    Args:
+        state: (P,) uint8 index in `STATES`.
+        free_frames: (P,) frames in which the target has room.
+        sensor_points: (S, P) mean number of points of each sensor on the target.
+        detecting_sensors: (P,) mean number of sensors with enough points each.
+        detected_share: (P,) share of the frames in which all sensors together have enough points.
+        min_points: (P,) minimum over the frames of the points of all sensors.
+        min_sensors: (P,) minimum over the frames of the number of sensors with enough points each.
+        surface_share: (P,) share of the visible surface within the threshold of a measured point.
+        visible_m2: (P,) visible surface in square meters.
+    """
 
     state: NDArray[np.uint8]
     free_frames: Int64
@@ -70,34 +99,34 @@ class PositionVisibility:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class TargetMap(PositionVisibility):
-    """What a rig sees of a target, for every cell of a raster. Rows are y, columns are x; NaN where it cannot stand.
+    """Visibility of a target for a rig in every cell of a raster. Rows are y, columns are x; NaN without a target.
 
     Args:
+        state: (Y, X) uint8 index in `STATES`.
+        free_frames: (Y, X) frames in which the target has room.
+        sensor_points: (S, Y, X) mean number of points of each sensor on the target.
+        detecting_sensors: (Y, X) mean number of sensors with enough points each.
+        detected_share: (Y, X) share of the frames in which all sensors together have enough points.
+        min_points: (Y, X) minimum over the frames of the points of all sensors.
+        min_sensors: (Y, X) minimum over the frames of the number of sensors with enough points each.
+        surface_share: (Y, X) share of the visible surface within the threshold; also NaN where none is visible.
+        visible_m2: (Y, X) visible surface in square meters.
         rig: Name of the rig.
-        scenario: Name of the world.
+        scenario: Name of the scenario.
         target: Name of the target.
-        target_size_m: Extent of its box.
+        target_size_m: Size of its bounding box.
         target_bottom_m: Height of its lowest point above the ground.
-        heading: How it stands; see `Heading`.
+        heading: Its orientation; see `Heading`.
         raster: The cells.
-        vehicle_box: Box of the vehicle.
-        vehicle_outline_m: (K, 2) what is drawn of it.
-        sensor_model: What its sensors make of their hits, `ideal` or `real`.
-        sensor_names: Of the rig.
-        sensor_positions_m: (S, 2) where they are, seen from above.
-        detection_points: How many points are enough.
-        threshold_m: How near a point of its surface must be to a measured one.
-        seed: Of the simulation.
-        num_frames: How many steps were simulated.
-        state: (Y, X) uint8, a number of `STATES`.
-        steps: (Y, X) in how many of them the target had room.
-        sensor_points: (S, Y, X) mean number of points of each sensor on it.
-        sensors: (Y, X) mean number of sensors with enough points each.
-        seen: (Y, X) share of the steps with enough points of all sensors together.
-        min_points: (Y, X) fewest points on it in any step.
-        min_sensors: (Y, X) fewest sensors with enough points each in any step.
-        share: (Y, X) share of its visible surface within the threshold; NaN too where none is visible.
-        visible_m2: (Y, X) its visible surface.
+        vehicle_box: Bounding box of the vehicle.
+        vehicle_outline_m: (K, 2) outline of the vehicle in plots.
+        sensor_model: Sensor model, `ideal` or `real`.
+        sensor_names: Names of the S sensors of the rig.
+        sensor_positions_m: (S, 2) positions of the sensors in bird's-eye view.
+        detection_points: Points that are enough to detect the target.
+        threshold_m: Largest distance from a measured point at which a point of the surface counts as detected.
+        seed: Seed of the simulation.
+        num_frames: Number of simulated frames.
     """
 
     rig: str
@@ -119,88 +148,130 @@ class TargetMap(PositionVisibility):
 
     @property
     def x_m(self) -> Float64:
-        """(X,) middles of the columns."""
+        """(X,) centers of the columns."""
         return self.raster.x_m
 
     @property
     def y_m(self) -> Float64:
-        """(Y,) middles of the rows."""
+        """(Y,) centers of the rows."""
         return self.raster.y_m
 
     @property
     def points(self) -> Float64:
-        """(Y, X) mean number of points on it, of all sensors."""
+        """(Y, X) mean number of points of all sensors on the target."""
         return np.asarray(self.sensor_points.sum(axis=0))
 
     @property
     def free_mask(self) -> Bools:
-        """(Y, X) whether it can stand there."""
+        """(Y, X) True where the target has room in at least one frame."""
         return np.asarray(self.state == FREE)
 
     @property
     def detected_mask(self) -> Bools:
-        """(Y, X) whether it is seen: by `hits` points at least, in every step."""
-        enough: Bools = np.nan_to_num(self.min_points) >= self.detection_points
-        return enough & self.free_mask
+        """(Y, X) True where the target has at least `detection_points` points in every frame."""
+        has_enough_points: Bools = np.nan_to_num(self.min_points) >= self.detection_points
+        return has_enough_points & self.free_mask
 
     @property
     def distance_m(self) -> Float64:
-        """(Y, X) from the middle of each cell to the vehicle's box, seen from above; 0 within it."""
-        away_m: Float64 = np.linalg.norm(compute_outline_offsets_m(self.vehicle_box, self.raster.positions_m), axis=1)
-        return away_m.reshape(self.raster.shape)
+        """(Y, X) distance of the cell centers from the vehicle's box in bird's-eye view; 0 within the box."""
+        offsets_m = compute_outline_offsets_m(self.vehicle_box, self.raster.positions_m)
+        distance_m: Float64 = np.linalg.norm(offsets_m, axis=1)
+        return distance_m.reshape(self.raster.shape)
 
     @property
     def side(self) -> Int64:
-        """(Y, X) number in `SIDES` of the side that each cell is on, from corners at 45 degrees; -1 within the box."""
+        """(Y, X) side of the vehicle as an index in `SIDES`; -1 within its box."""
         return find_sides(self.vehicle_box, self.raster.positions_m).reshape(self.raster.shape)
 
-    def summarize_sides(self, max_distances_m: tuple[float, ...] = WITHIN_M) -> list[SideShare]:
-        """Where it is seen, side by side: for each side, within each distance; NaN where no cell is free."""
+    def summarize_sides(self, max_distances_m: tuple[float, ...] = (1.0, 2.0, 3.0)) -> list[SideShare]:
+        """Summarize the detection on each side of the vehicle.
+
+        Args:
+            max_distances_m: Distances from the vehicle's box; each row covers all cells up to one of them.
+
+        Returns:
+            One row for each side and distance.
+        """
         side, distance_m, rows = self.side, self.distance_m, []
-        for number, name in enumerate(SIDES):
-            for limit_m in max_distances_m:
-                there = self.free_mask & (side == number) & (distance_m <= limit_m)
-                cells = int(there.sum())
-                rows.append(
-                    SideShare(name, limit_m, cells, float(self.detected_share[there].mean()) if cells else math.nan)
-                )
+        for index, name in enumerate(SIDES):
+            for max_distance_m in max_distances_m:
+                mask = self.free_mask & (side == index) & (distance_m <= max_distance_m)
+                detected_share = float(self.detected_share[mask].mean()) if mask.any() else math.nan
+                rows.append(SideShare(name, max_distance_m, int(mask.sum()), detected_share))
         return rows
 
     def compute_detected_share(self, max_distance_m: float) -> float:
-        """Share of the free places within a distance where it is seen; NaN if none is free."""
-        near = self.free_mask & (self.distance_m <= max_distance_m)
-        return float(self.detected_mask[near].mean()) if near.any() else math.nan
+        """Compute the share of the free cells within a distance in which the target is detected; NaN if none is free.
+
+        Args:
+            max_distance_m: Largest distance from the vehicle's box.
+
+        Returns:
+            Share from 0 to 1.
+        """
+        mask = self.free_mask & (self.distance_m <= max_distance_m)
+        return float(self.detected_mask[mask].mean()) if mask.any() else math.nan
 
     def compute_failure_effects_m2(self, max_distance_m: float) -> dict[str, float]:
-        """For each sensor, how much more is not seen within a distance when it fails: fewer points than enough."""
-        near = self.detected_mask & (self.distance_m <= max_distance_m)
-        left = self.points - self.sensor_points
-        m2 = (near & (left < self.detection_points)).sum(axis=(1, 2)) * self.raster.cell_m**2
-        return dict(zip(self.sensor_names, m2.tolist(), strict=True))
+        """Compute the area in which the target is no longer detected if one sensor fails.
+
+        Args:
+            max_distance_m: Largest distance from the vehicle's box.
+
+        Returns:
+            Lost area in square meters for each sensor.
+        """
+        mask = self.detected_mask & (self.distance_m <= max_distance_m)
+        remaining_points = self.points - self.sensor_points
+        is_lost = mask & (remaining_points < self.detection_points)
+        lost_m2 = is_lost.sum(axis=(1, 2)) * self.raster.cell_m**2
+        return dict(zip(self.sensor_names, lost_m2.tolist(), strict=True))
 
     def find_max_undetected_ranges_m(self) -> dict[str, float]:
-        """For each side, how far the farthest free cell without enough points is; 0 if all have, NaN if none is."""
-        farthest_m = {}
-        for number, name in enumerate(SIDES):
-            there = self.free_mask & (self.side == number)
-            unseen_m = self.distance_m[there & ~self.detected_mask]
-            farthest_m[name] = float(unseen_m.max(initial=0.0)) if there.any() else math.nan
-        return farthest_m
+        """Find the distance of the farthest free cell in which the target is not detected.
+
+        Returns:
+            Distance from the vehicle's box for each side; 0 if the target is detected in all free cells, NaN if no
+            cell is free.
+        """
+        max_ranges_m = {}
+        for index, name in enumerate(SIDES):
+            mask = self.free_mask & (self.side == index)
+            undetected_m = self.distance_m[mask & ~self.detected_mask]
+            max_ranges_m[name] = float(undetected_m.max(initial=0.0)) if mask.any() else math.nan
+        return max_ranges_m
 
     def find_worst_positions(self, count: int = 10, min_spacing_m: float = 1.0) -> list[TargetPosition]:
-        """The places with the fewest points, and of those the nearest first; no two within a distance of each other."""
+        """Find the free positions with the fewest points; among equals, the nearest first.
+
+        Args:
+            count: Largest number of positions.
+            min_spacing_m: Smallest distance between two of them.
+
+        Returns:
+            The positions, the worst first.
+        """
         row, column = np.nonzero(self.free_mask)
         order = np.lexsort((self.distance_m[row, column], self.points[row, column]))
         row, column = row[order], column[order]
-        worst: list[TargetPosition] = []
-        while len(row) and len(worst) < count:
-            worst.append(self.get_position(int(row[0]), int(column[0])))
-            away_m = np.hypot(self.x_m[column] - worst[-1].x_m, self.y_m[row] - worst[-1].y_m)
-            row, column = row[away_m >= min_spacing_m], column[away_m >= min_spacing_m]
-        return worst
+        positions: list[TargetPosition] = []
+        while len(row) and len(positions) < count:
+            positions.append(self.get_position(int(row[0]), int(column[0])))
+            spacing_m = np.hypot(self.x_m[column] - positions[-1].x_m, self.y_m[row] - positions[-1].y_m)
+            row, column = row[spacing_m >= min_spacing_m], column[spacing_m >= min_spacing_m]
+        return positions
 
     def get_position(self, row: int, column: int) -> TargetPosition:
-        """What is seen at one cell."""
+        """Get the visibility in one cell.
+
+        Args:
+            row: Row of the cell.
+            column: Column of the cell.
+
+        Returns:
+            The visibility.
+        """
         side = int(self.side[row, column])
         return TargetPosition(
             x_m=float(self.x_m[column]),
@@ -213,43 +284,52 @@ class TargetMap(PositionVisibility):
         )
 
     def compute_detection_border_m(self) -> Float64:
-        """(3 E, 2) the border between free cells where it is seen and where not: the ends of each edge, and NaN."""
-        seen, free, half_m = self.detected_mask, self.free_mask, self.raster.cell_m / 2
+        """Compute the border between free cells in which the target is detected and free cells in which it is not.
+
+        Returns:
+            (3 E, 2) both ends of each of E edges, followed by NaN, so that one plotted line shows all edges.
+        """
+        detected, free, half_m = self.detected_mask, self.free_mask, self.raster.cell_m / 2
         x, y = np.meshgrid(self.x_m, self.y_m)
-        upright = (seen[:, 1:] != seen[:, :-1]) & free[:, 1:] & free[:, :-1]
-        level = (seen[1:] != seen[:-1]) & free[1:] & free[:-1]
-        parts = []
-        for at, (of_x, of_y), along in (
-            (upright, (x[:, :-1], y[:, :-1]), (0.0, 2.0)),
-            (level, (x[:-1], y[:-1]), (2.0, 0.0)),
-        ):
-            end = np.stack([of_x[at], of_y[at]], axis=1) + half_m  # ahead and to the left
-            parts.append(np.stack([end, end - half_m * np.array(along), np.full_like(end, math.nan)], axis=1))
-        return np.asarray(np.concatenate(parts).reshape(-1, 2))
+        between_columns = (detected[:, 1:] != detected[:, :-1]) & free[:, 1:] & free[:, :-1]
+        between_rows = (detected[1:] != detected[:-1]) & free[1:] & free[:-1]
+        edges_along_y = x[:, :-1][between_columns], y[:, :-1][between_columns], (0.0, 2.0)
+        edges_along_x = x[:-1][between_rows], y[:-1][between_rows], (2.0, 0.0)
+        lines_m = []
+        for center_x, center_y, direction in (edges_along_y, edges_along_x):
+            begin_m = np.stack([center_x, center_y], axis=1) + half_m  # corner ahead and to the left
+            end_m = begin_m - half_m * np.array(direction)
+            lines_m.append(np.stack([begin_m, end_m, np.full_like(begin_m, math.nan)], axis=1))
+        return np.asarray(np.concatenate(lines_m).reshape(-1, 2))
 
     def __repr__(self) -> str:
-        return f"TargetMap of {self.target} around {self.rig}: {self.raster.shape} places, {self.num_frames} steps"
+        return f"TargetMap of {self.target} around {self.rig}: {self.raster.shape} positions, {self.num_frames} frames"
 
     def _repr_html_(self) -> str:
-        near = (
-            f"{side.side} {format_percent(side.detected_share)} %"
-            for side in self.summarize_sides(WITHIN_M[-1:])
-            if side.free_cells
-        )
-        where = f"Free places within {WITHIN_M[-1]:g} m where it gets {self.detection_points} points or more: {', '.join(near)}."
-        return build_result_html([f"Would {self.rig} see {self.target}?", where], self.plot())
+        max_distance_m = 3.0
+        shares = []
+        for side in self.summarize_sides((max_distance_m,)):
+            if side.free_cells:
+                shares.append(f"{side.side} {format_percent(side.detected_share)} %")
+        criterion = f"with {self.detection_points} points or more"
+        sentence = f"Free positions within {max_distance_m:g} m {criterion}: {', '.join(shares)}."
+        return build_result_html([f"Detection of {self.target} by {self.rig}", sentence], self.plot())
 
     @property
     def target_description(self) -> str:
-        """Extent of the target, and how high above the ground it is."""
+        """Size of the target and its height above the ground."""
         length, width, height = self.target_size_m
         low, high = self.target_bottom_m, self.target_bottom_m + height
         return f"{length:.2f} x {width:.2f} x {height:.2f} m, {low:.2f} to {high:.2f} m above the ground"
 
     def plot(self) -> "Figure":
-        """The points on the target at every place, with the border of what is seen: a figure of its own."""
+        """Plot the points on the target in every cell and the border of detection.
+
+        Returns:
+            A new figure.
+        """
         heading = f"{self.heading} side to the vehicle" if isinstance(self.heading, str) else f"yaw {self.heading:g}°"
-        steps = f"{self.num_frames} step{'s' if self.num_frames > 1 else ''}"
+        frames = f"{self.num_frames} frame{'s' if self.num_frames > 1 else ''}"
         return plot_target_visibility(
             self.points,
             self.detected_mask,
@@ -259,38 +339,46 @@ class TargetMap(PositionVisibility):
             sensors_m=self.sensor_positions_m,
             min_points=self.detection_points,
             title=f"{self.rig}: points on {self.target}",
-            subtitle=f"{self.target_description}, {heading}; {self.scenario}, {steps}",
+            subtitle=f"{self.target_description}, {heading}; {self.scenario}, {frames}",
         )
 
     def to_dataframe(self) -> "pandas.DataFrame":
-        """A row for each cell, with its middle, `distance_m`, `side`, `state` and all maps.
+        """Convert to a table with a row for each cell: its center, `distance_m`, `side`, `state` and all maps.
+
+        Returns:
+            The table.
 
         Raises:
-            ModuleNotFoundError: pandas is not there.
+            ModuleNotFoundError: pandas is not installed.
         """
-        maps = self.to_xarray().to_dataframe().reset_index()
-        maps["side"] = [SIDES[side] if side >= 0 else "" for side in self.side.ravel()]
-        maps["state"] = [STATES[state] for state in self.state.ravel()]
-        return maps
+        table = self.to_xarray().to_dataframe().reset_index()
+        table["side"] = [SIDES[side] if side >= 0 else "" for side in self.side.ravel()]
+        table["state"] = [STATES[state] for state in self.state.ravel()]
+        return table
 
     def to_xarray(self) -> "xarray.Dataset":
-        """The maps, and `points_SENSOR` of each sensor, over `y_m` and `x_m`, the middles of the cells.
+        """Convert to maps over the cell centers `y_m` and `x_m`; `points_SENSOR` are the points of one sensor.
+
+        Returns:
+            The maps.
 
         Raises:
-            ModuleNotFoundError: xarray is not there.
+            ModuleNotFoundError: xarray is not installed.
         """
-        maps: dict[str, NDArray[Any]] = {name: getattr(self, name) for name in MAPS}
-        maps |= {f"points_{name}": of for name, of in zip(self.sensor_names, self.sensor_points, strict=True)}
+        maps: dict[str, NDArray[Any]] = {name: getattr(self, name) for name in ("distance_m", "side", *CELL_ARRAYS)}
+        for name, sensor_points in zip(self.sensor_names, self.sensor_points, strict=True):
+            maps[f"points_{name}"] = sensor_points
         return build_xarray_dataset(maps, {"y_m": self.y_m, "x_m": self.x_m})
 
     @property
     def counts(self) -> dict[str, int]:
-        """How many cells there are of each state, and how many are free and have an unknown share."""
-        states = {name: int((self.state == number).sum()) for number, name in enumerate(STATES)}
-        return {**states, "surface_share_unobserved": int((self.free_mask & np.isnan(self.surface_share)).sum())}
+        """Number of cells in each state, and of free cells whose surface is not visible from any viewpoint."""
+        counts = {name: int((self.state == index).sum()) for index, name in enumerate(STATES)}
+        counts["surface_share_unobserved"] = int((self.free_mask & np.isnan(self.surface_share)).sum())
+        return counts
 
     def get_settings(self) -> dict[str, Any]:
-        """What it is of, for JSON."""
+        """Get the settings of the measurement, for JSON."""
         return {
             "rig": self.rig,
             "scenario": self.scenario,
@@ -310,51 +398,3 @@ class TargetMap(PositionVisibility):
             "seed": self.seed,
             "num_frames": self.num_frames,
         }
-
-
-COLUMNS = ("x_m", "y_m", "distance_m", "side", "state", "free_frames", "points", "detecting_sensors", "detected_share", "min_points",
-           "min_sensors", "surface_share", "visible_m2")  # fmt: skip
-
-ARRAYS = ("x_m", "y_m", "state", "free_frames", "points", "sensor_points", "detecting_sensors", "detected_share", "min_points",
-          "min_sensors", "surface_share", "visible_m2",
-          "distance_m", "side", "vehicle_outline_m")  # fmt: skip
-
-
-def write_csv(target_map: TargetMap, path: Path) -> None:
-    """One row a cell, row by row; empty where nothing is known. Last columns: the points of each sensor."""
-    rows: list[list[object]] = [[*COLUMNS, *(f"points_{name}" for name in target_map.sensor_names)]]
-    points = target_map.points
-    for row, column in np.ndindex(target_map.raster.shape):
-        at = row, column
-        place = target_map.get_position(row, column)
-        means = points[at], target_map.detecting_sensors[at], target_map.detected_share[at]
-        known = (
-            *means,
-            target_map.min_points[at],
-            target_map.min_sensors[at],
-            target_map.surface_share[at],
-            target_map.visible_m2[at],
-        )
-        of_sensors = target_map.sensor_points[(slice(None), row, column)]
-        rows.append([
-            f"{place.x_m:.9g}", f"{place.y_m:.9g}", f"{place.distance_m:.9g}", place.side, STATES[target_map.state[at]],
-            int(target_map.free_frames[at]), *(_number(value) for value in (*known, *of_sensors)),
-        ])  # fmt: skip
-    path.write_text(format_csv(rows), encoding="utf-8")
-
-
-def _number(value: float) -> str:
-    return "" if np.isnan(value) else f"{value:.9g}"
-
-
-def write_arrays(target_map: TargetMap, path: Path) -> None:
-    """All arrays, and the settings as JSON text in `settings`; `np.load` reads it."""
-    arrays = {name: getattr(target_map, name) for name in ARRAYS}
-    write_npz(
-        path,
-        {
-            **arrays,
-            "detection_border_m": target_map.compute_detection_border_m(),
-            "settings": np.array(json.dumps(target_map.get_settings())),
-        },
-    )

@@ -1,4 +1,4 @@
-"""A target: a body that is put beside the vehicle, and the points of its surface."""
+"""Test targets and the sample points of their surface."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,17 +18,21 @@ from torchcover.simulation.sight import SHORTER, compute_visibility
 from torchcover.simulation.surface_reference import ABOVE_M
 from torchcover.simulation.surface_strata import PLANE_STEPS
 
-# What people say -> the built-in body that is meant, whose name has its size.
+PackedBits = NDArray[np.uint8]
+
+# Short names of test targets and the built-in bodies that they stand for; the names of the bodies include their size.
 TARGETS = {"child": "child_110cm", "adult": "adult", "dog": "dog_57cm", "cyclist": "cyclist", "pole": "pole_100cm"}
+# Sample points on the surface of a target, a multiple of 8 because their visibility is stored as packed bits.
+NUM_SAMPLES = 64
 
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """A body that is asked about. It keeps the height above the ground at which its file places it.
+    """Body whose visibility is tested. It keeps the height above the ground at which its file places it.
 
     Args:
-        name: What tables call it: the name of the body, with its size where it is built in for this.
-        mesh: Its form; origin on the ground under the center of its bounding box, x ahead, z up.
+        name: Name in tables: the name of the body, which includes the size for the built-in test targets.
+        mesh: Shape; the origin is on the ground below the center of the bounding box, x points ahead, z up.
 
     Example:
         >>> child = Target.load("child")
@@ -41,7 +45,7 @@ class Target:
 
     @cached_property
     def solid(self) -> BodyGeometry:
-        """Its geometry, to cast rays at."""
+        """Geometry for ray casting."""
         return BodyGeometry(self.mesh)
 
     def __getstate__(self) -> dict[str, object]:
@@ -49,39 +53,38 @@ class Target:
 
     @property
     def bottom_m(self) -> float:
-        """Height of its lowest point above the ground, in meters."""
+        """Height of the lowest point above the ground, in meters."""
         return self.solid.bounding_box.lower_m[2]
 
     @classmethod
     def load(cls, name_or_path: str | Path) -> Self:
-        """One of `TARGETS`, a built-in vehicle by its name, the YAML file of one, or a mesh file in meters.
+        """Load a test target.
 
-        The ground is z = 0 of the file: what lies above stays there, and what reaches below is put on the ground.
+        Args:
+            name_or_path: One of `TARGETS`, the name of a built-in vehicle, the YAML file of a vehicle, or a mesh file
+                in meters. The ground is z = 0 of the file. A mesh above it keeps its height; a mesh that reaches
+                below it is lifted onto it.
+
+        Returns:
+            The target.
 
         Raises:
             FileNotFoundError: No such file or name.
-            ValueError: The file is neither a vehicle nor a mesh, or is flat.
+            ValueError: The file is neither a vehicle nor a mesh, or the mesh is flat.
         """
         name = TARGETS.get(str(name_or_path), str(name_or_path))
         mesh = build_actor_mesh(f"target {name!r}", create_body_shape(name), "target", keep_height=True)
         return cls(Path(name).stem if Path(name).suffix else name, mesh)
 
 
-PackedBits = NDArray[np.uint8]
-
-# A byte of bits has 8 of them.
-SAMPLES = 64
-# Drawn for each that is kept: what lies inside another part of the body is nobody's surface.
-DRAWN_FOR_EACH = 16
-# Rows of distances that are held at once: no more than a cache has room for.
-HITS_AT_ONCE = 512
-
-
 class TargetSurface(NamedTuple):
-    """Points that stand for equal shares of a target's outer surface.
+    """Sample points that represent equal shares of the outer surface of a target.
 
-    `points_m` (M, 3) in the target's frame; `normals` (M, 3) of length one; `is_two_sided` (M,) whether both sides may be
-    looked at, as of what is not closed; `sample_area_m2` the square metres that each stands for.
+    Args:
+        points_m: (M, 3) points in the target frame.
+        normals: (M, 3) unit normals.
+        is_two_sided: (M,) True for faces of an open mesh, of which both sides can be observed.
+        sample_area_m2: Area that each point represents.
     """
 
     points_m: Float64
@@ -91,21 +94,34 @@ class TargetSurface(NamedTuple):
 
     @classmethod
     def from_target(cls, target: Target) -> Self:
-        """Spread the points: equal steps of area over all faces, less what lies within another part of the body."""
+        """Spread `NUM_SAMPLES` points evenly over the outer surface of a target.
+
+        Args:
+            target: The target; surface inside another part of its body is excluded.
+
+        Returns:
+            The sample points.
+        """
         corners_m = target.mesh.vertices_m[target.mesh.faces]
-        across = np.cross(corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0])
-        twice_m2 = np.linalg.norm(across, axis=1)
-        drawn = SAMPLES * DRAWN_FOR_EACH
-        up_to = np.cumsum(twice_m2)
-        face = np.searchsorted(up_to, (np.arange(drawn) + 0.5) / drawn * up_to[-1], side="right")
-        a, b = (np.arange(drawn) * np.array(PLANE_STEPS)[:, None] + 0.5) % 1
+        scaled_normals = np.cross(corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0])
+        doubled_areas_m2 = np.linalg.norm(scaled_normals, axis=1)
+        cumulated_m2 = np.cumsum(doubled_areas_m2)
+        # Enough candidates remain after those inside another part of the body are excluded.
+        num_candidates = 16 * NUM_SAMPLES
+        face = np.searchsorted(
+            cumulated_m2, (np.arange(num_candidates) + 0.5) / num_candidates * cumulated_m2[-1], side="right"
+        )
+        a, b = (np.arange(num_candidates) * np.array(PLANE_STEPS)[:, None] + 0.5) % 1
+        # Points of the unit square beyond its diagonal are mirrored into the triangle.
         a, b = np.where(a + b > 1, 1 - a, a)[:, None], np.where(a + b > 1, 1 - b, b)[:, None]
         points_m = (1 - a - b) * corners_m[face, 0] + a * corners_m[face, 1] + b * corners_m[face, 2]
-        normals, two_sided = across[face] / twice_m2[face][:, None], ~find_outward_faces(target.mesh)[face]
-        outer = np.flatnonzero(two_sided | ~_enclosed(target, points_m + ABOVE_M * normals))
-        kept = outer[(np.arange(SAMPLES) + 0.5).astype(np.int64) * len(outer) // SAMPLES]
-        m2_each = float(up_to[-1]) / 2 * len(outer) / drawn / SAMPLES
-        return cls(points_m[kept], normals[kept], two_sided[kept], m2_each)
+        normals = scaled_normals[face] / doubled_areas_m2[face][:, None]
+        is_two_sided = ~find_outward_faces(target.mesh)[face]
+        is_enclosed = find_enclosed_points(target, points_m + ABOVE_M * normals)
+        outer = np.flatnonzero(is_two_sided | ~is_enclosed)
+        selection = outer[(np.arange(NUM_SAMPLES) + 0.5).astype(np.int64) * len(outer) // NUM_SAMPLES]
+        area_m2 = float(cumulated_m2[-1]) / 2 * len(outer) / num_candidates / NUM_SAMPLES
+        return cls(points_m[selection], normals[selection], is_two_sided[selection], area_m2)
 
     def find_visible_samples(
         self,
@@ -116,50 +132,76 @@ class TargetSurface(NamedTuple):
         *,
         num_threads: int = 1,
     ) -> PackedBits:
-        """(P, M / 8) bits: which of the points a (3,) place sees, the target itself and everything else in the way.
+        """Find the sample points that are visible from a viewpoint, with occlusion by the target and by the scene.
 
-        The target stands at (P, 4, 4) poses in the instant, which is without it. Threads do not change the result.
+        Args:
+            viewpoint_m: (3,) viewpoint in the vehicle frame.
+            target: The target.
+            vehicle_T_target: (P, 4, 4) poses of the target; each is tested alone.
+            instant: Scene without the target.
+            num_threads: Threads that may cast rays; the result does not depend on it.
+
+        Returns:
+            (P, M / 8) packed bits, 1 for a visible sample point.
         """
         target_R_vehicle = vehicle_T_target[:, :3, :3].swapaxes(1, 2)
-        there_m = (target_R_vehicle @ (viewpoint_m - vehicle_T_target[:, :3, 3])[..., None])[..., 0]
-        above = np.einsum("pmi,mi->pm", there_m[:, None] - self.points_m, self.normals)
-        position, sample = np.nonzero((above > 0) | self.is_two_sided)
-        side = np.where(self.is_two_sided[sample], np.sign(above[position, sample]), 1.0)
+        viewpoints_m = (target_R_vehicle @ (viewpoint_m - vehicle_T_target[:, :3, 3])[..., None])[..., 0]
+        height_m = np.einsum("pmi,mi->pm", viewpoints_m[:, None] - self.points_m, self.normals)
+        position, sample = np.nonzero((height_m > 0) | self.is_two_sided)
+        side = np.where(self.is_two_sided[sample], np.sign(height_m[position, sample]), 1.0)
         ends_m = self.points_m[sample] + ABOVE_M * side[:, None] * self.normals[sample]
-        ways_m = ends_m - there_m[position]
-        length_m = np.linalg.norm(ways_m, axis=1)
+        rays_m = ends_m - viewpoints_m[position]
+        length_m = np.linalg.norm(rays_m, axis=1)
         hits = target.solid.caster.cast_from_each(
-            there_m[position].astype(np.float32),
-            (ways_m / length_m[:, None]).T.astype(np.float32),
+            viewpoints_m[position].astype(np.float32),
+            (rays_m / length_m[:, None]).T.astype(np.float32),
             (length_m * (1 - SHORTER)).astype(np.float32),
         )
-        open_ways = np.flatnonzero(hits.body_indices < 0)
-        position, sample = position[open_ways], sample[open_ways]
-        in_vehicle_m = np.einsum("nij,nj->ni", vehicle_T_target[position, :3, :3], ends_m[open_ways])
-        in_vehicle_m += vehicle_T_target[position, :3, 3]
-        seen = np.zeros((len(vehicle_T_target), SAMPLES), dtype=bool)
-        seen[position, sample] = compute_visibility(
-            instant, viewpoint_m, in_vehicle_m.astype(np.float32), num_threads=num_threads
+        unoccluded = np.flatnonzero(hits.body_indices < 0)
+        position, sample = position[unoccluded], sample[unoccluded]
+        points_in_vehicle_m = np.einsum("nij,nj->ni", vehicle_T_target[position, :3, :3], ends_m[unoccluded])
+        points_in_vehicle_m += vehicle_T_target[position, :3, 3]
+        is_visible = np.zeros((len(vehicle_T_target), NUM_SAMPLES), dtype=bool)
+        is_visible[position, sample] = compute_visibility(
+            instant, viewpoint_m, points_in_vehicle_m.astype(np.float32), num_threads=num_threads
         ).is_visible
-        return np.packbits(seen, axis=1)
+        return np.packbits(is_visible, axis=1)
 
     def find_nearby_samples(self, hit_points_m: Float64, max_distance_m: float) -> PackedBits:
-        """(N, M / 8) bits: which of the points are within a distance of each of (N, 3) points in the target's frame."""
-        near = np.empty((len(hit_points_m), SAMPLES // 8), dtype=np.uint8)
-        own = (self.points_m**2).sum(axis=1)
-        for first in range(0, len(hit_points_m), HITS_AT_ONCE):
-            some = hit_points_m[first : first + HITS_AT_ONCE]
-            # In float64 nothing is lost where it could matter: both are within metres of the target's origin.
-            squared = (some**2).sum(axis=1)[:, None] + own - 2 * some @ self.points_m.T
-            near[first : first + HITS_AT_ONCE] = np.packbits(squared <= max_distance_m**2, axis=1)
-        return near
+        """Find the sample points within a distance of hit points.
+
+        Args:
+            hit_points_m: (N, 3) points in the target frame.
+            max_distance_m: Largest distance.
+
+        Returns:
+            (N, M / 8) packed bits, 1 for a sample point within the distance of the hit point.
+        """
+        chunk_size = 512  # distances of one chunk fit into the cache of a processor
+        is_near = np.empty((len(hit_points_m), NUM_SAMPLES // 8), dtype=np.uint8)
+        squared_norms = (self.points_m**2).sum(axis=1)
+        for first in range(0, len(hit_points_m), chunk_size):
+            chunk_m = hit_points_m[first : first + chunk_size]
+            # The expanded square loses no relevant digits: all points are within meters of the origin of the target.
+            squared_m2 = (chunk_m**2).sum(axis=1)[:, None] + squared_norms - 2 * chunk_m @ self.points_m.T
+            is_near[first : first + chunk_size] = np.packbits(squared_m2 <= max_distance_m**2, axis=1)
+        return is_near
 
 
-def _enclosed(target: Target, points_m: Float64) -> Bools:
-    """(N,) whether no ray gets out from a place."""
-    left = np.arange(len(points_m))
-    for towards in ALL_AROUND_RAYS.T:  # most get out at once
-        directions, far_m = np.tile(towards[:, None], len(left)), np.full(len(left), np.inf, dtype=np.float32)
-        hits = target.solid.caster.cast_from_each(points_m[left].astype(np.float32), directions, far_m)
-        left = left[hits.body_indices >= 0]
-    return np.asarray(np.isin(np.arange(len(points_m)), left))
+def find_enclosed_points(target: Target, points_m: Float64) -> Bools:
+    """Find the points from which no ray leaves the body of a target.
+
+    Args:
+        target: The target.
+        points_m: (N, 3) points in the target frame.
+
+    Returns:
+        (N,) True for enclosed points.
+    """
+    enclosed = np.arange(len(points_m))
+    for direction in ALL_AROUND_RAYS.T:  # the first directions already exclude most points
+        directions = np.tile(direction[:, None], len(enclosed))
+        limits_m = np.full(len(enclosed), np.inf, dtype=np.float32)
+        hits = target.solid.caster.cast_from_each(points_m[enclosed].astype(np.float32), directions, limits_m)
+        enclosed = enclosed[hits.body_indices >= 0]
+    return np.asarray(np.isin(np.arange(len(points_m)), enclosed))

@@ -1,4 +1,4 @@
-"""Put a target at every place around a vehicle, and see what its rig gets of it."""
+"""Visibility of a test target for a rig at every position around the vehicle."""
 
 import math
 from collections.abc import Sequence
@@ -12,16 +12,15 @@ from torchcover.geometry.arrays import Float64
 from torchcover.simulation.memory import check_memory_fits
 from torchcover.simulation.rig import Rig, set_ego
 from torchcover.simulation.scenario import Scenario
-from torchcover.targets.counting import PLACES, TargetFrames, count_target_points
+from torchcover.targets.counting import count_target_points
 from torchcover.targets.placing import Heading, Raster, build_poses, compute_yaws_rad, is_point_inside
 from torchcover.targets.result import FREE, OCCUPIED, OUTSIDE, PositionVisibility, TargetMap
-from torchcover.targets.surface import SAMPLES, Target, TargetSurface
+from torchcover.targets.surface import NUM_SAMPLES, Target, TargetSurface
+from torchcover.targets.target_frames import NUM_VIEWPOINTS, TargetFrames
 
-# Of one step: where each ends, on what, two random numbers. Of one cell: poses, sums, and what is made on the way.
-BYTES_PER_RAY = 21
-BYTES_PER_CELL = 500
-
-HITS = 5
+# Points that are enough to detect a target, as in Waymo's easier level of difficulty.
+DETECTION_POINTS = 5
+# Threshold of the metric of Uecker & Zöllner 2024, also for the surface of targets.
 THRESHOLD_M = 0.4
 
 
@@ -34,34 +33,38 @@ def measure_target_visibility(
     num_frames: int = 1,
     frame_interval_s: float | None = None,
     seed: int = 0,
-    detection_points: int = HITS,
+    detection_points: int = DETECTION_POINTS,
     threshold_m: float = THRESHOLD_M,
     heading: Heading = "narrow",
 ) -> TargetMap:
-    """What a rig sees of a target, for every place around the vehicle.
+    """Measure the visibility of a test target at every position around the vehicle.
 
-    Rays are those of `Simulator`, and points what a sensor makes of their hits. Of a LiDAR or a camera, each ray that
-    meets the target before anything else, the vehicle's own body included, gives one, within the sensor's ranges, less
-    those that drop out. Of a radar, a cell gives one if the hit in the middle of its hits is on the target. All places
-    see the same rays drop out. All rays are cast at the time of the step, whatever the `scan` of a sensor: exact where
-    vehicle and target rest or drive alike, but for what hides the target and drives otherwise.
+    Rays and sensor models are those of `Simulator`. A ray of a LiDAR or a camera gives a point on the target if it hits
+    the target before anything else, the ego vehicle included, within the range limits of the sensor, and does not drop
+    out. A resolution cell of a radar gives a point if the center of its hits is on the target. The same rays drop out
+    at all positions. All rays of a frame are cast at the same time, whatever the `scan` of a sensor; this is exact
+    where the target, its occluders and the vehicle move alike.
 
     Args:
         rig: The sensors.
-        scenario: The world, whose ego carries them. The target is in none of it: other targets hide nothing.
-        target: What is placed, upright, at its own height above the local ground; where there is none, the place is
+        scenario: The scenario with the ego vehicle; the target is at one position at a time, so that targets never hide
+            each other.
+        target: Test target, upright and at its own height above the local ground; positions without ground are
             `OUTSIDE`.
-        raster: Where; within 5 m of the vehicle in steps of 0.2 m if not given.
-        num_frames: How many steps are averaged.
-        frame_interval_s: Time between two of them; the scenario's time step if not given.
-        seed: Of traffic, random places, noise and drop-out.
-        detection_points: How many points are enough to see it.
-        threshold_m: How near a measured point on the target must be to a point of its surface, for the share.
-        heading: Which side of it the vehicle sees: "narrow" (fewest points), "wide" (most), or its yaw in degrees.
+        raster: Positions; default: up to 5 m from the vehicle in cells of 0.2 m.
+        num_frames: Number of frames that are averaged.
+        frame_interval_s: Time between two frames; default: the time step of the scenario.
+        seed: Seed of traffic, viewpoints, noise and drop-out.
+        detection_points: Points that are enough to detect the target.
+        threshold_m: Largest distance from a measured point at which a point of the surface counts as detected.
+        heading: Orientation of the target: "narrow" or "wide" side to the vehicle, or its yaw in degrees.
+
+    Returns:
+        Maps over the raster.
 
     Raises:
         FileNotFoundError: A mesh, vehicle or trajectory file is missing.
-        ValueError: A number out of its bounds, a target larger than the raster, or what `Simulator` refuses.
+        ValueError: A value is out of range, the target is larger than the raster, or `Simulator` refuses the rig.
 
     Example:
         >>> courtyard, pole = Scenario.load("courtyard"), Target.load("pole")
@@ -71,13 +74,14 @@ def measure_target_visibility(
         ((2, 4), True)
     """
     scenario = set_ego(scenario, {rig.name: rig})
-    vehicle = scenario.compute_ego_box()
-    raster = Raster.from_vehicle(vehicle) if raster is None else raster
-    _check_size(target, raster)
-    spots = measure_visibility_at_positions(
-        rig, scenario, target, raster.positions_m,
-        num_frames=num_frames, frame_interval_s=frame_interval_s, seed=seed, detection_points=detection_points, threshold_m=threshold_m, heading=heading,
+    vehicle_box = scenario.compute_ego_box()
+    raster = Raster.from_vehicle(vehicle_box) if raster is None else raster
+    check_target_fits(target, raster)
+    positions = measure_visibility_at_positions(
+        rig, scenario, target, raster.positions_m, num_frames=num_frames, frame_interval_s=frame_interval_s, seed=seed,
+        detection_points=detection_points, threshold_m=threshold_m, heading=heading,
     )  # fmt: skip
+    maps = {name: array.reshape(*array.shape[:-1], *raster.shape) for name, array in vars(positions).items()}
     return TargetMap(
         rig=rig.name,
         scenario=scenario.name,
@@ -86,8 +90,8 @@ def measure_target_visibility(
         target_bottom_m=target.bottom_m,
         heading=heading,
         raster=raster,
-        vehicle_box=vehicle,
-        vehicle_outline_m=_outline_m(scenario),
+        vehicle_box=vehicle_box,
+        vehicle_outline_m=compute_vehicle_outline_m(scenario),
         sensor_model=rig.sensor_model,
         sensor_names=tuple(sensor.name for sensor in rig.sensors),
         sensor_positions_m=np.array([sensor.mount.to_matrix()[:2, 3] for sensor in rig.sensors]),
@@ -95,7 +99,7 @@ def measure_target_visibility(
         threshold_m=threshold_m,
         seed=seed,
         num_frames=num_frames,
-        **{name: array.reshape(*array.shape[:-1], *raster.shape) for name, array in vars(spots).items()},
+        **maps,
     )
 
 
@@ -109,94 +113,144 @@ def measure_visibility_at_positions(
     num_frames: int = 1,
     frame_interval_s: float | None = None,
     seed: int = 0,
-    detection_points: int = HITS,
+    detection_points: int = DETECTION_POINTS,
     threshold_m: float = THRESHOLD_M,
     heading: Heading = "narrow",
 ) -> PositionVisibility:
-    """What some sensors see of a target at places; all that is not said here is as in `survey`.
+    """Measure the visibility of a test target at given positions, for some sensors of a rig.
 
-    `positions_m`: (P, 2) where, in the vehicle frame; `counted_sensors`: numbers of the sensors that count, all if not given;
-    the others are in the way as ever.
+    Args:
+        rig: The rig.
+        scenario: The scenario with the ego vehicle.
+        target: The test target.
+        positions_m: (P, 2) positions in the vehicle frame.
+        counted_sensors: Indices of the sensors whose points count; default: all. The others still occlude.
+        num_frames: As in `measure_target_visibility`, like all further arguments.
+        frame_interval_s: Time between two frames.
+        seed: Seed of all random numbers.
+        detection_points: Points that are enough to detect the target.
+        threshold_m: Largest distance from a measured point to a detected point of the surface.
+        heading: Orientation of the target.
+
+    Returns:
+        Arrays over the positions.
+
+    Raises:
+        FileNotFoundError: A mesh, vehicle or trajectory file is missing.
+        ValueError: A value is out of range.
     """
-    _check(num_frames, seed, detection_points, threshold_m)
+    check_options(num_frames, seed, detection_points, threshold_m)
     scenario = set_ego(scenario, {rig.name: rig})
-    vehicle, box = scenario.compute_ego_box(), target.solid.bounding_box
-    _check_memory(rig, len(positions_m), num_frames)
-    vehicle_T_target = build_poses(positions_m, compute_yaws_rad(heading, box, vehicle, positions_m))
-    occupied = find_overlaps(box, vehicle_T_target, vehicle.corners_m)
+    vehicle_box, target_box = scenario.compute_ego_box(), target.solid.bounding_box
+    check_memory(rig, len(positions_m), num_frames)
+    poses = build_poses(positions_m, compute_yaws_rad(heading, target_box, vehicle_box, positions_m))
+    is_occupied = find_overlaps(target_box, poses, vehicle_box.corners_m)
     for sensor in rig.sensors:
-        occupied |= is_point_inside(box, vehicle_T_target, sensor.mount.to_matrix()[:3, 3])
-    surface, elsewhere = TargetSurface.from_target(target), np.flatnonzero(~occupied)
-    every_steps = 1 if frame_interval_s is None else scenario.count_time_steps(frame_interval_s)
-    around = vehicle_T_target[elsewhere]
-    run = TargetFrames(
-        rig, scenario, target, surface, around, num_frames=num_frames, frame_stride=every_steps, seed=seed
+        is_occupied |= is_point_inside(target_box, poses, sensor.mount.to_matrix()[:3, 3])
+    evaluated = np.flatnonzero(~is_occupied)
+    poses = poses[evaluated]
+    surface = TargetSurface.from_target(target)
+    frame_stride = 1 if frame_interval_s is None else scenario.count_time_steps(frame_interval_s)
+    target_frames = TargetFrames(
+        rig, scenario, target, surface, poses, num_frames=num_frames, frame_stride=frame_stride, seed=seed
     )
-    some = range(len(rig.sensors)) if counted_sensors is None else counted_sensors
-    every = run.mounted_sensors
-    mounted = [every[k] for k in some]
-    taken = [step._replace(sensor_frames=[step.sensor_frames[k] for k in some]) for step in run]
+    sensor_indices = range(len(rig.sensors)) if counted_sensors is None else counted_sensors
+    mounted_sensors = [target_frames.mounted_sensors[index] for index in sensor_indices]
+    counted_frames = []
+    for frame in target_frames:
+        sensor_frames = [frame.sensor_frames[index] for index in sensor_indices]
+        counted_frames.append(frame._replace(sensor_frames=sensor_frames))
     sums = count_target_points(
-        target, surface, around, mounted, taken, detection_points=detection_points, threshold_m=threshold_m
-    )
+        target, surface, poses, mounted_sensors, counted_frames,
+        detection_points=detection_points, threshold_m=threshold_m,
+    )  # fmt: skip
 
-    def spread(values: NDArray[Any], empty: float = np.nan) -> NDArray[Any]:
-        everywhere = np.full((*values.shape[:-1], len(positions_m)), empty, dtype=values.dtype)
-        everywhere[..., elsewhere] = values
-        return everywhere
+    def fill_positions(values: NDArray[Any], fill_value: float = np.nan) -> NDArray[Any]:
+        """Spread values of the evaluated positions over all positions."""
+        array = np.full((*values.shape[:-1], len(positions_m)), fill_value, dtype=values.dtype)
+        array[..., evaluated] = values
+        return array
 
-    steps_with = np.where(sums.free_frames > 0, sums.free_frames, np.nan)
-    visible = np.where(sums.visible_samples > 0, sums.visible_samples, np.nan)
+    has_free_frame = sums.free_frames > 0
+    free_frames = np.where(has_free_frame, sums.free_frames, np.nan)
+    visible_samples = np.where(sums.visible_samples > 0, sums.visible_samples, np.nan)
+    visible_m2 = sums.visible_samples / free_frames * surface.sample_area_m2 / target_frames.viewpoints_per_frame
     return PositionVisibility(
-        state=spread(np.where(sums.free_frames > 0, FREE, OUTSIDE).astype(np.uint8), OCCUPIED),
-        free_frames=spread(sums.free_frames, 0),
-        sensor_points=spread(sums.sensor_points / steps_with),
-        detecting_sensors=spread(sums.detecting_sensors / steps_with),
-        detected_share=spread(sums.detected_frames / steps_with),
-        min_points=spread(np.where(sums.free_frames > 0, sums.min_points, np.nan)),
-        min_sensors=spread(np.where(sums.free_frames > 0, sums.min_sensors, np.nan)),
-        surface_share=spread(sums.detected_samples / visible),
-        visible_m2=spread(sums.visible_samples / steps_with * surface.sample_area_m2 / run.viewpoints_per_frame),
+        state=fill_positions(np.where(has_free_frame, FREE, OUTSIDE).astype(np.uint8), OCCUPIED),
+        free_frames=fill_positions(sums.free_frames, 0),
+        sensor_points=fill_positions(sums.sensor_points / free_frames),
+        detecting_sensors=fill_positions(sums.detecting_sensors / free_frames),
+        detected_share=fill_positions(sums.detected_frames / free_frames),
+        min_points=fill_positions(np.where(has_free_frame, sums.min_points, np.nan)),
+        min_sensors=fill_positions(np.where(has_free_frame, sums.min_sensors, np.nan)),
+        surface_share=fill_positions(sums.detected_samples / visible_samples),
+        visible_m2=fill_positions(visible_m2),
     )
 
 
-def _outline_m(scenario: Scenario) -> Float64:
-    """(K, 2) the smallest convex outline of the vehicle, seen from above."""
+def compute_vehicle_outline_m(scenario: Scenario) -> Float64:
+    """Compute the (K, 2) convex hull of the ego vehicle in bird's-eye view."""
     from shapely import MultiPoint
 
     return np.array(MultiPoint(scenario.build_ego_mesh().vertices_m[:, :2]).convex_hull.exterior.coords)[:-1]
 
 
-def _check(num_frames: int, seed: int, detection_points: int, threshold_m: float) -> None:
-    for name, value, least in (
-        ("num_frames", num_frames, 1),
-        ("seed", seed, 0),
-        ("detection_points", detection_points, 1),
-    ):
-        if value < least:
-            raise ValueError(f"{name}: a number >= {least} is needed; got {value}")
+def check_options(num_frames: int, seed: int, detection_points: int, threshold_m: float) -> None:
+    """Check that counts and the threshold are in range.
+
+    Args:
+        num_frames: At least 1.
+        seed: At least 0.
+        detection_points: At least 1.
+        threshold_m: Positive and finite.
+
+    Raises:
+        ValueError: A value is out of range.
+    """
+    minima = (("num_frames", num_frames, 1), ("seed", seed, 0), ("detection_points", detection_points, 1))
+    for name, value, minimum in minima:
+        if value < minimum:
+            raise ValueError(f"{name}: a number >= {minimum} is needed; got {value}")
     if not 0 < threshold_m < math.inf:
-        raise ValueError(f"threshold: metres above 0 are needed; got {threshold_m}")
+        raise ValueError(f"threshold: a length above 0 m is needed; got {threshold_m}")
 
 
-def _check_size(target: Target, raster: Raster) -> None:
+def check_target_fits(target: Target, raster: Raster) -> None:
+    """Check that a raster is not smaller than the target, which hints at a mesh in millimeters.
+
+    Args:
+        target: The test target.
+        raster: Its positions.
+
+    Raises:
+        ValueError: The target is longer or wider than the raster.
+    """
     length_m, width_m, _ = target.solid.bounding_box.size_m
-    wide_m, high_m = raster.x_bounds_m[1] - raster.x_bounds_m[0], raster.y_bounds_m[1] - raster.y_bounds_m[0]
-    if max(length_m, width_m) > max(wide_m, high_m) or min(length_m, width_m) > min(wide_m, high_m):
+    raster_x_m, raster_y_m = (high - low for low, high in (raster.x_bounds_m, raster.y_bounds_m))
+    if max(length_m, width_m) > max(raster_x_m, raster_y_m) or min(length_m, width_m) > min(raster_x_m, raster_y_m):
         raise ValueError(
-            f"target {target.name!r} is {length_m:.3g} x {width_m:.3g} m, larger than the raster of {wide_m:.3g} x "
-            f"{high_m:.3g} m; take a larger raster, or set the unit of its mesh in a vehicle file"
+            f"target {target.name!r} is {length_m:.3g} x {width_m:.3g} m, larger than the raster of {raster_x_m:.3g} x "
+            f"{raster_y_m:.3g} m; use a larger raster, or set the unit of its mesh in a vehicle file"
         )
 
 
-def _check_memory(rig: Rig, cells: int, steps: int) -> None:
-    rays = sum(sensor.num_rays for sensor in rig.sensors)
-    places = max(PLACES, steps)
-    needed_bytes = BYTES_PER_RAY * rays * steps + cells * (
-        BYTES_PER_CELL + places * SAMPLES // 8 + 8 * len(rig.sensors)
-    )
+def check_memory(rig: Rig, num_positions: int, num_frames: int) -> None:
+    """Check that a run fits into memory.
+
+    Args:
+        rig: The rig, whose ray ends are kept for all frames.
+        num_positions: Number of target positions.
+        num_frames: Number of frames.
+
+    Raises:
+        ValueError: The run needs more memory than there is.
+    """
+    bytes_per_ray = 21  # range, hit flag and two random numbers
+    bytes_per_position = 500  # pose, sums and intermediate results
+    num_rays = sum(sensor.num_rays for sensor in rig.sensors)
+    bytes_per_position += max(NUM_VIEWPOINTS, num_frames) * NUM_SAMPLES // 8 + 8 * len(rig.sensors)
     check_memory_fits(
-        f"{cells:,} places and {steps:,} steps of {rays:,} rays",
-        needed_bytes,
-        "use fewer steps or a larger step of the raster",
+        f"{num_positions:,} target positions and {num_frames:,} frames of {num_rays:,} rays",
+        bytes_per_ray * num_rays * num_frames + num_positions * bytes_per_position,
+        "use fewer frames or larger cells of the raster",
     )
