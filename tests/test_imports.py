@@ -139,9 +139,9 @@ def test_every_public_name_is_there():
 def test_the_public_names_are_those_of_the_contract():
     assert set(torchcover.__all__) == {
         "BevGrid", "Camera", "Coverage", "CoverageMetric", "Region", "RegionsOfInterest", "Rig", "Scenario",
-        "blind_spot_radius", "cameras", "check", "compare", "coverage", "data", "detection", "estimation", "evaluate",
-        "encounter", "encounters", "evaluation", "forward_regions", "geometry", "metrics",
-        "nearest", "neighbors", "placement", "report", "simulation", "map_target_visibility", "targets", "training",
+        "blind_spot_radius", "cameras", "check", "compare", "coverage", "data", "detection", "encounters", "estimation",
+        "evaluate", "evaluate_encounters", "evaluation", "forward_regions", "geometry", "map_target_visibility",
+        "metrics", "nearest", "neighbors", "placement", "report", "simulation", "targets", "training",
     }  # fmt: skip
     assert torchcover.__all__ == sorted(torchcover.__all__)
 

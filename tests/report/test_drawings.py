@@ -202,7 +202,7 @@ def test_the_way_of_the_ego_is_drawn_if_it_moves():
 
 def test_clouds_are_drawn_the_rig_over_the_reference():
     line = np.stack([np.linspace(5, 25, 4000), np.full(4000, 5.0), np.zeros(4000)], axis=1)
-    picture = scene(reference_points=line, sensor=line[:2000])
+    picture = scene(reference_points=line, sensor_points=line[:2000])
     assert picture.at(0, 8.0, 5.0) == pytest.approx(to_rgb(SENSOR), abs=0.02)
     assert picture.at(0, 22.0, 5.0) == pytest.approx(to_rgb(REFERENCE), abs=0.02)
     entries = [text.get_text() for text in picture.figure.axes[0].get_legend().get_texts()]

@@ -201,14 +201,14 @@ def test_the_hover_shows_the_cell_as_it_is_in_the_file(seen, named, tmp_path):
             at = np.searchsorted(file["cell"], number)
             cells.append([file[key][at].tolist() for key in keys])
     (radius, error, *_), (of_many, its_error, detection, detection_error) = cells
-    m2 = named["many"].area.sum_blocks()[0][0, row, column].item()
+    m2 = named["many"].area_sums.sum_blocks()[0][0, row, column].item()
     assert found["hover"].startswith("x 3 to 4 m, y 2 to 3 m: ")
     assert found["label"] == f"{TITLE}, ground, z -0.5 to 0.5 m, {NASTY}"
     assert close(*numbers(found["hover"], "m"), radius[0], error[0])
-    assert float(re.search("in all steps: ([0-9.]+)", found["hover"])[1]) == pytest.approx(m2, rel=6e-4)
-    unknown, known = found["edge"]  # nothing was ever probed behind x = -5 m
-    assert unknown.endswith(": unknown, no visible surface found")
-    assert "unknown" not in known
+    assert float(re.search("in all frames: ([0-9.]+)", found["hover"])[1]) == pytest.approx(m2, rel=6e-4)
+    unobserved, observed = found["edge"]  # nothing was ever probed behind x = -5 m
+    assert unobserved.endswith(": no visible surface")
+    assert "no visible surface" not in observed
     assert found["beyond"] == "x 100 to 101 m, y 100 to 101 m: beyond the grid"
     assert close(*numbers(found["other_band"], "m"), radius[1], error[1])
     assert close(*numbers(found["other_rig"], "m"), of_many[1], its_error[1])

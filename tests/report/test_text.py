@@ -83,11 +83,11 @@ def test_trouble_is_told_in_words_with_its_count():
     coverage = metric(thresholds_m=(0.4,), max_radius_m=0.5)
     reference = torch.tensor([[0.2, 0.0, 0.0], [0.6, 0.0, 0.0], [-9.0, 0.0, 0.0]])
     coverage.update([ORIGIN, torch.zeros(0, 3), ORIGIN], [reference, reference, torch.zeros(0, 3)])
-    text = text_of(coverage.compute(), NEAR)
+    text = " ".join(text_of(coverage.compute(), NEAR).split())
     assert "1 of 3 frames had no sensor points" in text
     assert "1 of 3 frames had no reference points" in text
-    assert "3 of 4 reference points count as 0.5 m far, the limit" in text
-    assert "2 of 6 reference points lie outside the grid: left out." in text
+    assert "3 of 4 reference points have no sensor point nearby; their radius is set to the maximum of 0.5 m." in text
+    assert "2 of 6 reference points outside the grid are excluded." in text
     assert "z = 0" not in text
 
 

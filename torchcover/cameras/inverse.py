@@ -34,7 +34,7 @@ _PIXELS_PER_CHUNK = 1 << 15
 
 
 @dataclass(frozen=True)
-class SolverParams:
+class InversionParams:
     """Parameters of Newton's method.
 
     Args:
@@ -156,7 +156,7 @@ class _NewtonSearch:
         distortion: Distortion,
         region: ValidRegion,
         focal: tuple[float, float],
-        params: SolverParams,
+        params: InversionParams,
         u: Float64,
         v: Float64,
         a: Float64,
@@ -220,7 +220,7 @@ def solve(
     u: Float64,
     v: Float64,
     focal: tuple[float, float],
-    params: SolverParams = SolverParams(),
+    params: InversionParams = InversionParams(),
 ) -> tuple[Float64, Float64, SolverStatus]:
     """Find the points of the valid region whose distorted images are (u, v), on the threads that torch may use.
 

@@ -129,7 +129,7 @@ def describe_single_point_of_failure(table: CoverageTable, rig: str, params: Fai
     if all(math.isnan(value) for value in values):
         return "Single point of failure unknown: no surface in the regions was observed."
     if quantity.key != RADIUS.key and not any(value > 0.0 for value in values):
-        return "No single point of failure: nothing in the regions is detected with all sensors."
+        return "Single point of failure unknown: nothing in the regions is detected with all sensors."
     if len(sensors) == 1:
         return f"Single point of failure: {sensors[0]} is the only sensor."
     candidates = []
