@@ -15,7 +15,7 @@ from torchcover.targets import Target, measure_visibility_at_positions
 # Ahead of an ego that is 4 m long; the last is within it, so that it has no room and is not checked.
 PLACES = [[4.5, 0.0], [6.5, 0.0], [9.0, 0.0], [0.0, 0.0]]
 CHILD = {"target": "child", "positions": {"points_m": PLACES}, "points": 1}
-CROSSING = {"name": "a", "ego": {"speed_kmh": 30}, "other": {"body": "adult", "speed_kmh": 5, "from_m": 2}}
+CROSSING = {"name": "a", "ego": {"speed_kmh": 30}, "road_user": {"body": "adult", "speed_kmh": 5, "approach_distance_m": 2}}
 ENCOUNTERS = {"name": "some", "encounters": [CROSSING, {**CROSSING, "name": "b", "ego": {"speed_kmh": 70}}]}
 SPAN = {"channels": 4, "vertical_fov_deg": [-4, 4], "columns": 361}
 LEVEL = rig(lidar(**SPAN), name="level")

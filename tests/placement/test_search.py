@@ -131,7 +131,7 @@ def needing(pitch_deg):
         (requirement,) = required.requirements
         (bound,) = requirement.bounds
         counts = 1, int(margin < 0), 0, ()
-        state = "kept" if margin >= 0 else "not kept"
+        state = "met" if margin >= 0 else "not met"
         verdict = Verdict(requirement.text, bound, state, 0, 0, 0, margin, *counts)
         return CheckResult(required, {rig.name: [verdict]}, {})
 
@@ -156,7 +156,7 @@ def test_a_child_is_looked_for_around_the_vehicle_of_the_space():
 
 
 def test_requirements_in_other_bands_or_directions_are_refused():
-    with pytest.raises(ValueError, match=r"most: of detection_0\.4m more is better; least is meant"):
+    with pytest.raises(ValueError, match=r"max_value: of detection_0\.4m more is better; min_value is meant"):
         space(requirements=required({"min_value": 0.9}, {"max_value": 0.5}))
     asked = required({"min_value": 0.5}) | {"heights": {"ground": [-0.2, 0.2]}}
     with pytest.raises(ValueError, match=r"'ground' is \(-0\.2, 0\.2\)"):

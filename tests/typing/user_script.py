@@ -13,7 +13,7 @@ from torchcover.data import Frame, RecordedFrames, RigSubset, SimulatedFrames
 
 def measured(frames: SimulatedFrames | RecordedFrames | RigSubset) -> Coverage:
     """A loop over any source of frames."""
-    metric = CoverageMetric(BevGrid(x_m=(0.0, 20.0), y_m=(-5.0, 5.0)), max_radius=25.0)
+    metric = CoverageMetric(BevGrid(x_m=(0.0, 20.0), y_m=(-5.0, 5.0)), max_radius_m=25.0)
     for frame in frames:
         metric.update(frame.sensor, frame.reference, weights=frame.reference_weights, block_index=frame.block_index)
     return metric.compute()
@@ -21,10 +21,10 @@ def measured(frames: SimulatedFrames | RecordedFrames | RigSubset) -> Coverage:
 
 def compared(rigs: list[Path], frames: SimulatedFrames) -> list[float]:
     """Arguments in each of their forms, and what `evaluate` gives."""
-    one = evaluate("front_roof_128", "urban", steps=64, thresholds_m=0.4, device=torch.device("cpu"), metrics="all")
-    several = evaluate(rigs, frames=frames, thresholds_m=(0.4, 1.0), ask="ask.yaml", target_error=["1%", "0.02m"])
+    one = evaluate("front_roof_128", "urban", num_frames=64, thresholds_m=0.4, device=torch.device("cpu"), metrics="all")
+    several = evaluate(rigs, frames=frames, thresholds_m=(0.4, 1.0), regions="regions.yaml", target_error=["1%", "0.02m"])
     evaluate("front_roof_128", stepz=64)  # type: ignore[call-arg]  # an argument that there is not
-    evaluate("front_roof_128", steps="64")  # type: ignore[arg-type]
+    evaluate("front_roof_128", num_frames="64")  # type: ignore[arg-type]
     return [float(coverage.radius.nanmean()) for coverage in compare([one, several, "saved.npz"]).coverages.values()]
 
 
