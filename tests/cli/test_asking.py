@@ -71,7 +71,7 @@ def test_the_sensor_behind_is_what_the_place_behind_depends_on(evaluate, torchco
     by_place = {(row["region"], row["band"]): row for row in rows_of(worlds / "out")}
     for region, sensor, other in (("behind", "rear", "front"), ("ahead", "front", "rear")):
         row = by_place[region, "dog"]
-        assert row["most_important_sensor"] == sensor
+        assert row["most_critical_sensor"] == sensor
         assert float(row[f"detection_2m_without_{sensor}_change"]) < -0.2
         assert float(row[f"detection_2m_without_{other}_change"]) == 0.0
         assert float(row["sensors_2m"]) == pytest.approx(float(row["detection_2m"]))  # never both

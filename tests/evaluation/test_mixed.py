@@ -77,7 +77,7 @@ def test_marks_are_beyond_chance_in_the_mixture(mixed, yards):
     assert not any(row["detection_0.4m_best"] for row in few.summary)
     # Eight blocks in all are not eight in each.
     assert all(row["detection_0.4m_low"] is None for row in few.summary)
-    assert "Not enough frames for intervals in near: 4 blocks" in " ".join(str(few).split())
+    assert "Not enough frames for confidence intervals in near: got 4 blocks" in " ".join(str(few).split())
 
 
 def test_redundancy_is_mixed_by_the_book(yards):
@@ -90,7 +90,7 @@ def test_redundancy_is_mixed_by_the_book(yards):
         mixed.summary,
         [(mixed.weights[name], world.summary[0]) for name, world in mixed.scenario_results.items()],
     )
-    assert row["most_important_sensor"] == "high"
+    assert row["most_critical_sensor"] == "high"
     for key in ("sensors_0.4m", "detection_0.4m_without_high", "detection_0.4m_without_high_change"):
         assert row[key] == pytest.approx(sum(weight * part[key] for weight, part in parts))
         error = math.sqrt(sum((weight * part[f"{key}_error"]) ** 2 for weight, part in parts))
@@ -145,7 +145,7 @@ def test_files_hold_every_world_and_the_mixture(mixed, tmp_path):
     assert [row["scenario"] for row in rows] == ["near"] * 2 + ["far"] * 2 + ["mixture"] * 2
     assert [float(row["radius_m"]) for row in rows[4:]] == [row["radius_m"] for row in mixed.summary]
     assert {(row["vehicle"], row["sensor_model"]) for row in rows} == {("box", "ideal")}
-    assert [stem.split("/")[0] for stem, _ in mixed.maps()][:: len(list(mixed.maps())) - 1] == ["near", "far"]
+    assert [stem.split("/")[0] for stem, _ in mixed.plot_maps()][:: len(list(mixed.plot_maps())) - 1] == ["near", "far"]
     with pytest.raises(ValueError, match=r"worlds\[name\]"):
         _ = mixed.coverage
 

@@ -208,7 +208,7 @@ def test_each_world_is_built_by_one_worker_whoever_gives_the_frames(monkeypatch,
 def test_a_source_that_does_not_know_its_worlds_is_refused_where_it_matters(frames, frames_of):
     source = frames_of(Told(frames))
     assert observe(source, [Names()], num_workers=1).num_frames == len(source)
-    with pytest.raises(TypeError, match=r"^frames: Wrapped does not say which world a frame is of"):
+    with pytest.raises(TypeError, match=r"^frames: Wrapped does not name the scene of a frame, so"):
         observe(source, [Names()], num_workers=2, keep_partial=True)
 
 
@@ -249,7 +249,7 @@ def test_a_worker_makes_one_task_ahead(frames):
 
 
 def test_of_two_rigs_none_is_meant_until_it_is_named(frames):
-    with pytest.raises(ValueError, match="say which"):
+    with pytest.raises(ValueError, match="clouds of 2 rigs .a, b.: name one"):
         observe(frames, [coverage(rig=None)])
     with pytest.raises(ValueError, match="cannot merge the coverage of rig 'b' into that of 'a'"):
         coverage("a").merge_state(coverage("b"))

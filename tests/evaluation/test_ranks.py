@@ -206,7 +206,7 @@ def test_what_travels_is_on_the_cpu():
 def test_who_waits_for_what_others_have_seen_learns_that_one_has_ended():
     def work(rank):
         if rank.rank == 1:
-            rank.tell(MemoryError(), ABORTED)
+            rank.report_failure(MemoryError(), ABORTED)
         else:
             rank.gather("x")
 
@@ -221,7 +221,7 @@ def test_ranks_leave_when_all_is_written_and_rank_0_as_the_last_one(monkeypatch,
     def work(rank):
         time.sleep(0.3 * (rank.rank == late))
         happened.append(("written", "ready", "ready")[rank.rank])
-        rank.part()
+        rank.shut_down()
         happened.append(("closed", "left", "left")[rank.rank])
 
     assert in_threads(work) == [None] * 3
@@ -250,9 +250,9 @@ def test_the_first_failure_is_the_one_that_is_told_of():
 def test_who_waits_for_what_rank_0_is_about_learns_that_it_has_ended():
     def work(rank):
         if rank.rank == 0:
-            rank.tell(MemoryError(), ABORTED)
+            rank.report_failure(MemoryError(), ABORTED)
         else:
-            rank.check_same({"seed": "1"})
+            rank.check_identity({"seed": "1"})
 
     found = in_threads(work)
     assert list(map(repr, found)) == ["None", *["ChildProcessError('rank 0: MemoryError')"] * 2]
@@ -262,12 +262,12 @@ def test_who_waits_for_what_rank_0_is_about_learns_that_it_has_ended():
 def test_who_ends_all_ends_with_its_own_error_and_the_others_with_words_of_it(failing):
     def work(rank):
         try:
-            with rank.aborting():
+            with rank.abort_on_error():
                 if rank.rank == failing:
                     raise ValueError("no  such\nthing")
                 rank._wait_for(["never"])
         finally:
-            rank.part()
+            rank.shut_down()
 
     words = f"rank {failing}: ValueError: no such thing"
     for rank, error in enumerate(in_threads(work)):
@@ -315,13 +315,13 @@ def test_an_error_before_the_first_step_ends_all(frame_of, tmp_path):
     assert str(first) == f"rank 1: ValueError: {second}"
     assert max(first_s, second_s) < 10.0
     for error, _ in in_ranks(tmp_path, lambda ranks: measured(Drive(frame_of), ranks, target_error="1%")):
-        assert "target error: every rank sees its share only" in str(error)
+        assert "target error: a rank only has its share of the frames" in str(error)
 
 
 def test_who_waits_for_a_rank_that_is_gone_can_be_ended(frame_of, tmp_path):
     def work(ranks):
         if ranks.rank == 1:
-            ranks.check_same = lambda _: os._exit(0)
+            ranks.check_identity = lambda _: os._exit(0)
         else:
             threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT)).start()
         try:

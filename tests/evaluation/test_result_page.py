@@ -48,7 +48,7 @@ def test_the_page_says_what_the_table_says_and_where_it_comes_from(result, tmp_p
     assert NASTY in words
     for row in result.table.rows[NASTY]:
         assert row.region.name in words
-    for fact in ("courtyard", torchcover.__version__, "rays that end on the ego itself", "seed", "seconds"):
+    for fact in ("courtyard", torchcover.__version__, "rays that end on the ego itself", "seed", "duration s"):
         assert fact in words
 
 
@@ -67,7 +67,7 @@ def test_the_rig_on_the_page_can_be_read_back(name, tmp_path):
     text = html.unescape(html.escape(format_rig_yaml(name, rig.sensors)))
     (tmp_path / "rig.yaml").write_text(text, encoding="utf-8")
     again = Rig.load(tmp_path / "rig.yaml")
-    assert [sensor.content() for sensor in again.sensors] == [sensor.content() for sensor in rig.sensors]
+    assert [sensor.collect_content() for sensor in again.sensors] == [sensor.collect_content() for sensor in rig.sensors]
 
 
 def test_the_page_of_a_target_draws_where_it_is_first_seen(tmp_path):

@@ -139,7 +139,7 @@ def build_columns(table: CoverageTable) -> ColumnGetters:
     for rig_rows in table.rows.values():
         sensors |= dict.fromkeys(get_failure_sensors(rig_rows))
     if sensors:
-        columns["most_important_sensor"] = _get_most_critical_sensor
+        columns["most_critical_sensor"] = _get_most_critical_sensor
         for quantity in list_redundancy_quantities((), table.thresholds_m):
             columns |= _build_number_columns(quantity.key, partial(_get_redundancy, quantity.key))
     for sensor in sensors:
