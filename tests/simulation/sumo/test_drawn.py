@@ -20,7 +20,7 @@ from torchcover.simulation.sumo import SumoTraffic, simulating, traffic
 from torchcover.simulation.sumo.network import read_network
 from torchcover.simulation.sumo.simulating import convert_opendrive
 from torchcover.simulation.sumo.streets import TURN_MPS2, RandomStreets, compute_turning_speed_mps, write_routes
-from torchcover.simulation.traffic.fleet import KIND_OF, Fleet, load_bodies
+from torchcover.simulation.traffic.fleet import BODY_KINDS, Fleet, load_bodies
 
 from .towns import XODR, street, write_net
 
@@ -93,7 +93,7 @@ def test_drawn_traffic_has_bodies_of_all_sizes_and_lorries_and_buses_among_them(
     told = parse_xml(routes)
     lengths_m = {kind.get("id"): float(kind.get("length", "nan")) for kind in told.iter("vType")}
     driven = [vehicle.get("type") for vehicle in told.iter("vehicle")]
-    assert {KIND_OF[kind] for kind in driven if kind != "ego"} > {"sedan", "suv", "hatchback", "van", "lorry", "bus"}
+    assert {BODY_KINDS[kind] for kind in driven if kind != "ego"} > {"sedan", "suv", "hatchback", "van", "lorry", "bus"}
     assert len({lengths_m[kind] for kind in driven}) > 12
     assert all(abs(lengths_m[kind] - fleet.get_length_m(kind)) < 0.01 for kind in driven)
 

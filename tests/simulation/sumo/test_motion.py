@@ -14,7 +14,7 @@ from torchcover.simulation.sumo.motion import (
     drop_colliding_users,
 )
 from torchcover.simulation.sumo.network import Vicinity, read_network
-from torchcover.simulation.traffic.fleet import DRAWS, compute_tractrix_yaw_rad
+from torchcover.simulation.traffic.fleet import HITCHES, compute_tractrix_yaw_rad
 
 from .towns import DRIVE, WALK, edge, write_net
 
@@ -161,7 +161,7 @@ def test_a_trailer_follows_its_kingpin_and_both_parts_count(corner):
     (front, _), (rear, size_m) = motion.parts
     assert rear[0] == pytest.approx([*(front[0, :2] - [6.375, 0.0]), 0.0], abs=1e-9)
     assert [front[0, 0] + 6.65 / 2, rear[0, 0] - 13.6 / 2] == pytest.approx([-40.0, -56.5])
-    hitches_m = DRAWS["truck"].compute_hitch_positions_m(front)[:, None]
+    hitches_m = HITCHES["truck"].compute_hitch_positions_m(front)[:, None]
     np.testing.assert_allclose(
         compute_tractrix_yaw_rad(hitches_m, np.array([8.41]), np.zeros(1))[:, 0], rear[:, 2], atol=1e-12
     )

@@ -7,7 +7,7 @@ from torchcover.geometry import build_transform, convert_euler_to_rotation
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation.bodies import Vehicle
 from torchcover.simulation.traffic.fleet import (
-    DRAWS,
+    HITCHES,
     REAR_OF,
     Fleet,
     compute_tractrix_yaw_rad,
@@ -18,7 +18,7 @@ from torchcover.simulation.world import Actor
 
 from .test_separation import Solids, among
 
-KINDS = sorted(DRAWS)
+KINDS = sorted(HITCHES)
 
 
 def test_on_a_circle_the_rear_follows_a_smaller_one():
@@ -40,7 +40,7 @@ def test_along_a_line_the_angle_falls_as_in_the_closed_form_whatever_the_steps()
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_on_a_straight_both_parts_are_the_whole_vehicle(kind):
-    hitch, bodies, whole = DRAWS[kind], load_bodies(), Vehicle.load(kind).build_mesh()
+    hitch, bodies, whole = HITCHES[kind], load_bodies(), Vehicle.load(kind).build_mesh()
     front = np.array([[hitch.center_offset_m, 0.0, 0.0]])
     (rear,) = compute_trailer_poses([kind], [front])
     parts = [bodies[part].transform(at(pose[0])) for part, pose in ((kind, front), (hitch.trailer_kind, rear))]
@@ -60,7 +60,7 @@ def test_on_a_straight_both_parts_are_the_whole_vehicle(kind):
 def test_the_parts_of_a_vehicle_never_meet_however_it_turns(kind, turned_deg):
     bodies = load_bodies()
     (rear,) = compute_trailer_poses([kind], [np.zeros((1, 3))], [np.deg2rad(turned_deg)])
-    meshes = bodies[kind], bodies[DRAWS[kind].trailer_kind].transform(at(rear[0]))
+    meshes = bodies[kind], bodies[HITCHES[kind].trailer_kind].transform(at(rear[0]))
     pieces = [Solids.of_static([mesh]) for mesh in meshes]
     both = Solids.of_static(meshes)
     part = np.repeat([0, 1], [len(solids.low) for solids in pieces])
@@ -75,7 +75,7 @@ def test_in_traffic_axles_do_not_slip_and_the_hitch_holds(kind, world):
     assert len(rears) > 3
     for rear in rears:
         front = fronts[rear.name.removeprefix(REAR_OF)]
-        both = DRAWS[front.name.split()[0]]
+        both = HITCHES[front.name.split()[0]]
         assert (front.category, rear.category) == ("truck", "trailer")
         drawn, own = poses(rear), poses(front)
         back = np.stack([np.cos(drawn[:, 2]), np.sin(drawn[:, 2])], axis=1)

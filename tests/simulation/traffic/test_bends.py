@@ -10,7 +10,7 @@ from torchcover.simulation.traffic import UrbanTraffic
 from torchcover.simulation.traffic.alignment import Alignment, OffsetPath, StreetCorridor
 from torchcover.simulation.traffic.city import CityBuilder
 from torchcover.simulation.traffic.fleet import Fleet, load_bodies
-from torchcover.simulation.traffic.flow import LIMIT_EVERY_M
+from torchcover.simulation.traffic.flow import SPEED_LIMIT_SPACING_M
 from torchcover.simulation.traffic.hills import Hills
 from torchcover.simulation.traffic.scenery import build_slab
 from torchcover.simulation.traffic.streets import (
@@ -136,7 +136,7 @@ def test_cars_may_drive_as_fast_as_is_comfortable_and_brake_gently_for_it():
     streets = sample_street_plan(section, 25.0, 0.5, (-120.0, 900.0), 1400.0, generator, shapes)
     assert streets.main_street.turn_directions.any()
     lane = streets.build_traffic_lanes()[0]
-    places = LIMIT_EVERY_M * np.arange(len(lane.speed_limits_mps))
+    places = SPEED_LIMIT_SPACING_M * np.arange(len(lane.speed_limits_mps))
     yaw = np.unwrap(np.deg2rad(lane.centerline.compute_poses(places)[:, 2]))
     across = np.abs(np.gradient(yaw, places)) * lane.speed_limits_mps**2
     in_curves = (
@@ -144,7 +144,7 @@ def test_cars_may_drive_as_fast_as_is_comfortable_and_brake_gently_for_it():
     )
     assert across[in_curves & (lane.speed_limits_mps < 15.0)].max() < 1.1 * COMFORTABLE_MPS2
     assert lane.speed_limits_mps.min() < 8.0
-    braking = -np.diff(lane.speed_limits_mps**2) / (2 * LIMIT_EVERY_M)
+    braking = -np.diff(lane.speed_limits_mps**2) / (2 * SPEED_LIMIT_SPACING_M)
     assert braking.max() < 1.001 * BRAKING_MPS2
     # A bus keeps off the bus beside it.
     inner = section.min_turn_radius_m - (section.lanes_per_direction - 0.5) * section.lane_width_m

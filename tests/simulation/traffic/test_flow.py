@@ -7,12 +7,10 @@ import pytest
 
 from torchcover.simulation.traffic.alignment import Polyline, build_rounded_rectangle
 from torchcover.simulation.traffic.flow import (
-    BRAKING_FOR_A_LIGHT_MPS2,
     CROSS,
     MAIN,
-    QUEUE_SPEED,
-    STOP_BEFORE_LINE_M,
     Agent,
+    JunctionParams,
     JunctionPassage,
     Lane,
     LaneSimulation,
@@ -22,6 +20,7 @@ from torchcover.simulation.traffic.idm import Driver, compute_acceleration_mps2,
 
 TIMES_S = np.arange(0.0, 60.0, 0.1)
 CAR = Driver(14.0)
+PARAMS = JunctionParams()
 LONG = Polyline(np.array([[0.0, 0.0], [2000.0, 0.0]]))
 
 
@@ -113,7 +112,7 @@ def twin(lanes, agents, lights, times_s):
             np.inf if gate is None else gate.stop_line_m - at - agent.length_m / 2
             for gate, at, agent in zip(gates, place, agents, strict=True)
         ]
-        committed = [v**2 > 2 * BRAKING_FOR_A_LIGHT_MPS2 * way for v, way in zip(speed, to_line, strict=True)]
+        committed = [v**2 > 2 * PARAMS.max_braking_mps2 * way for v, way in zip(speed, to_line, strict=True)]
         inside = {(gates[n].junction_index, gates[n].phase) for n in range(len(agents)) if committed[n]}
         moved = []
         for n, agent in enumerate(agents):
@@ -122,11 +121,11 @@ def twin(lanes, agents, lights, times_s):
             if gate is not None and not committed[n]:
                 back = at - agents[m].length_m / 2
                 jam = gate.stop_line_m < back < gate.exit_m + agent.length_m + driver.standstill_gap_m
-                jam = jam and speed[m] < QUEUE_SPEED * driver.desired_speed_mps
+                jam = jam and speed[m] < PARAMS.queue_speed_share * driver.desired_speed_mps
                 free = left[gate.junction_index, gate.phase] > gate.min_green_s
                 if jam or not free or (gate.junction_index, 1 - gate.phase) in inside:
                     line = to_line[n]
-            stop = line + driver.standstill_gap_m - STOP_BEFORE_LINE_M
+            stop = line + driver.standstill_gap_m - PARAMS.stop_distance_m
             closing = speed[n] - speed[m] if np.isfinite(at) else 0.0
             behind, before = (
                 compute_acceleration_mps2(

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from torchcover.geometry.arrays import Bools, Float64, Int64
 from torchcover.simulation.sumo.floating import TIME_SLACK_S, SumoTrack
-from torchcover.simulation.traffic.fleet import DRAWS, compute_tractrix_yaw_rad, compute_trailer_poses, stack_paths
+from torchcover.simulation.traffic.fleet import HITCHES, compute_tractrix_yaw_rad, compute_trailer_poses, stack_paths
 
 # Bodies have a pose this often, and places are means over so much time before and after.
 FINE_S, SMOOTH_S = 0.1, 1.0
@@ -51,8 +51,8 @@ class RoadUser(NamedTuple):
     def trailer_axle_distance_m(self) -> float:
         """How far the axles of what it draws along are behind the point that leads, on a straight."""
         return (
-            self.lead_offset_m - DRAWS[self.kind].hitch_offset_m + DRAWS[self.kind].hitch_to_axle_m
-            if self.kind in DRAWS
+            self.lead_offset_m - HITCHES[self.kind].hitch_offset_m + HITCHES[self.kind].hitch_to_axle_m
+            if self.kind in HITCHES
             else 0.0
         )
 
@@ -128,7 +128,7 @@ def _lead_m(user: RoadUser, times_s: Float64, origin_m: Float64, walked: shapely
         even_m = _along_edges(even_m, times_s[1] - times_s[0], walked)
     half_s = max(SMOOTH_S, float(np.median(np.diff(track.times_s))))
     smooth_m = smooth_positions(even_m, int(np.ceil(half_s / (times_s[1] - times_s[0]))))
-    before_middle_m = user.lead_offset_m + (DRAWS[user.kind].center_offset_m if user.kind in DRAWS else 0.0)
+    before_middle_m = user.lead_offset_m + (HITCHES[user.kind].center_offset_m if user.kind in HITCHES else 0.0)
     behind_m = 0.0 if track.is_pedestrian else max(user.length_m / 2 - before_middle_m, 0.0)
     return _behind(smooth_m, behind_m, np.deg2rad(track.yaw_deg[0]))
 
@@ -145,7 +145,7 @@ def _poses(users: Sequence[RoadUser], ways_m: Sequence[Float64]) -> list[Float64
 
 def _rears(users: Sequence[RoadUser], poses: Sequence[Float64]) -> dict[int, Float64]:
     """(K, 3) poses of what some draw along, by their numbers, along those of fronts."""
-    fronts = [number for number, user in enumerate(users) if user.kind in DRAWS]
+    fronts = [number for number, user in enumerate(users) if user.kind in HITCHES]
     rears = compute_trailer_poses([users[number].kind for number in fronts], [poses[number] for number in fronts])
     return dict(zip(fronts, rears, strict=True))
 

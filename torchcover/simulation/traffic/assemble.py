@@ -1,4 +1,4 @@
-"""From places on lanes to a world: poses, the tilt of the ego vehicle, and people who cross a carriageway."""
+"""Conversion of lane positions to actors: poses, tilt of the ego vehicle, and pedestrians that cross a street."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -9,20 +9,25 @@ import numpy as np
 from torchcover.geometry.arrays import Bools, Float64, Int64
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation.shapes import Mesh
-from torchcover.simulation.traffic.fleet import CATEGORIES, DRAWS, EGO, REAR_OF, Fleet, compute_trailer_poses
+from torchcover.simulation.traffic.fleet import CATEGORIES, EGO, HITCHES, REAR_OF, Fleet, compute_trailer_poses
 from torchcover.simulation.traffic.flow import Agent, Lane, TrafficHistory
 from torchcover.simulation.traffic.hills import Hills
 from torchcover.simulation.traffic.scenery import PAVEMENT_M
 from torchcover.simulation.world import Actor
 
-# Probability to take the first chance after a stay, instead of waiting for another.
-EAGERNESS = 0.8
-MAX_STAY_S = 12.0
+# Largest range of a sensor: road users that never come this close to the ego vehicle are omitted from the scene.
+HORIZON_M = 250.0
 
 
 @dataclass(frozen=True, eq=False)
 class Footpath:
-    """A straight way from one (2,) waiting place to another, with a kerb `curb_distance_m` behind both, or none."""
+    """Straight path between two waiting positions.
+
+    Args:
+        start_m: (2,) first waiting position.
+        end_m: (2,) second waiting position.
+        curb_distance_m: Distance from each waiting position to the curb ahead; None without curbs.
+    """
 
     start_m: Float64
     end_m: Float64
@@ -30,24 +35,41 @@ class Footpath:
 
     @property
     def length_m(self) -> float:
-        """From one waiting place to the other."""
+        """Distance between the waiting positions."""
         return float(np.linalg.norm(self.end_m - self.start_m))
 
     def compute_poses(self, fractions: Float64, is_returning: Bools, body_radius_m: float) -> tuple[Float64, Float64]:
-        """(T, 3) positions and (T,) headings in degrees of who has gone (T,) shares of the way, forth or back.
+        """Compute poses of a pedestrian on the path.
 
-        The body steps down when all of it, so far from its middle, is past the kerb.
+        Args:
+            fractions: (T,) positions as fractions of the path, from the start.
+            is_returning: (T,) True on the way from the end to the start.
+            body_radius_m: Radius of the body, which steps down when all of it is past the curb.
+
+        Returns:
+            (T, 3) positions in meters and (T,) headings in degrees.
         """
-        way = self.end_m - self.start_m
-        yaw = np.rad2deg(np.arctan2(way[1], way[0])) + 180.0 * is_returning
-        position = self.start_m + fractions[:, None] * way
-        if self.curb_distance_m is None:
-            height = np.zeros(len(fractions))
-        else:
-            height = compute_step_height_m(
-                np.minimum(fractions, 1 - fractions) * self.length_m - self.curb_distance_m, body_radius_m
-            )
-        return np.column_stack([position, height]), yaw
+        path_m = self.end_m - self.start_m
+        yaw_deg = np.rad2deg(np.arctan2(path_m[1], path_m[0])) + 180.0 * is_returning
+        positions_m = self.start_m + fractions[:, None] * path_m
+        heights_m = np.zeros(len(fractions))
+        if self.curb_distance_m is not None:
+            beyond_curb_m = np.minimum(fractions, 1 - fractions) * self.length_m - self.curb_distance_m
+            heights_m = compute_step_height_m(beyond_curb_m, body_radius_m)
+        return np.column_stack([positions_m, heights_m]), yaw_deg
+
+
+@dataclass(frozen=True)
+class WalkingParams:
+    """Behavior of a pedestrian that walks to and fro.
+
+    Args:
+        max_wait_s: Longest wait before the pedestrian looks for a chance to start.
+        start_probability: Probability to take a chance instead of waiting for a later one.
+    """
+
+    max_wait_s: float = 12.0
+    start_probability: float = 0.8
 
 
 def simulate_walking(
@@ -57,67 +79,83 @@ def simulate_walking(
     times_s: Float64,
     body_radius_m: float,
     generator: np.random.Generator,
+    params: WalkingParams = WalkingParams(),
 ) -> tuple[Float64, Float64]:
-    """Go to and fro on a path, `traversal_s` each way: (T, 3) positions and (T,) headings in degrees at even times.
+    """Simulate a pedestrian that walks to and fro on a path.
 
-    One sets off only when one may, (T,), as who does then finds the way free until the end.
+    Args:
+        path: The path.
+        can_start: (T,) frames at which a pedestrian that starts finds the path free until its end.
+        traversal_s: Duration of one way.
+        times_s: (T,) evenly spaced times.
+        body_radius_m: Radius of the body.
+        generator: Random generator of waits.
+        params: Behavior.
+
+    Returns:
+        (T, 3) positions in meters and (T,) headings in degrees.
     """
-    count, step_s = len(can_start), float(times_s[1] - times_s[0])
-    chances = np.flatnonzero(can_start)
-    steps = int(np.ceil(traversal_s / step_s))
-    back = bool(generator.random() < 0.5)
-    share, faces_start = np.full(count, float(back)), np.full(count, back)
-    now = 0
+    num_frames, frame_interval_s = len(can_start), float(times_s[1] - times_s[0])
+    start_frames = np.flatnonzero(can_start)
+    traversal_frames = int(np.ceil(traversal_s / frame_interval_s))
+    is_at_end = bool(generator.random() < 0.5)
+    fractions, is_returning = np.full(num_frames, float(is_at_end)), np.full(num_frames, is_at_end)
+    frame = 0
     while True:
-        now += round(generator.uniform(0.0, MAX_STAY_S) / step_s)
-        ahead = chances[np.searchsorted(chances, now) :]
-        if len(ahead) == 0:
-            return path.compute_poses(share, faces_start, body_radius_m)
-        set_off = int(ahead[0])
-        now = set_off + 1
-        if generator.random() < EAGERNESS:
-            gone = np.clip((np.arange(count) - set_off) / steps, 0.0, 1.0)[set_off:]
-            share[set_off:] = 1.0 - gone if back else gone
-            arrived = set_off + steps
-            faces_start[arrived:] = not back
-            back, now = not back, arrived
+        frame += round(generator.uniform(0.0, params.max_wait_s) / frame_interval_s)
+        next_start = int(np.searchsorted(start_frames, frame))
+        if next_start == len(start_frames):
+            return path.compute_poses(fractions, is_returning, body_radius_m)
+        start = int(start_frames[next_start])
+        frame = start + 1
+        if generator.random() < params.start_probability:
+            progress = np.clip((np.arange(num_frames) - start) / traversal_frames, 0.0, 1.0)[start:]
+            fractions[start:] = 1.0 - progress if is_at_end else progress
+            frame = start + traversal_frames
+            is_at_end = not is_at_end
+            is_returning[frame:] = is_at_end
 
 
 def compute_step_height_m(beyond_curb_m: Float64, body_radius_m: float | Float64) -> Float64:
-    """Height of the feet of somebody whose middle is so far beyond the kerb, on the carriageway's side."""
-    stepping = (beyond_curb_m - body_radius_m) / PAVEMENT_M
-    return PAVEMENT_M * (1.0 - np.clip(stepping, 0.0, 1.0))
+    """Compute the height of the feet of a pedestrian near a curb.
+
+    Args:
+        beyond_curb_m: (...) distance of the center from the curb, positive on the carriageway.
+        body_radius_m: Radius of the body, or (...) radii.
+
+    Returns:
+        (...) heights above the carriageway in meters.
+    """
+    step_fractions = (beyond_curb_m - body_radius_m) / PAVEMENT_M
+    return PAVEMENT_M * (1.0 - np.clip(step_fractions, 0.0, 1.0))
 
 
 def is_free_for(blocked: Bools, duration_s: float, step_s: float) -> Bools:
-    """(T,) whether nothing is blocked from each time on for a duration; what is after the last time counts as free."""
-    steps = int(np.ceil(duration_s / step_s))
-    before = np.concatenate([[0], np.cumsum(blocked)])
-    here = np.arange(len(blocked))
-    return np.asarray(before[np.minimum(here + steps + 1, len(blocked))] == before[here])
+    """Test whether nothing is blocked from each frame on for a duration.
 
+    Args:
+        blocked: (T,) blocked frames; frames after the last one count as free.
+        duration_s: The duration.
+        step_s: Time between two frames.
 
-# Beyond the farthest range of a sensor: who never comes this close to the ego is left out of the world.
-HORIZON_M = 250.0
-# Where it is found out at first who may come so close, trailers are behind who draws them.
-SLACK_M = 12.0
-LOOKS_EVERY = 20
-# A soft-sprung passenger car: it dives by some 3 degrees at 1 g, and leans a little more in a curve.
-PITCH_DEG_PER_MPS2 = 0.3
-ROLL_DEG_PER_MPS2 = 0.4
-# The springs do not go farther, and bumpers sit on the axles behind them.
-MAX_SPRING_PITCH_DEG, MAX_SPRING_ROLL_DEG = 1.5, 1.1
-SPRING_TIME_S = 0.35
-# Unevenness of a road: shares of one bump's angle at wavelengths from a patch to a long swell.
-WAVELENGTHS_M = np.array([9.0, 17.0, 37.0, 71.0])
-PITCH_WAVES_DEG = np.array([0.08, 0.10, 0.10, 0.10])
-ROLL_WAVES_DEG = np.array([0.06, 0.08, 0.10, 0.14])
+    Returns:
+        (T,) True where all frames of the duration are free.
+    """
+    num_frames = int(np.ceil(duration_s / step_s))
+    blocked_before = np.concatenate([[0], np.cumsum(blocked)])
+    frames = np.arange(len(blocked))
+    ends = np.minimum(frames + num_frames + 1, len(blocked))
+    return np.asarray(blocked_before[ends] == blocked_before[frames])
 
 
 class BodyTrajectories(NamedTuple):
-    """Where N bodies are at T times: `positions_m` (T, N, 3), `yaw_deg` (T, N), and the N `kinds`.
+    """Poses of N bodies at T times.
 
-    The last of them are drawn along, by those whose numbers are `towing_indices`.
+    Args:
+        positions_m: (T, N, 3) positions; NaN where a body is absent.
+        yaw_deg: (T, N) headings.
+        kinds: N bodies; trailers come last.
+        towing_indices: Index of the towing vehicle of each trailer.
     """
 
     positions_m: Float64
@@ -127,68 +165,107 @@ class BodyTrajectories(NamedTuple):
 
     @classmethod
     def from_bodies(cls, bodies: Sequence[tuple[Float64, Float64, str]]) -> "BodyTrajectories":
-        """Those of bodies with (T, 3) positions, (T,) headings in degrees and a kind each."""
+        """Combine bodies with positions (T, 3) in meters, headings (T,) in degrees and a kind each."""
         positions_m, yaw_deg, kinds = zip(*bodies, strict=True)
         return cls(np.stack(positions_m, axis=1), np.stack(yaw_deg, axis=1), kinds)
 
     def add_trailers(self, initial_yaw_rad: Sequence[float] | None = None) -> "BodyTrajectories":
-        """And all that these bodies draw along, with headings in radians at first; straight behind if not given."""
-        fronts = tuple(number for number, kind in enumerate(self.kinds) if kind in DRAWS)
-        own = [np.column_stack([self.positions_m[:, k, :2], np.deg2rad(self.yaw_deg[:, k])]) for k in fronts]
-        if not fronts:
+        """Append the trailers of these bodies.
+
+        Args:
+            initial_yaw_rad: Heading of each trailer at the start; straight behind the towing vehicle if None.
+        """
+        towing_indices = tuple(index for index, kind in enumerate(self.kinds) if kind in HITCHES)
+        if not towing_indices:
             return self
-        poses = np.stack(compute_trailer_poses([self.kinds[front] for front in fronts], own, initial_yaw_rad), axis=1)
+        front_kinds = [self.kinds[index] for index in towing_indices]
+        front_poses = []
+        for index in towing_indices:
+            yaw_rad = np.deg2rad(self.yaw_deg[:, index])
+            front_poses.append(np.column_stack([self.positions_m[:, index, :2], yaw_rad]))
+        poses = np.stack(compute_trailer_poses(front_kinds, front_poses, initial_yaw_rad), axis=1)
         positions_m = np.concatenate([self.positions_m, poses * [1.0, 1.0, 0.0]], axis=1)
         yaw_deg = np.concatenate([self.yaw_deg, np.rad2deg(poses[..., 2])], axis=1)
-        return BodyTrajectories(
-            positions_m, yaw_deg, (*self.kinds, *(DRAWS[self.kinds[front]].trailer_kind for front in fronts)), fronts
-        )
+        trailer_kinds = [HITCHES[kind].trailer_kind for kind in front_kinds]
+        return BodyTrajectories(positions_m, yaw_deg, (*self.kinds, *trailer_kinds), towing_indices)
 
 
 def compute_body_trajectories(
     lanes: Sequence[Lane], agents: Sequence[Agent], lane_positions_m: Float64
 ) -> BodyTrajectories:
-    """Follow the lanes, on the ground, to (T, N) places on them; what is drawn along comes behind."""
+    """Compute the poses of agents and their trailers on the ground plane.
+
+    Args:
+        lanes: Lanes.
+        agents: N agents.
+        lane_positions_m: (T, N) positions along the lanes.
+    """
     positions_m, yaw_deg = np.zeros((*lane_positions_m.shape, 3)), np.empty(lane_positions_m.shape)
-    lane_of, kinds = np.array([agent.lane_index for agent in agents]), tuple(agent.kind for agent in agents)
+    lane_indices = np.array([agent.lane_index for agent in agents])
+    kinds = tuple(agent.kind for agent in agents)
     lane_positions_m = lane_positions_m + get_center_offsets_m(kinds)
-    for on_lane, poses in _along(lanes, lane_of, lane_positions_m):
+    for on_lane, poses in _iterate_lane_poses(lanes, lane_indices, lane_positions_m):
         positions_m[:, on_lane, :2], yaw_deg[:, on_lane] = poses[..., :2], poses[..., 2]
-    start = []
-    for number in [number for number, kind in enumerate(kinds) if kind in DRAWS]:
-        # At first the axles are on the lane, too.
-        back_m = DRAWS[kinds[number]].hitch_to_axle_m - DRAWS[kinds[number]].hitch_offset_m
-        (axles_m,) = lanes[lane_of[number]].centerline.compute_poses(lane_positions_m[:1, number] - back_m)[:, :2]
-        start.append(float(np.arctan2(*(positions_m[0, number, :2] - axles_m)[::-1])))
-    return BodyTrajectories(positions_m, yaw_deg, kinds).add_trailers(start)
+    initial_yaw_rad = []
+    for index, kind in enumerate(kinds):
+        if kind in HITCHES:
+            # At the start the axles of the trailer are on the lane.
+            axle_distance_m = HITCHES[kind].hitch_to_axle_m - HITCHES[kind].hitch_offset_m
+            centerline = lanes[lane_indices[index]].centerline
+            (axle_m,) = centerline.compute_poses(lane_positions_m[:1, index] - axle_distance_m)[:, :2]
+            x_m, y_m = positions_m[0, index, :2] - axle_m
+            initial_yaw_rad.append(float(np.arctan2(y_m, x_m)))
+    return BodyTrajectories(positions_m, yaw_deg, kinds).add_trailers(initial_yaw_rad)
 
 
-def _along(lanes: Sequence[Lane], lane_of: Int64, place_m: Float64) -> Iterator[tuple[slice | Int64, Float64]]:
-    """Those on the same lane, and their (T, N, 3) poses. Mostly they are numbered in turn, and taken without a copy."""
-    order = np.argsort(lane_of, kind="stable")
-    for on_lane in np.split(order, np.flatnonzero(np.diff(lane_of[order])) + 1):
+def _iterate_lane_poses(
+    lanes: Sequence[Lane], lane_indices: Int64, lane_positions_m: Float64
+) -> Iterator[tuple[slice | Int64, Float64]]:
+    """Iterate over the agents of each lane and their poses (T, N, 3); consecutive agents are sliced without a copy."""
+    order = np.argsort(lane_indices, kind="stable")
+    for on_lane in np.split(order, np.flatnonzero(np.diff(lane_indices[order])) + 1):
         first, last = int(on_lane[0]), int(on_lane[-1])
-        some = slice(first, last + 1) if last - first == len(on_lane) - 1 else on_lane
-        yield some, lanes[lane_of[first]].centerline.compute_poses(place_m[:, some])
+        selection = slice(first, last + 1) if last - first == len(on_lane) - 1 else on_lane
+        yield selection, lanes[lane_indices[first]].centerline.compute_poses(lane_positions_m[:, selection])
 
 
 def get_center_offsets_m(kinds: Sequence[str]) -> Float64:
-    """(N,) how far the middles of bodies are before those of all that belongs to them."""
-    return np.array([DRAWS[kind].center_offset_m if kind in DRAWS else 0.0 for kind in kinds])
+    """Return the distances (N,) of bodies ahead of the centers of their vehicles: not 0 with a trailer."""
+    return np.array([HITCHES[kind].center_offset_m if kind in HITCHES else 0.0 for kind in kinds])
 
 
-def find_nearby_agents(lanes: Sequence[Lane], agents: Sequence[Agent], lane_positions_m: Float64) -> Int64:
-    """Numbers of those who may come near the first one, who is among them; they are looked at now and then only."""
-    looks = np.unique(np.append(np.arange(0, len(lane_positions_m), LOOKS_EVERY), len(lane_positions_m) - 1))
-    seen_m = lane_positions_m[looks]
-    positions_m, lane_of = np.empty((*seen_m.shape, 2)), np.array([agent.lane_index for agent in agents])
-    for on_lane, poses in _along(lanes, lane_of, seen_m + get_center_offsets_m([agent.kind for agent in agents])):
+def find_nearby_agents(
+    lanes: Sequence[Lane],
+    agents: Sequence[Agent],
+    lane_positions_m: Float64,
+    frame_stride: int = 20,
+    margin_m: float = 12.0,
+) -> Int64:
+    """Find agents that may come within `HORIZON_M` of the first agent.
+
+    Args:
+        lanes: Lanes.
+        agents: N agents.
+        lane_positions_m: (T, N) positions along the lanes.
+        frame_stride: Distances are computed every so many frames, to save time.
+        margin_m: Addition to the horizon for trailers, which are behind their agents.
+
+    Returns:
+        Ascending indices of agents, with 0.
+    """
+    num_frames = len(lane_positions_m)
+    frames = np.unique(np.append(np.arange(0, num_frames, frame_stride), num_frames - 1))
+    lane_positions_m = lane_positions_m[frames]
+    positions_m = np.empty((*lane_positions_m.shape, 2))
+    lane_indices = np.array([agent.lane_index for agent in agents])
+    center_positions_m = lane_positions_m + get_center_offsets_m([agent.kind for agent in agents])
+    for on_lane, poses in _iterate_lane_poses(lanes, lane_indices, center_positions_m):
         positions_m[:, on_lane] = poses[..., :2]
-    distance_m = np.linalg.norm(positions_m - positions_m[:, :1], axis=2)
-    # Nobody drives back: between two looks, the two come closer by the ways of both at most.
-    ways_m = np.diff(seen_m, axis=0, append=seen_m[-1:])
-    nearest_m = (distance_m - ways_m - ways_m[:, :1]).min(axis=0)
-    return np.flatnonzero(nearest_m < HORIZON_M + SLACK_M)
+    distances_m = np.linalg.norm(positions_m - positions_m[:, :1], axis=2)
+    # Agents never drive backwards: between two of these frames, two agents approach at most by the ways of both.
+    steps_m = np.diff(lane_positions_m, axis=0, append=lane_positions_m[-1:])
+    min_distances_m = (distances_m - steps_m - steps_m[:, :1]).min(axis=0)
+    return np.flatnonzero(min_distances_m < HORIZON_M + margin_m)
 
 
 def build_ego_actor(
@@ -200,15 +277,26 @@ def build_ego_actor(
     generator: np.random.Generator,
     hills: Hills | None = None,
 ) -> Actor:
-    """The ego, one of those who follow lanes, with a body that tilts; on a plain if there are no hills."""
-    way, speed = flow.lane_positions_m[:, ego_index], flow.speeds_mps[:, ego_index]
-    angles = compute_attitude_deg(times_s, way, speed, trajectories.yaw_deg[:, ego_index], generator)
+    """Build the ego vehicle, whose body tilts with acceleration, curves and the road.
+
+    Args:
+        times_s: (T,) evenly spaced times.
+        trajectories: Poses on the ground plane.
+        flow: Positions and speeds along the lanes.
+        ego_index: Index of the ego vehicle.
+        mesh: Mesh of the ego vehicle.
+        generator: Random generator of the unevenness of the road.
+        hills: Ground heights; a plane if None.
+    """
+    distance_m, speed_mps = flow.lane_positions_m[:, ego_index], flow.speeds_mps[:, ego_index]
+    yaw_deg = trajectories.yaw_deg[:, ego_index]
+    angles_deg = compute_attitude_deg(times_s, distance_m, speed_mps, yaw_deg, generator)
     positions_m = trajectories.positions_m[:, ego_index].copy()
     if hills is not None:
-        stances = hills.compute_heights_and_tilts(positions_m[:, :2], trajectories.yaw_deg[:, ego_index])
-        positions_m[:, 2] += stances[:, 0]
-        angles[:, 1:] += stances[:, 1:]
-    return Actor(EGO, "car", mesh, Trajectory(times_s, positions_m, angles))
+        heights_and_tilts = hills.compute_heights_and_tilts(positions_m[:, :2], yaw_deg)
+        positions_m[:, 2] += heights_and_tilts[:, 0]
+        angles_deg[:, 1:] += heights_and_tilts[:, 1:]
+    return Actor(EGO, "car", mesh, Trajectory(times_s, positions_m, angles_deg))
 
 
 def build_nearby_actors(
@@ -218,71 +306,122 @@ def build_nearby_actors(
     fleet: Fleet,
     hills: Hills | None = None,
 ) -> tuple[Actor, ...]:
-    """All who ever come near the ego, in groups; the ego itself is left out. NaN where somebody is not there."""
-    near: list[Actor] = []
+    """Build actors of all bodies that come within `HORIZON_M` of the ego vehicle, except the ego vehicle.
+
+    Args:
+        times_s: (T,) evenly spaced times.
+        trajectory_groups: Poses on the ground plane or on sidewalks.
+        ego: Ego vehicle.
+        fleet: Meshes of the bodies.
+        hills: Ground heights; a plane if None.
+
+    Returns:
+        Actors; their trajectories cover the frames in which they are present, at least two.
+    """
+    actors: list[Actor] = []
     for group in trajectory_groups:
-        # On the level, and one axis after the other: hills come later, and this is done for very many.
-        x_m, y_m = ((group.positions_m[..., k] - ego.trajectory.positions_m[:, None, k]) ** 2 for k in (0, 1))
-        distance = np.sqrt(np.fmin.reduce(x_m + y_m, axis=0))
-        numbers = np.flatnonzero((distance < HORIZON_M) & (np.array(group.kinds) != EGO))
-        # One body after the other: each has its own piece of both.
-        positions_m = np.ascontiguousarray(group.positions_m[:, numbers].swapaxes(0, 1))
+        # Distances are computed without hills and axis by axis, because there are very many bodies.
+        squared_x_m2 = (group.positions_m[..., 0] - ego.trajectory.positions_m[:, None, 0]) ** 2
+        squared_y_m2 = (group.positions_m[..., 1] - ego.trajectory.positions_m[:, None, 1]) ** 2
+        distances_m = np.sqrt(np.fmin.reduce(squared_x_m2 + squared_y_m2, axis=0))
+        bodies = np.flatnonzero((distances_m < HORIZON_M) & (np.array(group.kinds) != EGO))
+        # Body by body, so that each trajectory is contiguous.
+        positions_m = np.ascontiguousarray(group.positions_m[:, bodies].swapaxes(0, 1))
         angles_deg = np.zeros_like(positions_m)
-        angles_deg[..., 0] = group.yaw_deg[:, numbers].T
+        angles_deg[..., 0] = group.yaw_deg[:, bodies].T
         if hills is not None:
-            on_foot = np.array([CATEGORIES[group.kinds[number]] == "pedestrian" for number in numbers], dtype=bool)
-            positions_m[on_foot, :, 2] += hills.compute_heights_m(positions_m[on_foot, :, :2])
-            stances = hills.compute_heights_and_tilts(positions_m[~on_foot, :, :2], angles_deg[~on_foot, :, 0])
-            positions_m[~on_foot, :, 2] += stances[..., 0]
-            angles_deg[~on_foot, :, 1:] = stances[..., 1:]
-        there = ~np.isnan(positions_m[..., 0])
-        always = np.array([all_along.all() for all_along in there], dtype=bool)
-        names = dict[int, str]()
-        for row, number in enumerate(numbers.tolist()):
-            kind, some = group.kinds[number], slice(None) if always[row] else there[row]
-            if np.count_nonzero(there[row]) < 2:
+            is_walking = np.array([CATEGORIES[group.kinds[body]] == "pedestrian" for body in bodies], dtype=bool)
+            positions_m[is_walking, :, 2] += hills.compute_heights_m(positions_m[is_walking, :, :2])
+            heights_and_tilts = hills.compute_heights_and_tilts(
+                positions_m[~is_walking, :, :2], angles_deg[~is_walking, :, 0]
+            )
+            positions_m[~is_walking, :, 2] += heights_and_tilts[..., 0]
+            angles_deg[~is_walking, :, 1:] = heights_and_tilts[..., 1:]
+        is_present = ~np.isnan(positions_m[..., 0])
+        is_always_present = is_present.all(axis=1)
+        names: dict[int, str] = {}
+        for row, body in enumerate(bodies.tolist()):
+            if np.count_nonzero(is_present[row]) < 2:
                 continue
-            trajectory = Trajectory(times_s[some], positions_m[row, some], angles_deg[row, some], not always[row])
-            names[number] = f"{kind} {len(near)}"
-            if number >= len(group.kinds) - len(group.towing_indices):
-                front = group.towing_indices[number - len(group.kinds)]
-                names[number] = REAR_OF + names.get(front, names[number])
-            near.append(Actor(names[number], CATEGORIES[kind], fleet.meshes[kind], trajectory))
-    return tuple(near)
+            kind = group.kinds[body]
+            names[body] = f"{kind} {len(actors)}"
+            if body >= len(group.kinds) - len(group.towing_indices):
+                towing_body = group.towing_indices[body - len(group.kinds)]
+                names[body] = REAR_OF + names.get(towing_body, names[body])
+            frames = slice(None) if is_always_present[row] else is_present[row]
+            trajectory = Trajectory(
+                times_s[frames], positions_m[row, frames], angles_deg[row, frames], not is_always_present[row]
+            )
+            actors.append(Actor(names[body], CATEGORIES[kind], fleet.meshes[kind], trajectory))
+    return tuple(actors)
+
+
+@dataclass(frozen=True)
+class AttitudeParams:
+    """Tilt of a passenger car with soft springs.
+
+    Args:
+        pitch_deg_per_mps2: Pitch per deceleration; about 3 degrees at 1 g.
+        roll_deg_per_mps2: Roll per lateral acceleration.
+        max_pitch_deg: Limit of the springs.
+        max_roll_deg: Limit of the springs.
+        spring_time_s: Time constant of the damped springs.
+        wavelengths_m: Wavelengths of the unevenness of the road, from a patch to a long swell.
+        pitch_waves_deg: Amplitude of the pitch at each wavelength.
+        roll_waves_deg: Amplitude of the roll at each wavelength.
+    """
+
+    pitch_deg_per_mps2: float = 0.3
+    roll_deg_per_mps2: float = 0.4
+    max_pitch_deg: float = 1.5
+    max_roll_deg: float = 1.1
+    spring_time_s: float = 0.35
+    wavelengths_m: tuple[float, ...] = (9.0, 17.0, 37.0, 71.0)
+    pitch_waves_deg: tuple[float, ...] = (0.08, 0.10, 0.10, 0.10)
+    roll_waves_deg: tuple[float, ...] = (0.06, 0.08, 0.10, 0.14)
 
 
 def compute_attitude_deg(
-    times_s: Float64, distance_m: Float64, speed_mps: Float64, yaw_deg: Float64, generator: np.random.Generator
+    times_s: Float64,
+    distance_m: Float64,
+    speed_mps: Float64,
+    yaw_deg: Float64,
+    generator: np.random.Generator,
+    params: AttitudeParams = AttitudeParams(),
 ) -> Float64:
-    """(T, 3) yaw, pitch and roll in degrees of a car about the point on the road under its middle.
+    """Compute the attitude of a car about the point on the road below its center.
 
-    The wheels of a car pivot about a point midway between the axles, so a pitch of 1 degree lifts or lowers them by
-    under 3 cm: the springs' stroke, which a rigid body has to show at its wheels. |pitch| < 2 and |roll| < 1.5 degrees.
-    Braking turns the nose down (positive pitch); in a left-hand curve the right side goes down (positive roll). The
-    road's unevenness depends on the way alone, so a standing car does not rock. Times are evenly spaced.
+    Braking lowers the nose (positive pitch); in a left curve the right side goes down (positive roll). The unevenness
+    of the road depends on the distance alone: a standing car does not rock. A rigid body shows the travel of its
+    springs at the wheels: a pitch of 1 degree about the point midway between the axles moves them by less than 3 cm.
+
+    Args:
+        times_s: (T,) evenly spaced times.
+        distance_m: (T,) distances along the path.
+        speed_mps: (T,) speeds.
+        yaw_deg: (T,) headings.
+        generator: Random generator of the phases of the unevenness.
+        params: Springs and road.
+
+    Returns:
+        (T, 3) yaw, pitch and roll in degrees, with |pitch| < 2 and |roll| < 1.5.
     """
-    forward = np.gradient(speed_mps, times_s)
-    leftward = speed_mps * np.gradient(np.unwrap(np.deg2rad(yaw_deg)), times_s)
-    pitch = _limit(-PITCH_DEG_PER_MPS2 * forward, MAX_SPRING_PITCH_DEG)
-    roll = _limit(ROLL_DEG_PER_MPS2 * leftward, MAX_SPRING_ROLL_DEG)
-    pitch = _settle(times_s, pitch) + _unevenness(distance_m, PITCH_WAVES_DEG, generator)
-    roll = _settle(times_s, roll) + _unevenness(distance_m, ROLL_WAVES_DEG, generator)
-    return np.stack([yaw_deg, pitch, roll], axis=1)
+    forward_mps2 = np.gradient(speed_mps, times_s)
+    leftward_mps2 = speed_mps * np.gradient(np.unwrap(np.deg2rad(yaw_deg)), times_s)
+    pitch_deg = params.max_pitch_deg * np.tanh(-params.pitch_deg_per_mps2 * forward_mps2 / params.max_pitch_deg)
+    roll_deg = params.max_roll_deg * np.tanh(params.roll_deg_per_mps2 * leftward_mps2 / params.max_roll_deg)
+    angles_deg = [yaw_deg]
+    for angle_deg, waves_deg in ((pitch_deg, params.pitch_waves_deg), (roll_deg, params.roll_waves_deg)):
+        phases = generator.uniform(0, 2 * np.pi, size=len(waves_deg))
+        waves = np.sin(2 * np.pi * distance_m[:, None] / np.array(params.wavelengths_m) + phases)
+        angles_deg.append(smooth_exponentially(times_s, angle_deg, params.spring_time_s) + waves @ np.array(waves_deg))
+    return np.stack(angles_deg, axis=1)
 
 
-def _limit(angle_deg: Float64, largest_deg: float) -> Float64:
-    return largest_deg * np.tanh(angle_deg / largest_deg)
-
-
-def _settle(times_s: Float64, wanted_deg: Float64) -> Float64:
-    """Follow the wanted angle with the delay of a damped spring (a first-order low pass, exact for each step)."""
-    share = 1.0 - np.exp(-np.diff(times_s) / SPRING_TIME_S)
-    settled = wanted_deg.copy()
-    for step, part in enumerate(share):
-        settled[step + 1] = settled[step] + part * (wanted_deg[step + 1] - settled[step])
-    return settled
-
-
-def _unevenness(way_m: Float64, waves_deg: Float64, generator: np.random.Generator) -> Float64:
-    phase = generator.uniform(0, 2 * np.pi, size=len(WAVELENGTHS_M))
-    return np.asarray(np.sin(2 * np.pi * way_m[:, None] / WAVELENGTHS_M + phase) @ waves_deg)
+def smooth_exponentially(times_s: Float64, values: Float64, time_constant_s: float) -> Float64:
+    """Smooth values (T,) by a first-order low-pass filter that is exact for each step."""
+    weights = 1.0 - np.exp(-np.diff(times_s) / time_constant_s)
+    smoothed = values.copy()
+    for index, weight in enumerate(weights):
+        smoothed[index + 1] = smoothed[index] + weight * (values[index + 1] - smoothed[index])
+    return smoothed

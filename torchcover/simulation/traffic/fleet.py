@@ -1,4 +1,4 @@
-"""Road users: bodies by kind, drivers by kind, lanes filled with them, and trailers that follow at a hitch."""
+"""Road users: bodies and drivers of each kind, lanes filled with agents, and trailers that are towed at a hitch."""
 
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
@@ -19,10 +19,14 @@ from torchcover.simulation.world import Actor
 
 
 class Hitch(NamedTuple):
-    """How a body draws another one along, of kind `trailer_kind`, whose axles never slip sideways.
+    """Geometry of a tractor and its trailer, whose axles never slip sideways.
 
-    The middle of the front is `center_offset_m` before that of both, on a straight, and the hitch `hitch_offset_m` before the middle
-    of the front, negative behind it. From the hitch, the axles of the rear are `hitch_to_axle_m` back, and its middle `hitch_to_center_m`.
+    Args:
+        trailer_kind: Kind of the towed body.
+        center_offset_m: Center of the tractor ahead of the center of the whole vehicle, on a straight.
+        hitch_offset_m: Hitch ahead of the center of the tractor; negative behind it.
+        hitch_to_axle_m: Distance from the hitch back to the axles of the trailer.
+        hitch_to_center_m: Distance from the hitch back to the center of the trailer.
     """
 
     trailer_kind: str
@@ -32,99 +36,124 @@ class Hitch(NamedTuple):
     hitch_to_center_m: float
 
     def compute_hitch_positions_m(self, poses: Float64) -> Float64:
-        """(T, 2) where the hitch is, at (T, 3) poses x, y and heading in radians of the front."""
-        return _shifted_m(poses, self.hitch_offset_m)[:, :2]
+        """Compute positions (T, 2) of the hitch at poses (T, 3) of the tractor: x, y, heading in radians."""
+        return move_forward(poses, self.hitch_offset_m)[:, :2]
 
 
 # At the limits of EU Directive 96/53/EC the kingpin is 12 m before the rear end, and the front of the trailer turns
 # 2.04 m around it.
-DRAWS: Mapping[str, Hitch] = {"truck": Hitch("trailer", 4.925, -1.175, 8.41, 5.2)}
+HITCHES: Mapping[str, Hitch] = {"truck": Hitch("trailer", 4.925, -1.175, 8.41, 5.2)}
 
 
 def compute_trailer_poses(
     kinds: Sequence[str], front_poses: Sequence[Float64], initial_yaw_rad: Sequence[float] | None = None
 ) -> list[Float64]:
-    """(T, 3) poses x, y and heading in radians of what N bodies of these kinds draw along, whose own are likewise.
+    """Compute the poses of the trailers of N tractors.
 
-    T may differ. `initial_yaw_rad` are headings of the rears at first; straight behind if not given.
+    Args:
+        kinds: N keys of `HITCHES`.
+        front_poses: N arrays (T, 3) of x, y and heading in radians of the tractors; T may differ.
+        initial_yaw_rad: N headings of the trailers at the start; straight behind the tractors if None.
+
+    Returns:
+        N arrays (T, 3) of x, y and heading in radians.
     """
     if not kinds:
         return []
-    hitches = [DRAWS[kind] for kind in kinds]
-    leads_m = [hitch.compute_hitch_positions_m(own) for hitch, own in zip(hitches, front_poses, strict=True)]
-    first = np.array([own[0, 2] for own in front_poses] if initial_yaw_rad is None else initial_yaw_rad)
-    yaws = compute_tractrix_yaw_rad(
-        stack_paths(leads_m), np.array([hitch.hitch_to_axle_m for hitch in hitches]), first
-    ).T
-    return [
-        _shifted_m(np.column_stack([lead_m, yaw[: len(lead_m)]]), -hitch.hitch_to_center_m)
-        for hitch, lead_m, yaw in zip(hitches, leads_m, yaws, strict=True)
-    ]
+    hitches = [HITCHES[kind] for kind in kinds]
+    hitch_paths_m = []
+    for hitch, poses in zip(hitches, front_poses, strict=True):
+        hitch_paths_m.append(hitch.compute_hitch_positions_m(poses))
+    if initial_yaw_rad is None:
+        initial_yaw_rad = [poses[0, 2] for poses in front_poses]
+    axle_distances_m = np.array([hitch.hitch_to_axle_m for hitch in hitches])
+    yaws_rad = compute_tractrix_yaw_rad(stack_paths(hitch_paths_m), axle_distances_m, np.array(initial_yaw_rad)).T
+    trailer_poses = []
+    for hitch, path_m, yaw_rad in zip(hitches, hitch_paths_m, yaws_rad, strict=True):
+        hitch_poses = np.column_stack([path_m, yaw_rad[: len(path_m)]])
+        trailer_poses.append(move_forward(hitch_poses, -hitch.hitch_to_center_m))
+    return trailer_poses
 
 
 def stack_paths(paths_m: Sequence[Float64]) -> Float64:
-    """(T, N, 2) N ways, of which each stays at its end until the longest is there."""
-    longest = max(map(len, paths_m))
-    return np.stack([np.pad(way_m, ((0, longest - len(way_m)), (0, 0)), "edge") for way_m in paths_m], axis=1)
+    """Stack N paths (K, 2) of different lengths into (T, N, 2); shorter paths repeat their last position."""
+    num_positions = max(len(path_m) for path_m in paths_m)
+    return np.stack([np.pad(path_m, ((0, num_positions - len(path_m)), (0, 0)), "edge") for path_m in paths_m], axis=1)
 
 
 def compute_tractrix_yaw_rad(lead_positions_m: Float64, rod_lengths_m: Float64, initial_yaw_rad: Float64) -> Float64:
-    """(T, N) headings in radians, without leaps, of N rods that are drawn along at their front ends, (T, N, 2).
+    """Compute headings of N rods that are pulled at their front ends while their rear ends never slip sideways.
 
-    Their rear ends never slip sideways. Exact for ways of straight pieces: with the angle a between rod and way, tan(a
-    / 2) falls by exp(-way / length).
+    The result is exact for paths of straight segments: with the angle a between rod and path, tan(a / 2) decays by
+    exp(-distance / rod length).
+
+    Args:
+        lead_positions_m: (T, N, 2) positions of the front ends.
+        rod_lengths_m: (N,) lengths.
+        initial_yaw_rad: (N,) headings at the start.
+
+    Returns:
+        (T, N) unwrapped headings in radians.
     """
-    ways_m = np.diff(lead_positions_m, axis=0)
-    towards = np.arctan2(ways_m[..., 1], ways_m[..., 0])
-    falls = np.exp(-np.hypot(ways_m[..., 0], ways_m[..., 1]) / rod_lengths_m)
-    found = np.empty(lead_positions_m.shape[:2])
-    found[0] = initial_yaw_rad
-    for k, (toward, fall) in enumerate(zip(towards, falls, strict=True)):
-        half = np.tan((toward - found[k]) / 2)
-        found[k + 1] = found[k] + 2 * (np.arctan(half) - np.arctan(half * fall))
-    return found
+    steps_m = np.diff(lead_positions_m, axis=0)
+    directions_rad = np.arctan2(steps_m[..., 1], steps_m[..., 0])
+    decays = np.exp(-np.hypot(steps_m[..., 0], steps_m[..., 1]) / rod_lengths_m)
+    yaw_rad = np.empty(lead_positions_m.shape[:2])
+    yaw_rad[0] = initial_yaw_rad
+    for index, (direction_rad, decay) in enumerate(zip(directions_rad, decays, strict=True)):
+        half_tangent = np.tan((direction_rad - yaw_rad[index]) / 2)
+        yaw_rad[index + 1] = yaw_rad[index] + 2 * (np.arctan(half_tangent) - np.arctan(half_tangent * decay))
+    return yaw_rad
 
 
-def _shifted_m(poses: Float64, ahead_m: float) -> Float64:
-    """(T, 3) poses so much ahead."""
-    yaw = poses[:, 2]
-    return poses + ahead_m * np.stack([np.cos(yaw), np.sin(yaw), np.zeros(len(yaw))], axis=1)
-
-
-CARS = ("hatchback", "sedan", "suv", "pickup", "van")
-ON_FOOT = ("adult", "child")
-# They need no road, or one that is not built.
-LEFT_OUT = frozenset({"rail", "rail_urban", "rail_electric", "rail_fast", "subway", "cable_car", "ship", "drone"})
+def move_forward(poses: Float64, distance_m: float) -> Float64:
+    """Move poses (T, 3) of x, y and heading in radians forward along their headings."""
+    yaw_rad = poses[:, 2]
+    return poses + distance_m * np.stack([np.cos(yaw_rad), np.sin(yaw_rad), np.zeros(len(yaw_rad))], axis=1)
 
 
 class VehicleType(NamedTuple):
-    """What is known of somebody: a class, by SUMO's names, and a length."""
+    """Type of a road user in a recording or simulation.
+
+    Args:
+        vehicle_class: Vehicle class in SUMO's vocabulary, such as "passenger".
+        length_m: Length.
+    """
 
     vehicle_class: str
     length_m: float
 
     def find_body(self, lengths_m: Mapping[str, float]) -> str | None:
-        """The body whose length is nearest among those of the class; None if there is none of this class."""
-        if self.vehicle_class in LEFT_OUT:
+        """Find the body that represents this type.
+
+        Args:
+            lengths_m: Length of each available body.
+
+        Returns:
+            The body of the class whose length is nearest; None for rail vehicles, ships and drones.
+        """
+        classes_without_body = "rail rail_urban rail_electric rail_fast subway cable_car ship drone"
+        if self.vehicle_class in classes_without_body.split():
             return None
-        kinds = load_road_user_classes()["bodies"].get(self.vehicle_class, CARS)
-        if kinds[0] in ON_FOOT:
-            return str(kinds[0])  # the simulation's lengths of people are all the same
-        bodies = [name for name in lengths_m if name.partition("_")[0] in kinds]
-        return min(bodies, key=lambda kind: abs(lengths_m[kind] - self.length_m))
+        cars = ("hatchback", "sedan", "suv", "pickup", "van")
+        kinds = load_road_user_classes()["bodies"].get(self.vehicle_class, cars)
+        if kinds[0] in ("adult", "child"):
+            return str(kinds[0])  # SUMO gives all people one length
+        bodies = [body for body in lengths_m if body.partition("_")[0] in kinds]
+        differences_m = [abs(lengths_m[body] - self.length_m) for body in bodies]
+        return bodies[int(np.argmin(differences_m))]
 
 
-# What each built-in body counts as.
-BODIES = {
+# Category of each built-in kind; a trailer has its own box and category, as in nuScenes.
+KIND_CATEGORIES = {
     **dict.fromkeys(("suv", "sedan", "hatchback", "pickup", "van"), "car"),
     **dict.fromkeys(("lorry", "truck"), "truck"),
-    # It has a box and a category of its own, as in nuScenes.
     **{kind: kind for kind in ("trailer", "bus", "motorcycle", "cyclist")},
     **dict.fromkeys(("adult", "child"), "pedestrian"),
 }
-# Lengths, widths and heights of others of a kind, as shares of its body's: within the spreads of boxes in recorded
-# logs (docs/measured/streets.md).
-SIZES: Mapping[str, tuple[tuple[float, float, float], ...]] = {
+# Length, width and height of further bodies of a kind, as factors on the size of its first body; within the spread of
+# boxes in recorded logs (docs/measured/streets.md).
+SIZE_FACTORS: Mapping[str, tuple[tuple[float, float, float], ...]] = {
     "suv": ((0.91, 0.95, 1.02), (1.03, 1.03, 1.10)),
     "sedan": ((0.94, 0.98, 0.99), (1.04, 1.02, 1.03)),
     "hatchback": ((0.90, 0.96, 1.00), (1.02, 1.01, 1.08)),
@@ -134,95 +163,129 @@ SIZES: Mapping[str, tuple[tuple[float, float, float], ...]] = {
     "adult": ((0.95, 0.92, 0.94), (1.05, 1.06, 1.05)),
     "child": ((0.90, 0.90, 0.88), (1.10, 1.08, 1.15)),
 }
-# Those of other sizes have a number behind their kind.
-KIND_OF = {f"{kind}_{number}": kind for kind, sizes in SIZES.items() for number in range(2, 2 + len(sizes))}
-KIND_OF |= {kind: kind for kind in BODIES}
-CATEGORIES = {name: BODIES[kind] for name, kind in sorted(KIND_OF.items())}
+# Kind of each body: further bodies of a kind have a number behind its name, from 2.
+BODY_KINDS = {f"{kind}_{number}": kind for kind, sizes in SIZE_FACTORS.items() for number in range(2, 2 + len(sizes))}
+BODY_KINDS |= {kind: kind for kind in KIND_CATEGORIES}
+CATEGORIES = {body: KIND_CATEGORIES[kind] for body, kind in sorted(BODY_KINDS.items())}
+HEAVY_KINDS = ("truck", "lorry", "bus")
+# Name of the ego vehicle, and prefix of the name of an actor that is a trailer.
 EGO = "ego"
-HEAVY = ("truck", "lorry", "bus")
 REAR_OF = "rear of "
 
-WALKING = Driver(
+PEDESTRIAN = Driver(
     desired_speed_mps=1.4, headway_s=0.4, standstill_gap_m=0.5, acceleration_mps2=1.0, deceleration_mps2=1.5
 )
-CYCLING = Driver(
+CYCLIST = Driver(
     desired_speed_mps=5.0, headway_s=0.8, standstill_gap_m=1.0, acceleration_mps2=0.8, deceleration_mps2=1.8
 )
 
 
 @cache
 def load_bodies() -> Mapping[str, Mesh]:
-    """The built-in bodies, in all their sizes."""
+    """Load the mesh of each built-in body in `CATEGORIES`."""
     truck = Vehicle.load("truck")
-    behind = [part.name.startswith("trailer") for part in truck.parts]
-    called = {kind: kind for kind in BODIES if kind not in ("truck", "trailer")} | {"child": "child_120cm"}
-    meshes = {kind: Vehicle.load(name).build_mesh() for kind, name in called.items()}
-    for kind, is_rear in (("truck", False), ("trailer", True)):
-        parts = tuple(part for part, at_rear in zip(truck.parts, behind, strict=True) if at_rear is is_rear)
+    meshes: dict[str, Mesh] = {}
+    for kind in KIND_CATEGORIES:
+        if kind not in ("truck", "trailer"):
+            meshes[kind] = Vehicle.load("child_120cm" if kind == "child" else kind).build_mesh()
+    for kind in ("truck", "trailer"):
+        parts = tuple(part for part in truck.parts if part.name.startswith("trailer") == (kind == "trailer"))
         meshes[kind] = truck.model_copy(update={"parts": parts}).build_mesh()
-    for kind, sizes in SIZES.items():
-        for number, shares in enumerate(sizes, 2):
-            meshes[f"{kind}_{number}"] = meshes[kind]._replace(vertices_m=meshes[kind].vertices_m * np.array(shares))
+    for kind, sizes in SIZE_FACTORS.items():
+        for number, factors in enumerate(sizes, 2):
+            meshes[f"{kind}_{number}"] = meshes[kind]._replace(vertices_m=meshes[kind].vertices_m * np.array(factors))
     return meshes
 
 
 class Fleet:
-    """The bodies of a world, and the drivers drawn for them. ValueError: a kind has no body."""
+    """Bodies of a scene, samples of drivers, and the parked vehicles.
+
+    Args:
+        body_meshes: Mesh of each body in `CATEGORIES`.
+        ego_mesh: Mesh of the ego vehicle; the body "suv" if None.
+        generator: Random generator of kinds and drivers.
+
+    Attributes:
+        meshes: Mesh of each body and of the ego vehicle.
+        parked: Actors that never move.
+        omitted_count: Number of road users that were omitted because their bodies would overlap others.
+
+    Raises:
+        ValueError: A body has no mesh.
+    """
 
     def __init__(self, body_meshes: Mapping[str, Mesh], ego_mesh: Mesh | None, generator: np.random.Generator) -> None:
         missing = sorted(CATEGORIES.keys() - body_meshes.keys())
         if missing:
             raise ValueError(f"traffic needs a body for each kind; there is none for {', '.join(missing)}")
-        self.meshes = {
-            EGO: body_meshes["suv"] if ego_mesh is None else ego_mesh,
-            **{kind: body_meshes[kind] for kind in CATEGORIES},
-        }
-        self._sizes = {kind: BoundingBox.from_points(mesh.vertices_m).size_m for kind, mesh in self.meshes.items()}
-        self._lengths_m = {kind: self._length_m(kind) for kind in self.meshes}  # asked thousands of times a world
+        self.meshes = {EGO: body_meshes["suv"] if ego_mesh is None else ego_mesh}
+        self.meshes |= {kind: body_meshes[kind] for kind in CATEGORIES}
+        self._sizes_m = {kind: BoundingBox.from_points(mesh.vertices_m).size_m for kind, mesh in self.meshes.items()}
+        # Lengths are computed once because a scene looks them up thousands of times.
+        self._lengths_m = {kind: self._compute_length_m(kind) for kind in self.meshes}
         self._generator = generator
         self.parked: list[Actor] = []
         self.omitted_count = 0
 
     def get_length_m(self, kind: str) -> float:
-        """Extent along x, on a straight with all that it draws along."""
+        """Return the extent of a body along x, on a straight and with its trailer."""
         return self._lengths_m[kind]
 
-    def _length_m(self, kind: str) -> float:
-        parts_m = [length_m for length_m, _ in self.get_sizes_m(kind)]
-        return (
-            sum(parts_m) / 2 - DRAWS[kind].hitch_offset_m + DRAWS[kind].hitch_to_center_m
-            if kind in DRAWS
-            else parts_m[0]
-        )
+    def _compute_length_m(self, kind: str) -> float:
+        part_lengths_m = [length_m for length_m, _ in self.get_sizes_m(kind)]
+        if kind not in HITCHES:
+            return part_lengths_m[0]
+        return sum(part_lengths_m) / 2 - HITCHES[kind].hitch_offset_m + HITCHES[kind].hitch_to_center_m
 
     def get_sizes_m(self, kind: str) -> tuple[tuple[float, float], ...]:
-        """Lengths and widths of the body and of what it draws along."""
-        return tuple(self._sizes[part][:2] for part in get_part_kinds(kind))
+        """Return length and width of a body and, if it has one, of its trailer."""
+        return tuple(self._sizes_m[part][:2] for part in get_part_kinds(kind))
 
     def get_width_m(self, kind: str) -> float:
-        """Extent along y."""
-        return self._sizes[kind][1]
+        """Return the extent of a body along y."""
+        return self._sizes_m[kind][1]
 
     def sample_kind(self, weights: Mapping[str, float]) -> str:
-        """One kind, each with a probability in proportion to its weight, in one of its sizes."""
-        names, up_to = _bodies_of(tuple(weights), tuple(weights.values()))
-        return names[bisect_right(up_to, self._generator.random())]
+        """Sample a body.
+
+        Args:
+            weights: Relative frequency of each kind; all bodies of a kind are equally frequent.
+
+        Returns:
+            Key of `CATEGORIES`, or of `weights`.
+        """
+        bodies, cumulative_shares = list_bodies(tuple(weights), tuple(weights.values()))
+        return bodies[bisect_right(cumulative_shares, self._generator.random())]
 
     def sample_driver(self, typical_driver: Driver, speed_spread: float) -> Driver:
-        """A driver whose desired speed differs from the typical one by up to `speed_spread`, a share of it."""
-        # As `uniform` would, which takes thrice as long.
-        share = 1 - speed_spread + (1 + speed_spread - (1 - speed_spread)) * self._generator.random()
-        desired_mps = float(typical_driver.desired_speed_mps * share)
-        rest = (
+        """Sample a driver.
+
+        Args:
+            typical_driver: Driver with the mean desired speed.
+            speed_spread: Largest relative deviation of the desired speed.
+
+        Returns:
+            Driver with a uniformly distributed desired speed.
+        """
+        # Written out because `uniform` takes three times as long, and a scene has thousands of drivers.
+        factor = 1 - speed_spread + (1 + speed_spread - (1 - speed_spread)) * self._generator.random()
+        return Driver(
+            float(typical_driver.desired_speed_mps * factor),
             typical_driver.headway_s,
             typical_driver.standstill_gap_m,
             typical_driver.acceleration_mps2,
             typical_driver.deceleration_mps2,
         )
-        return Driver(desired_mps, *rest)  # by hand: there are thousands of them in a world
 
     def create_agent(self, kind: str, lane_index: int, lane_position_m: float, driver: Driver) -> Agent:
-        """Somebody of a kind on a lane."""
+        """Create an agent with the length of its body.
+
+        Args:
+            kind: Body.
+            lane_index: Index of the lane.
+            lane_position_m: Position of the center along the lane.
+            driver: Driver.
+        """
         return Agent(kind, self.get_length_m(kind), lane_index, lane_position_m, driver)
 
     def add_parked_vehicle(
@@ -232,10 +295,18 @@ class Fleet:
         height_m: float = 0.0,
         tilt_deg: tuple[float, float] = (0.0, 0.0),
     ) -> None:
-        """Note a body down in `parked`, at a pose x, y in metres and yaw in degrees; pitch and roll on a slope."""
+        """Append a vehicle to `parked`.
+
+        Args:
+            kind: Body.
+            pose: x and y in meters and yaw in degrees.
+            height_m: z of the ground.
+            tilt_deg: Pitch and roll.
+        """
         x_m, y_m, yaw_deg = pose
-        place = Trajectory.create_static((x_m, y_m, height_m), (yaw_deg, *tilt_deg))
-        self.parked.append(Actor(f"parked {kind} {len(self.parked)}", CATEGORIES[kind], self.meshes[kind], place))
+        trajectory = Trajectory.create_static((x_m, y_m, height_m), (yaw_deg, *tilt_deg))
+        name = f"parked {kind} {len(self.parked)}"
+        self.parked.append(Actor(name, CATEGORIES[kind], self.meshes[kind], trajectory))
 
     def fill_lane(
         self,
@@ -249,55 +320,69 @@ class Fleet:
         speed_spread: float = 0.12,
         heavy_speed_spread: float = 0.12,
     ) -> list[Agent]:
-        """Fill a lane with agents at random gaps, `density_per_km` as far as they fit at full speed; nobody on a junction.
+        """Fill a lane with agents at random gaps.
 
-        The fronts and rears of all lie in `span_m` on it, clear of `existing_agents`, who are there already. `drivers` are
-        the weight and the typical driver of each kind that uses the lane, `passages` the junctions on it; speeds spread by
-        `speed_spread`, those of lorries and buses by `heavy_speed_spread`.
+        Args:
+            lane_index: Index of the lane.
+            span_m: First and last position; all agents are within it from bumper to bumper.
+            density_per_km: Agents per kilometer, as far as they fit at full speed.
+            drivers: Weight and typical driver of each kind on the lane.
+            passages: Junctions on the lane, which stay empty.
+            existing_agents: Agents whose surroundings stay empty.
+            speed_spread: Largest relative deviation of desired speeds.
+            heavy_speed_spread: The same for trucks and buses.
+
+        Returns:
+            The new agents, from the start of the lane.
         """
-        mix = {kind: weight for kind, (weight, _) in drivers.items()}
+        weights = {kind: weight for kind, (weight, _) in drivers.items()}
         agents: list[Agent] = []
-        others = [other for other in existing_agents if other.lane_index == lane_index]
-        rear = span_m[0]
+        neighbors = [agent for agent in existing_agents if agent.lane_index == lane_index]
+        rear_m = span_m[0]
         while density_per_km > 0:
-            kind = self.sample_kind(mix)
-            driver = self.sample_driver(
-                drivers[KIND_OF[kind]][1], heavy_speed_spread if KIND_OF[kind] in HEAVY else speed_spread
-            )
-            # What one keeps at full speed, so that nobody has to brake at first.
-            gap = float(driver.standstill_gap_m + driver.headway_s * driver.desired_speed_mps)
-            length = self.get_length_m(kind)
-            rear += gap + self._generator.exponential(max(1000.0 / density_per_km - gap - length, 0.1))
-            if rear + length > span_m[1]:
+            body = self.sample_kind(weights)
+            kind = BODY_KINDS[body]
+            driver = self.sample_driver(drivers[kind][1], heavy_speed_spread if kind in HEAVY_KINDS else speed_spread)
+            # The gap at full speed: nobody has to brake at the start.
+            gap_m = float(driver.standstill_gap_m + driver.headway_s * driver.desired_speed_mps)
+            length_m = self.get_length_m(body)
+            rear_m += gap_m + self._generator.exponential(max(1000.0 / density_per_km - gap_m - length_m, 0.1))
+            if rear_m + length_m > span_m[1]:
                 break
-            agent = self.create_agent(kind, lane_index, rear + length / 2, driver)
-            if not _in_the_way(agent, passages, gap, others):
+            agent = self.create_agent(body, lane_index, rear_m + length_m / 2, driver)
+            if not _is_blocked(agent, passages, gap_m, neighbors):
                 agents.append(agent)
-            rear += length
+            rear_m += length_m
         return agents
 
 
 def get_part_kinds(kind: str) -> tuple[str, ...]:
-    """A kind, and that of what it draws along."""
-    return (kind, DRAWS[kind].trailer_kind) if kind in DRAWS else (kind,)
+    """Return a kind and, if it has one, the kind of its trailer."""
+    return (kind, HITCHES[kind].trailer_kind) if kind in HITCHES else (kind,)
 
 
 @lru_cache(maxsize=64)
-def _bodies_of(kinds: tuple[str, ...], weights: tuple[float, ...]) -> tuple[list[str], list[float]]:
-    """The bodies of some kinds, all sizes of a kind alike, and the share that each and those before it have."""
-    sizes = [[name for name, kind in KIND_OF.items() if kind == one] for one in kinds]
-    shares = np.repeat(np.array(weights) / np.sum(weights), [len(names) for names in sizes])
-    up_to = (shares / np.repeat([len(names) for names in sizes], [len(names) for names in sizes])).cumsum()
-    return [name for names in sizes for name in names], (up_to / up_to[-1]).tolist()
+def list_bodies(kinds: tuple[str, ...], weights: tuple[float, ...]) -> tuple[list[str], list[float]]:
+    """List the bodies of kinds with the cumulative share of each body; bodies of a kind share its weight equally."""
+    bodies: list[str] = []
+    shares: list[float] = []
+    for kind, weight in zip(kinds, np.array(weights) / np.sum(weights), strict=True):
+        kind_bodies = [body for body, body_kind in BODY_KINDS.items() if body_kind == kind]
+        bodies += kind_bodies
+        shares += [weight / len(kind_bodies)] * len(kind_bodies)
+    cumulative_shares = np.cumsum(shares)
+    return bodies, (cumulative_shares / cumulative_shares[-1]).tolist()
 
 
-def _in_the_way(agent: Agent, gates: Sequence[JunctionPassage], gap_m: float, others: Sequence[Agent]) -> bool:
-    rear, front = agent.lane_position_m - agent.length_m / 2, agent.lane_position_m + agent.length_m / 2
-    # Gates follow each other: of those that are not behind, the first is the nearest.
-    gate = bisect_right(gates, rear, key=lambda gate: gate.exit_m)
-    if gate < len(gates) and front > gates[gate].stop_line_m - gap_m:
+def _is_blocked(agent: Agent, passages: Sequence[JunctionPassage], gap_m: float, neighbors: Sequence[Agent]) -> bool:
+    """Test whether an agent is on a junction, or closer than a gap to a junction or to a neighbor."""
+    rear_m, front_m = agent.lane_position_m - agent.length_m / 2, agent.lane_position_m + agent.length_m / 2
+    # Passages are in order: the first one that is not behind is the nearest.
+    next_passage = bisect_right(passages, rear_m, key=lambda passage: passage.exit_m)
+    if next_passage < len(passages) and front_m > passages[next_passage].stop_line_m - gap_m:
         return True
-    return any(
-        abs(agent.lane_position_m - other.lane_position_m) < (agent.length_m + other.length_m) / 2 + gap_m
-        for other in others
-    )
+    for neighbor in neighbors:
+        min_distance_m = (agent.length_m + neighbor.length_m) / 2 + gap_m
+        if abs(agent.lane_position_m - neighbor.lane_position_m) < min_distance_m:
+            return True
+    return False

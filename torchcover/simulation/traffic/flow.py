@@ -1,8 +1,8 @@
-"""Everybody who follows a lane, moved together: queues by the driver model, junctions by lights and by looking.
+"""Simulation of all road users that follow lanes: car following, traffic signals and priority at junctions.
 
-Two rules keep a junction free of conflicts. Nobody enters it outside their phase unless too close to stop when amber
-comes. And nobody enters it while somebody of the other phase is still inside or is one of those, so a vehicle that is
-held up on a junction is waited for, in spite of green.
+Two rules keep a junction free of conflicts. No agent enters it without green, unless it is too close to stop when
+yellow begins. No agent enters it while an agent of the other phase is inside or committed to enter, so that green does
+not let anyone drive into vehicles that are held up on the junction.
 """
 
 from collections.abc import Sequence
@@ -24,16 +24,24 @@ from torchcover.simulation.traffic.idm import (
     integrate_motion,
 )
 
-# Whoever follows the main street, on wheels or on foot, goes in one phase; whoever crosses it goes in the other.
-MAIN, CROSS = 0, 1
+# Phases of a junction: agents along the main street, driving or walking, and agents across it.
+MAIN = 0
+CROSS = 1
+# Longest step of a simulation; frames that are farther apart are divided into several steps.
+MAX_STEP_S = 0.1
+# Distance of the entries of `Lane.speed_limits_mps`.
+SPEED_LIMIT_SPACING_M = 2.0
 
 
 @dataclass(frozen=True, eq=False)
 class TrafficSignals:
-    """The lights of J junctions: main green, amber, all red, cross green, amber, all red, and again.
+    """Fixed-time signals of J junctions: main green, yellow, all red, cross green, yellow, all red, and so on.
 
-    `offset_s` (J,) is how far into its cycle each is at time 0. In amber those still enter who cannot stop any more;
-    then for `all_red_s` all have red.
+    Args:
+        offset_s: (J,) times into the cycle at time 0.
+        green_s: Duration of green for the main and the cross phase.
+        yellow_s: Duration of yellow, in which agents enter that cannot stop any more.
+        all_red_s: Duration of red for both phases after yellow.
     """
 
     offset_s: Float64
@@ -43,29 +51,42 @@ class TrafficSignals:
 
     @classmethod
     def create_empty(cls) -> "TrafficSignals":
-        """For lanes without junctions: the lights of one that no lane leads to."""
+        """Create signals for lanes without junctions: one junction to which no lane leads."""
         return cls(np.zeros(1))
 
     @property
     def cycle_s(self) -> float:
-        """Time after which the lights repeat."""
+        """Duration of a cycle."""
         return sum(self.green_s) + 2 * (self.yellow_s + self.all_red_s)
 
     def compute_remaining_green_s(self, times_s: ArrayLike) -> Float64:
-        """(..., J, 2) seconds of green left to the main and the cross phase at (...) times; negative without green."""
-        now = np.mod(np.asarray(times_s)[..., None] + self.offset_s, self.cycle_s)
-        cross_start = self.green_s[MAIN] + self.yellow_s + self.all_red_s
-        left = np.empty((*now.shape, 2))
-        left[..., MAIN] = self.green_s[MAIN] - now
-        left[..., CROSS] = np.where(now < cross_start, -np.inf, cross_start + self.green_s[CROSS] - now)
-        return left
+        """Compute the remaining green of each phase.
+
+        Args:
+            times_s: (...) times.
+
+        Returns:
+            (..., J, 2) seconds for the main and the cross phase; negative without green.
+        """
+        cycle_time_s = np.mod(np.asarray(times_s)[..., None] + self.offset_s, self.cycle_s)
+        cross_start_s = self.green_s[MAIN] + self.yellow_s + self.all_red_s
+        remaining_s = np.empty((*cycle_time_s.shape, 2))
+        remaining_s[..., MAIN] = self.green_s[MAIN] - cycle_time_s
+        cross_remaining_s = cross_start_s + self.green_s[CROSS] - cycle_time_s
+        remaining_s[..., CROSS] = np.where(cycle_time_s < cross_start_s, -np.inf, cross_remaining_s)
+        return remaining_s
 
 
 @dataclass(frozen=True)
 class JunctionPassage:
-    """Where a lane passes a junction in a phase: from its stop line to where a rear end has left the junction.
+    """Part of a lane on a junction.
 
-    Who enters must have so much green left; people on foot are slow to cross.
+    Args:
+        stop_line_m: Position of the stop line along the lane.
+        exit_m: Position at which a rear end has left the junction.
+        junction_index: Index of the junction.
+        phase: `MAIN` or `CROSS`.
+        min_green_s: Remaining green that an agent needs to enter; people on foot are slow to cross.
     """
 
     stop_line_m: float
@@ -76,10 +97,15 @@ class JunctionPassage:
 
 
 class JunctionPassageTable(NamedTuple):
-    """The gates of all lanes, one lane after the other; behind the last gate of each lane is one that is never reached.
+    """Passages of L lanes in one table of K rows, lane by lane; each lane ends with a passage at infinity.
 
-    What a `Gate` says, one array (K,) for each word. `phase_indices` counts the phases of all junctions, two to a junction, and
-    `conflicting_phase_indices` is the other one there. `first_passages` (L,) is the number of the first gate of each lane.
+    Args:
+        stop_lines_m: (K,) stop lines.
+        exits_m: (K,) exits.
+        phase_indices: (K,) twice the index of the junction plus the phase.
+        conflicting_phase_indices: (K,) index of the other phase of the junction.
+        min_green_s: (K,) remaining green that an agent needs to enter.
+        first_passages: (L,) row of the first passage of each lane.
     """
 
     stop_lines_m: Float64
@@ -91,43 +117,56 @@ class JunctionPassageTable(NamedTuple):
 
     @classmethod
     def from_lanes(cls, passages_by_lane: Sequence[tuple[JunctionPassage, ...]]) -> "JunctionPassageTable":
-        """Those of lanes, each with its gates in order."""
-        never = JunctionPassage(np.inf, np.inf, 0, 0)
-        gates = [gate for of_lane in passages_by_lane for gate in (*of_lane, never)]
+        """Build the table from the passages of each lane, in order."""
+        passages: list[JunctionPassage] = []
+        first_passages = []
+        for lane_passages in passages_by_lane:
+            first_passages.append(len(passages))
+            passages += [*lane_passages, JunctionPassage(np.inf, np.inf, 0, 0)]
+        junctions = np.array([passage.junction_index for passage in passages])
+        phases = np.array([passage.phase for passage in passages])
         return cls(
-            np.array([gate.stop_line_m for gate in gates]),
-            np.array([gate.exit_m for gate in gates]),
-            np.array([2 * gate.junction_index + gate.phase for gate in gates]),
-            np.array([2 * gate.junction_index + 1 - gate.phase for gate in gates]),
-            np.array([gate.min_green_s for gate in gates]),
-            np.cumsum([0, *(len(of_lane) + 1 for of_lane in passages_by_lane[:-1])]),
+            stop_lines_m=np.array([passage.stop_line_m for passage in passages]),
+            exits_m=np.array([passage.exit_m for passage in passages]),
+            phase_indices=2 * junctions + phases,
+            conflicting_phase_indices=2 * junctions + 1 - phases,
+            min_green_s=np.array([passage.min_green_s for passage in passages]),
+            first_passages=np.array(first_passages),
         )
 
     def find_next(self, lane_index: int, rear_positions_m: Float64) -> Int64:
-        """(N,) numbers of the first gate of a lane that each of N rear ends has not left."""
+        """Find the first passage of a lane that rear ends at positions (N,) have not left: rows (N,)."""
         first = self.first_passages[lane_index]
         last = first + int(np.argmax(np.isinf(self.exits_m[first:])))
         return np.asarray(first + np.searchsorted(self.exits_m[first:last], rear_positions_m))
 
 
-MAX_STEP_S = 0.1
-# Harder than comfortable, softer than an emergency: who would have to brake harder for a light goes on.
-BRAKING_FOR_A_LIGHT_MPS2 = 2.5
-STOP_BEFORE_LINE_M = 0.5
-# A vehicle ahead that is slower than this share of one's own desired speed is a queue, not a flow.
-QUEUE_SPEED = 0.15
+@dataclass(frozen=True)
+class JunctionParams:
+    """Behavior at junctions.
 
-LIMIT_EVERY_M = 2.0
+    Args:
+        max_braking_mps2: Agents that would have to brake harder for a signal go on; harder than comfortable, softer
+            than in an emergency.
+        stop_distance_m: Distance of a stopped front to the stop line.
+        queue_speed_share: A vehicle behind the junction is a queue, for which no agent enters, if it is slower than
+            this share of the desired speed of the agent.
+    """
 
-# Place and speed, pose and yaw, and their copies.
-BYTES_PER_STATE = 128
+    max_braking_mps2: float = 2.5
+    stop_distance_m: float = 0.5
+    queue_speed_share: float = 0.15
 
 
 @dataclass(frozen=True, eq=False)
 class Lane:
-    """A line that is followed in one direction, and the junctions on it, in their order.
+    """Line that agents follow in one direction.
 
-    `speed_limits_mps` (K,) is how fast its curves may be driven, at 0 m, `LIMIT_EVERY_M`, ...; any speed if not given.
+    Args:
+        centerline: The line.
+        passages: Junctions on the line, in order.
+        speed_limits_mps: (K,) speeds at which curves can be driven, every `SPEED_LIMIT_SPACING_M` from 0 m; None
+            without limits.
     """
 
     centerline: Polyline | OffsetPath
@@ -137,7 +176,15 @@ class Lane:
 
 @dataclass(frozen=True, eq=False)
 class Agent:
-    """Somebody of a kind, so long bumper to bumper, whose centre is at a place on a lane at first; their driver."""
+    """Road user on a lane, at the start of a simulation.
+
+    Args:
+        kind: Body.
+        length_m: Length from bumper to bumper.
+        lane_index: Index of the lane.
+        lane_position_m: Position of the center along the lane.
+        driver: Driver.
+    """
 
     kind: str
     length_m: float
@@ -147,7 +194,13 @@ class Agent:
 
 
 class TrafficHistory(NamedTuple):
-    """What happened: `lane_positions_m` and `speeds_mps` (T, N); `occupied_phases` (T, J, 2), whether a phase is on a junction."""
+    """Result of a simulation of N agents at T times, with J junctions.
+
+    Args:
+        lane_positions_m: (T, N) positions of the centers along the lanes.
+        speeds_mps: (T, N) speeds.
+        occupied_phases: (T, J, 2) whether agents of a phase are on a junction or committed to enter.
+    """
 
     lane_positions_m: Float64
     speeds_mps: Float64
@@ -155,164 +208,201 @@ class TrafficHistory(NamedTuple):
 
 
 class LaneSimulation:
-    """N agents, who must not overlap, nor stand on a junction, on L lanes."""
+    """Simulation of N agents on L lanes without lane changes.
 
-    def __init__(self, lanes: Sequence[Lane], agents: Sequence[Agent], signals: TrafficSignals) -> None:
+    Args:
+        lanes: Lanes.
+        agents: Agents, which must neither overlap nor stand on a junction.
+        signals: Traffic signals.
+        params: Behavior at junctions.
+    """
+
+    def __init__(
+        self,
+        lanes: Sequence[Lane],
+        agents: Sequence[Agent],
+        signals: TrafficSignals,
+        params: JunctionParams = JunctionParams(),
+    ) -> None:
         self.lane_positions_m = np.array([agent.lane_position_m for agent in agents], dtype=np.float64)
-        length = np.array([agent.length_m for agent in agents], dtype=np.float64)
-        lane = np.array([agent.lane_index for agent in agents])
+        self._params = params
+        self._length_m = np.array([agent.length_m for agent in agents], dtype=np.float64)
+        lane_indices = np.array([agent.lane_index for agent in agents])
         self._driver = Driver.stack([agent.driver for agent in agents])
-        self._leader, self._lap = _leaders(lanes, lane, self.lane_positions_m)
-        self._half_m, self._leaders_half_m = length / 2, length[self._leader] / 2
-        self._between_middles_m = (length + length[self._leader]) / 2
-        # Whoever stops behind a junction needs so much room there.
-        self._room_m = length, np.asarray(self._driver.standstill_gap_m)
-        self._queue_mps = QUEUE_SPEED * self._driver.desired_speed_mps
+        self._leader, self._lap_m = find_leaders(lanes, lane_indices, self.lane_positions_m)
+        leader_length_m = self._length_m[self._leader]
+        self._half_length_m, self._leader_half_length_m = self._length_m / 2, leader_length_m / 2
+        self._min_spacing_m = (self._length_m + leader_length_m) / 2
+        self._queue_speed_mps = params.queue_speed_share * self._driver.desired_speed_mps
         self._signals = signals
-        self._gates = JunctionPassageTable.from_lanes([lane.passages for lane in lanes])
-        self._limits = _Limits(lanes, lane)
-        # The number of the gate that each agent is in, or else of the next one ahead, and where that is.
-        self._gate = np.empty(len(agents), dtype=np.int64)
-        self._enter_m, self._exit_m, self._clear_m = np.empty((3, len(agents)))
-        for index in np.unique(lane):
-            members = np.flatnonzero(lane == index)
-            rear_m = self.lane_positions_m[members] - self._half_m[members]
-            self._face(members, self._gates.find_next(int(index), rear_m))
-        self.speeds_mps = self._first_speed()
-        self._look()
+        self._passages = JunctionPassageTable.from_lanes([lane.passages for lane in lanes])
+        self._speed_limits = SpeedLimitTable(lanes, lane_indices)
+        # For each agent the passage that it is on, or else the next one ahead, and its positions.
+        self._passage = np.empty(len(agents), dtype=np.int64)
+        self._stop_line_m, self._exit_m, self._clear_position_m = np.empty((3, len(agents)))
+        for lane_index in np.unique(lane_indices):
+            members = np.flatnonzero(lane_indices == lane_index)
+            rear_m = self.lane_positions_m[members] - self._half_length_m[members]
+            self._set_passages(members, self._passages.find_next(int(lane_index), rear_m))
+        self.speeds_mps = self._compute_initial_speeds_mps()
+        self._update_junctions()
 
     def run(self, times_s: Float64, warm_up_s: float = 0.0) -> TrafficHistory:
-        """Simulate, first the warm-up before the first time, and keep the state at each time."""
-        place_m, speed_mps = np.empty((2, len(times_s), len(self.lane_positions_m)))
-        occupied = np.empty((len(times_s), len(self._signals.offset_s), 2), dtype=bool)
-        drives = [(float(times_s[0]) - warm_up_s, warm_up_s)]
-        drives += [(float(before), float(after - before)) for before, after in pairwise(times_s)]
-        steps = [int(np.ceil(duration_s / MAX_STEP_S - 1e-9)) for _, duration_s in drives]
-        red = iter(self._red([start_s + step * duration_s / count
-                              for (start_s, duration_s), count in zip(drives, steps, strict=True)
-                              for step in range(count)]))  # fmt: skip
-        for number, count in enumerate(steps):
+        """Simulate and record the state at each time.
+
+        Args:
+            times_s: (T,) ascending times of the frames.
+            warm_up_s: Duration that is simulated before the first frame.
+        """
+        positions_m, speeds_mps = np.empty((2, len(times_s), len(self.lane_positions_m)))
+        is_occupied = np.empty((len(times_s), len(self._signals.offset_s), 2), dtype=bool)
+        starts_s, durations_s = [float(times_s[0]) - warm_up_s], [warm_up_s]
+        for frame_s, next_frame_s in pairwise(times_s):
+            starts_s.append(float(frame_s))
+            durations_s.append(float(next_frame_s - frame_s))
+        step_counts = [int(np.ceil(duration_s / MAX_STEP_S - 1e-9)) for duration_s in durations_s]
+        step_times_s = []
+        for start_s, duration_s, count in zip(starts_s, durations_s, step_counts, strict=True):
+            step_times_s += [start_s + step * duration_s / count for step in range(count)]
+        has_red_by_step = iter(self._find_red_passages(step_times_s))
+        for frame_index, count in enumerate(step_counts):
             for _ in range(count):
-                self._step(next(red), drives[number][1] / count)
-            place_m[number], speed_mps[number] = self.lane_positions_m, self.speeds_mps
-            occupied[number] = self._occupied.reshape(-1, 2)
-        return TrafficHistory(place_m, speed_mps, occupied)
+                self._advance(next(has_red_by_step), durations_s[frame_index] / count)
+            positions_m[frame_index], speeds_mps[frame_index] = self.lane_positions_m, self.speeds_mps
+            is_occupied[frame_index] = self._is_occupied.reshape(-1, 2)
+        return TrafficHistory(positions_m, speeds_mps, is_occupied)
 
-    def _red(self, times_s: Sequence[float]) -> Bools:
-        """(T, K) whether each gate has no green, or too little of it; lights heed nobody."""
-        left_s = self._signals.compute_remaining_green_s(times_s).reshape(len(times_s), -1)
-        return ~(left_s[:, self._gates.phase_indices] > self._gates.min_green_s)
+    def _find_red_passages(self, times_s: Sequence[float]) -> Bools:
+        """Find passages (T, K) without green, or with too little of it."""
+        remaining_s = self._signals.compute_remaining_green_s(times_s).reshape(len(times_s), -1)
+        return ~(remaining_s[:, self._passages.phase_indices] > self._passages.min_green_s)
 
-    def _step(self, red: Bools, step_s: float) -> None:
+    def _advance(self, has_red: Bools, step_s: float) -> None:
         driver, speed_mps = self._driver, self.speeds_mps
-        leader_m, leader_mps = self._leader_m(), speed_mps.take(self._leader)
-        gap_m = self._gap_m(leader_m)
-        held = (red | self._occupied[self._gates.conflicting_phase_indices])[self._gate]
-        # A queue behind the junction would force one to stop on it.
-        rear_m = leader_m - self._leaders_half_m
-        held |= (rear_m > self._enter_m) & (rear_m < self._clear_m) & (leader_mps < self._queue_mps)
-        held &= ~self._committed
-        # Lines that may be crossed are as far away as can be.
-        line_m = np.where(held, self._to_line_m, np.inf)
-        stop_m = line_m + driver.standstill_gap_m
-        stop_m -= STOP_BEFORE_LINE_M
-        tight = compute_gap_ratio(driver, speed_mps, gap_m, speed_mps - leader_mps)
-        np.maximum(tight, compute_gap_ratio(driver, speed_mps, stop_m, speed_mps), out=tight)
-        wanted = compute_acceleration_mps2(
-            driver, speed_mps, tight, self._limits.at(self.lane_positions_m, driver.desired_speed_mps)
+        leader_m, leader_mps = self._compute_leader_positions_m(), speed_mps.take(self._leader)
+        gap_m = self._compute_gaps_m(leader_m)
+        must_stop = (has_red | self._is_occupied[self._passages.conflicting_phase_indices])[self._passage]
+        # A queue behind the junction would force the agent to stop on it.
+        leader_rear_m = leader_m - self._leader_half_length_m
+        is_leader_behind_junction = (leader_rear_m > self._stop_line_m) & (leader_rear_m < self._clear_position_m)
+        must_stop |= is_leader_behind_junction & (leader_mps < self._queue_speed_mps)
+        must_stop &= ~self._is_committed
+        # Stop lines that may be crossed count as infinitely far away.
+        free_distance_m = np.where(must_stop, self._distance_to_line_m, np.inf)
+        stop_gap_m = free_distance_m + driver.standstill_gap_m
+        stop_gap_m -= self._params.stop_distance_m
+        gap_ratio = compute_gap_ratio(driver, speed_mps, gap_m, speed_mps - leader_mps)
+        np.maximum(gap_ratio, compute_gap_ratio(driver, speed_mps, stop_gap_m, speed_mps), out=gap_ratio)
+        desired_mps = self._speed_limits.limit_speeds_mps(self.lane_positions_m, driver.desired_speed_mps)
+        acceleration_mps2 = compute_acceleration_mps2(driver, speed_mps, gap_ratio, desired_mps)
+        distance_m, self.speeds_mps = integrate_motion(
+            speed_mps, acceleration_mps2, np.minimum(gap_m, free_distance_m), step_s
         )
-        way, self.speeds_mps = integrate_motion(speed_mps, wanted, np.minimum(gap_m, line_m), step_s)
-        self.lane_positions_m += way
-        (passed,) = (self.lane_positions_m - self._half_m > self._exit_m).nonzero()
+        self.lane_positions_m += distance_m
+        (passed,) = (self.lane_positions_m - self._half_length_m > self._exit_m).nonzero()
         if len(passed):
-            self._face(passed, self._gate[passed] + 1)
-        self._look()
+            self._set_passages(passed, self._passage[passed] + 1)
+        self._update_junctions()
 
-    def _face(self, agents: Int64, gates: Int64) -> None:
-        """Let some agents have these gates before them."""
-        self._gate[agents] = gates
-        self._enter_m[agents], self._exit_m[agents] = self._gates.stop_lines_m[gates], self._gates.exits_m[gates]
-        length_m, standstill_m = self._room_m
-        self._clear_m[agents] = self._exit_m[agents] + length_m[agents] + standstill_m[agents]
+    def _set_passages(self, agents: Int64, passages: Int64) -> None:
+        """Set the current passages of agents."""
+        self._passage[agents] = passages
+        self._stop_line_m[agents] = self._passages.stop_lines_m[passages]
+        self._exit_m[agents] = self._passages.exits_m[passages]
+        # Behind the junction, an agent needs room for its length and the gap to the vehicle ahead.
+        standstill_gap_m = np.asarray(self._driver.standstill_gap_m)[agents]
+        self._clear_position_m[agents] = self._exit_m[agents] + self._length_m[agents] + standstill_gap_m
 
-    def _leader_m(self) -> Float64:
-        """(N,) place of the one ahead; infinite for the first on a lane."""
+    def _compute_leader_positions_m(self) -> Float64:
+        """Compute the position (N,) of the agent ahead; infinite for the first on a lane."""
         leader_m = self.lane_positions_m.take(self._leader)
-        leader_m += self._lap
+        leader_m += self._lap_m
         return leader_m
 
-    def _gap_m(self, leader_m: Float64) -> Float64:
-        """(N,) free road to the one ahead, bumper to bumper."""
+    def _compute_gaps_m(self, leader_m: Float64) -> Float64:
+        """Compute the gap (N,) to the agent ahead, bumper to bumper."""
         gap_m = leader_m - self.lane_positions_m
-        gap_m -= self._between_middles_m
+        gap_m -= self._min_spacing_m
         return gap_m
 
-    def _look(self) -> None:
-        """See where everybody is before the next stop line, and whom the junctions belong to.
+    def _update_junctions(self) -> None:
+        """Update distances to stop lines (N,), agents on or committed to a junction (N,), and occupied phases (2 J,)."""
+        self._distance_to_line_m = self._stop_line_m - self.lane_positions_m
+        self._distance_to_line_m -= self._half_length_m
+        self._is_committed = self.speeds_mps**2 > 2 * self._params.max_braking_mps2 * self._distance_to_line_m
+        self._is_occupied = np.zeros(2 * len(self._signals.offset_s), dtype=bool)
+        self._is_occupied[self._passages.phase_indices[self._passage[self._is_committed]]] = True
 
-        `_to_line_m` (N,) is the way from the front to the line; `_committed` (N,), whether one is on a junction, or
-        will be because it is too late to stop; `_occupied` (2 J,), whether somebody of each phase is.
-        """
-        self._to_line_m = self._enter_m - self.lane_positions_m
-        self._to_line_m -= self._half_m
-        self._committed = self.speeds_mps**2 > 2 * BRAKING_FOR_A_LIGHT_MPS2 * self._to_line_m
-        self._occupied = np.zeros(2 * len(self._signals.offset_s), dtype=bool)
-        self._occupied[self._gates.phase_indices[self._gate[self._committed]]] = True
-
-    def _first_speed(self) -> Float64:
-        """(N,) fast, but slow enough to stop at the next line, and for the gap to the one ahead."""
-        stoppable = np.sqrt(
-            self._driver.deceleration_mps2 * np.maximum(self._enter_m - self.lane_positions_m - self._half_m, 0.0)
-        )
-        to_leader = np.maximum(self._gap_m(self._leader_m()) - self._driver.standstill_gap_m, 0.0)
-        bearable = to_leader / self._driver.headway_s
-        desired_mps = self._limits.at(self.lane_positions_m, self._driver.desired_speed_mps)
-        return np.asarray(np.minimum(0.95 * desired_mps, np.minimum(stoppable, bearable)))
+    def _compute_initial_speeds_mps(self) -> Float64:
+        """Compute high speeds (N,) from which agents can still stop at the next line and keep their gaps."""
+        distance_to_line_m = np.maximum(self._stop_line_m - self.lane_positions_m - self._half_length_m, 0.0)
+        stopping_mps = np.sqrt(self._driver.deceleration_mps2 * distance_to_line_m)
+        gap_m = self._compute_gaps_m(self._compute_leader_positions_m()) - self._driver.standstill_gap_m
+        following_mps = np.maximum(gap_m, 0.0) / self._driver.headway_s
+        desired_mps = self._speed_limits.limit_speeds_mps(self.lane_positions_m, self._driver.desired_speed_mps)
+        return np.asarray(np.minimum(0.95 * desired_mps, np.minimum(stopping_mps, following_mps)))
 
 
-class _Limits:
-    """What N agents may drive, on the lanes with these numbers, (N,)."""
+class SpeedLimitTable:
+    """Speed limits on the lanes of N agents.
 
-    def __init__(self, lanes: Sequence[Lane], lane: Int64) -> None:
-        tables = [np.array([np.inf]) if each.speed_limits_mps is None else each.speed_limits_mps for each in lanes]
-        first = np.cumsum([0, *(len(table) for table in tables)])
-        self._none = all(each.speed_limits_mps is None for each in lanes)
-        self._table = np.concatenate(tables)
-        self._first, self._last = first[lane], first[lane + 1] - 1
+    Args:
+        lanes: Lanes.
+        lane_indices: (N,) lane of each agent.
+    """
 
-    def at(self, place_m: Float64, desired_mps: FloatOrArray) -> FloatOrArray:
-        """(N,) what they want to drive at (N,) places, if that is allowed there."""
-        if self._none:
+    def __init__(self, lanes: Sequence[Lane], lane_indices: Int64) -> None:
+        no_limit = np.array([np.inf])
+        tables = [no_limit if lane.speed_limits_mps is None else lane.speed_limits_mps for lane in lanes]
+        first_entries = np.cumsum([0, *(len(table) for table in tables)])
+        self._limits_mps = np.concatenate(tables)
+        self._has_limits = any(lane.speed_limits_mps is not None for lane in lanes)
+        self._first, self._last = first_entries[lane_indices], first_entries[lane_indices + 1] - 1
+
+    def limit_speeds_mps(self, lane_positions_m: Float64, desired_mps: FloatOrArray) -> FloatOrArray:
+        """Limit desired speeds (N,) to the speed limits at positions (N,)."""
+        if not self._has_limits:
             return desired_mps
-        entry = (place_m / LIMIT_EVERY_M).astype(np.int64)
+        entry = (lane_positions_m / SPEED_LIMIT_SPACING_M).astype(np.int64)
         entry += self._first
         np.minimum(entry, self._last, out=entry)
         np.maximum(entry, self._first, out=entry)
-        return np.asarray(np.minimum(self._table.take(entry), desired_mps))
+        return np.asarray(np.minimum(self._limits_mps.take(entry), desired_mps))
 
 
 def check_traffic_memory(num_agents: float, num_frames: int) -> None:
-    """Refuse more agents than a simulation has memory for, before any of them is made."""
+    """Check that a simulation fits into memory, before its agents are created.
+
+    Args:
+        num_agents: Expected number of agents.
+        num_frames: Number of frames.
+
+    Raises:
+        ValueError: It does not fit.
+    """
+    bytes_per_state = 128  # position, speed, pose and yaw, and their copies
     check_memory_fits(
         f"traffic of about {num_agents:,.0f} for {num_frames:,} time steps",
-        BYTES_PER_STATE * num_agents * num_frames,
-        "shorten the duration, or let there be fewer to a kilometre",
+        bytes_per_state * num_agents * num_frames,
+        "shorten the duration, or let there be fewer to a kilometer",
     )
 
 
-def _leaders(lanes: Sequence[Lane], lane: Int64, place_m: Float64) -> tuple[Int64, Float64]:
-    """(N,) who is ahead, anybody for the first on a lane; and (N,) how much farther than their place that is.
+def find_leaders(lanes: Sequence[Lane], lane_indices: Int64, lane_positions_m: Float64) -> tuple[Int64, Float64]:
+    """Find the agent ahead of each of N agents on the same lane.
 
-    0; the length of a lap where the one ahead is the last one of a loop; infinite where there is nobody.
+    Returns:
+        (N,) indices of the agents ahead, and (N,) offsets of their positions in meters: the length of a loop if the
+        agent ahead is the last one on it, infinite if there is none, else 0.
     """
-    leader, lap = np.zeros(len(lane), dtype=np.int64), np.zeros(len(lane))
-    for index in np.unique(lane):
-        members = np.flatnonzero(lane == index)
-        members = members[np.argsort(-place_m[members], kind="stable")]
+    leader, offset_m = np.zeros(len(lane_indices), dtype=np.int64), np.zeros(len(lane_indices))
+    for lane_index in np.unique(lane_indices):
+        members = np.flatnonzero(lane_indices == lane_index)
+        members = members[np.argsort(-lane_positions_m[members], kind="stable")]
         leader[members[1:]] = members[:-1]
-        if lanes[index].centerline.is_closed and len(members) > 1:
+        centerline = lanes[lane_index].centerline
+        offset_m[members[0]] = np.inf
+        if centerline.is_closed and len(members) > 1:
             leader[members[0]] = members[-1]
-            lap[members[0]] = lanes[index].centerline.length_m
-        else:
-            lap[members[0]] = np.inf
-    return leader, lap
+            offset_m[members[0]] = centerline.length_m
+    return leader, offset_m

@@ -19,7 +19,7 @@ from torchcover.simulation.traffic.assemble import (
     build_nearby_actors,
     get_center_offsets_m,
 )
-from torchcover.simulation.traffic.fleet import EGO, HEAVY, KIND_OF, Fleet
+from torchcover.simulation.traffic.fleet import BODY_KINDS, EGO, HEAVY_KINDS, Fleet
 from torchcover.simulation.traffic.flow import Agent, TrafficHistory, check_traffic_memory
 from torchcover.simulation.traffic.hills import Hills, bend_along_street
 from torchcover.simulation.traffic.idm import Driver
@@ -269,7 +269,7 @@ class HighwayTraffic(ProceduralTraffic):
         # Places of the other direction are stations with the sign turned.
         side_m = np.array([sides[0], (-sides[1].end_m, -sides[1].begin_m)])
         agents = self._traffic(side_m, fleet)
-        heavy = np.array([KIND_OF.get(agent.kind) in HEAVY for agent in agents])
+        heavy = np.array([BODY_KINDS.get(agent.kind) in HEAVY_KINDS for agent in agents])
         exits = (generator.random(len(agents)) < EXIT_SHARE) & np.array(
             [a.lane_index % LANES == SIDE_LANE - 1 for a in agents]
         )
@@ -303,7 +303,7 @@ class HighwayTraffic(ProceduralTraffic):
         """Everybody; the ego is the first, behind a leader in its lane."""
         own, lasts_s = 3 - self.ego_lane, self._lasts_s
         kind = fleet.sample_kind({kind: weight for kind, (weight, _) in LANE_USERS[own].items()})
-        leader = LANE_USERS[own][KIND_OF[kind]][1] if KIND_OF[kind] in HEAVY else Driver(LEADER_MPS)
+        leader = LANE_USERS[own][BODY_KINDS[kind]][1] if BODY_KINDS[kind] in HEAVY_KINDS else Driver(LEADER_MPS)
         agents = [
             fleet.create_agent(EGO, own, -LEADER_AHEAD_M / 2, Driver(EGO_MPS, headway_s=1.0)),
             fleet.create_agent(kind, own, LEADER_AHEAD_M / 2, leader),

@@ -22,7 +22,7 @@ from torchcover.simulation.traffic.assemble import (
     is_free_for,
     simulate_walking,
 )
-from torchcover.simulation.traffic.fleet import EGO, WALKING, Fleet
+from torchcover.simulation.traffic.fleet import EGO, PEDESTRIAN, Fleet
 from torchcover.simulation.traffic.flow import Agent, Lane, LaneSimulation, TrafficSignals
 from torchcover.simulation.traffic.frontage import RoadsideDensity, find_street_sides, place_scenery
 from torchcover.simulation.traffic.idm import Driver
@@ -231,7 +231,7 @@ def _people(
     along = [Footpath(np.array([-half, y]), np.array([half, y])) for y in WALKWAYS_M]
     for path, crosses in [*((p, True) for p in _across_aisles(lot)), *((p, False) for p in along)]:
         kind = fleet.sample_kind({"adult": 4.0, "child": 1.0})
-        takes_s = path.length_m / float(WALKING.desired_speed_mps * generator.uniform(0.8, 1.1))
+        takes_s = path.length_m / float(PEDESTRIAN.desired_speed_mps * generator.uniform(0.8, 1.1))
         may_go = np.ones(len(times_s), dtype=bool)
         if crosses:  # when no car is on the piece of the aisle that is crossed
             distance = np.linalg.norm(driving.positions_m[..., :2] - (path.start_m + path.end_m) / 2, axis=2)

@@ -8,7 +8,7 @@ import numpy as np
 
 from torchcover.geometry.arrays import Bools, Float64, Int64
 from torchcover.simulation.traffic.alignment import Alignment, OffsetPath, StreetCorridor, compute_squared_distances_m2
-from torchcover.simulation.traffic.flow import CROSS, LIMIT_EVERY_M, MAIN, JunctionPassage, Lane, TrafficSignals
+from torchcover.simulation.traffic.flow import CROSS, MAIN, SPEED_LIMIT_SPACING_M, JunctionPassage, Lane, TrafficSignals
 
 # Between junctions no curve is tighter; crossings and stop lines lie on straights.
 SMALLEST_RADIUS_M = 110.0
@@ -303,8 +303,8 @@ class StreetPlan:
 
 
 def _limits_mps(line: OffsetPath) -> Float64:
-    """(K,) how fast a lane may be driven, at each `LIMIT_EVERY_M`: in curves, and before them."""
-    places = np.arange(0.0, line.length_m, LIMIT_EVERY_M)
+    """(K,) how fast a lane may be driven, at each `SPEED_LIMIT_SPACING_M`: in curves, and before them."""
+    places = np.arange(0.0, line.length_m, SPEED_LIMIT_SPACING_M)
     curvature = line.street.compute_curvatures_per_m(line.convert_distances_to_stations_m(places))
     curvature = np.abs(curvature / (1.0 - curvature * line.left_m))
     square = COMFORTABLE_MPS2 / np.maximum(curvature, 1e-6)

@@ -20,7 +20,7 @@ from torchcover.simulation.traffic.assemble import (
     simulate_walking,
 )
 from torchcover.simulation.traffic.city import CityBuilder
-from torchcover.simulation.traffic.fleet import CATEGORIES, CYCLING, EGO, WALKING, Fleet
+from torchcover.simulation.traffic.fleet import CATEGORIES, CYCLIST, EGO, PEDESTRIAN, Fleet
 from torchcover.simulation.traffic.flow import (
     CROSS,
     MAIN,
@@ -171,8 +171,8 @@ class UrbanTraffic(ProceduralTraffic):
         )
         per_lane = [
             *[(self.traffic_per_km, turning)] * len(main),
-            *[(self.cyclists_per_km, {"cyclist": (1.0, CYCLING)})] * len(bicycles),
-            *[(self.people_per_km, {"adult": (5.0, WALKING), "child": (1.0, WALKING)})] * len(sidewalks),
+            *[(self.cyclists_per_km, {"cyclist": (1.0, CYCLIST)})] * len(bicycles),
+            *[(self.people_per_km, {"adult": (5.0, PEDESTRIAN), "child": (1.0, PEDESTRIAN)})] * len(sidewalks),
             *[(self.cross_traffic_share * self.traffic_per_km, driving)] * len(cross),
         ]
         # Who has left a cross street's junction far behind does not come back.
@@ -278,7 +278,7 @@ def _crossers(
     """People who go to and fro across the main street, on both crossings of each junction with lights in sight."""
     found = []
     wait_m = streets.cross_section.curb_offset_m + WAITING_BEHIND_KERB_M
-    walks = 2 * wait_m / float(WALKING.desired_speed_mps)
+    walks = 2 * wait_m / float(PEDESTRIAN.desired_speed_mps)
     green = streets.signals.compute_remaining_green_s(times_s)[..., CROSS]
     may_go = (green + streets.signals.yellow_s > walks) & ~flow.occupied_phases[:, :, MAIN]
     seen = (streets.junction_stations_m > seen_m[0]) & (streets.junction_stations_m < seen_m[1])
