@@ -1,4 +1,7 @@
-"""Several processes, on one machine or many, share a run: each makes the frames of its share, and all are added up."""
+"""Ranks: several processes, on one machine or many, that share a run.
+
+Each rank measures whole scenes; afterwards the observers of all ranks are merged, and every rank gets the result.
+"""
 
 import io
 import json
@@ -8,6 +11,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from datetime import timedelta
 from itertools import groupby
 from typing import Any, TypeVar
@@ -20,204 +24,260 @@ from torchcover.evaluation.checkpoint import describe_differences
 from torchcover.evaluation.heartbeat import report_silent_ranks
 from torchcover.evaluation.observers import AnyObserver
 
-Payload = TypeVar("Payload")
+PayloadT = TypeVar("PayloadT")
 
-# A rank may wait for another as long as a run takes.
-LONGEST_WAIT_S = 30 * 24 * 3600.0
-LOOK_EVERY_S = 0.05
-# How long rank 0, which keeps the store, lets the others read what it has sent; whoever has, says so.
-PARTING_S = 60.0
-# What ranks tell each other, beside what they have measured.
-FAILED, ABORTED, IDENTITY, PARTED = "failed", "aborted", "identity", "parted"
-# What they have measured travels through the store, too, which takes at most 8 MiB at once.
-PART_BYTES = 4 * 2**20
-EVERYBODY = -1
+# Keys of the store: the first rank that failed, after which the results so far are merged; and the first that aborted.
+FAILED_KEY = "failed"
+ABORTED_KEY = "aborted"
+SHUTDOWN_KEY = "parted"
+# Receiver of a message to all ranks.
+ALL_RANKS = -1
+
+
+@dataclass(frozen=True)
+class RanksParams:
+    """Parameters of the messages between ranks.
+
+    Args:
+        max_wait_s: Longest wait for another rank, which may take as long as a run.
+        poll_interval_s: Time between two queries of the store.
+        shutdown_timeout_s: Time that rank 0 keeps the store open for ranks that have not read its last message.
+        max_part_bytes: Messages are split into parts of this size, since a store of torch takes at most 8 MiB at once.
+    """
+
+    max_wait_s: float = 30 * 24 * 3600.0
+    poll_interval_s: float = 0.05
+    shutdown_timeout_s: float = 60.0
+    max_part_bytes: int = 4 * 2**20
 
 
 class Ranks:
-    """The processes that share a run, as `torchrun` starts them: every one of them calls the same.
+    """Processes that share a run, as `torchrun` starts them; all of them make the same calls in the same order.
 
     Args:
-        store: Through which they tell each other everything.
-        rank: Which one this is.
-        num_ranks: How many there are.
+        store: Key-value store through which the ranks exchange messages.
+        rank: Index of this process; rank 0 keeps the store and writes the results.
+        num_ranks: Number of processes.
+        params: Times and sizes.
     """
 
-    def __init__(self, store: Store, rank: int, num_ranks: int) -> None:
+    def __init__(self, store: Store, rank: int, num_ranks: int, params: RanksParams = RanksParams()) -> None:
         self.store = store
         self.rank = rank
         self.num_ranks = num_ranks
-        self._letters = Counter[tuple[int, int]]()
+        self._params = params
+        self._message_counts = Counter[tuple[int, int]]()
 
     def iterate_share(self, indices: Sequence[int], get_scene_id: Callable[[int], int]) -> Iterator[int]:
-        """The frames that are this rank's: those of whole worlds, dealt in turns, so that more steps change no share.
+        """Yield the frames of this rank: whole scenes in turn, so that a longer run only adds frames to each share.
 
         Args:
-            indices: All frames, in order.
-            get_scene_id: Which world a frame is of.
+            indices: Indices of all frames, in order.
+            get_scene_id: Function that returns the scene of a frame.
         """
-        for number, (_, of_world) in enumerate(groupby(indices, get_scene_id)):
-            if number % self.num_ranks == self.rank:
-                yield from of_world
+        for scene_number, (_, scene_indices) in enumerate(groupby(indices, get_scene_id)):
+            if scene_number % self.num_ranks == self.rank:
+                yield from scene_indices
 
     def get_device(self, name: str) -> str:
-        """Where this rank computes: of several GPUs, one each."""
+        """Return the device of this rank: the GPU with its local rank for "cuda", `name` otherwise."""
         return f"cuda:{os.environ.get('LOCAL_RANK', '0')}" if name == "cuda" else name
 
     def check_identity(self, identity: Mapping[str, str]) -> None:
-        """Find out whether all ranks are about the same run.
+        """Check that this rank has the same settings as rank 0.
+
+        Args:
+            identity: Name of each setting that changes the result -> its value.
 
         Raises:
-            ValueError: This one is not; the message says what differs from rank 0.
+            ValueError: A setting differs; the message lists the differences.
+            ChildProcessError: Another rank has aborted the run.
         """
+        key = "identity"
         if self.rank == 0:
-            self.store.set(IDENTITY, json.dumps(dict(identity)))
+            self.store.set(key, json.dumps(dict(identity)))
             return
-        self._wait_for([IDENTITY])
-        if other := describe_differences(identity, json.loads(self.store.get(IDENTITY))):
-            raise ValueError(f"rank {self.rank} is about another run than rank 0: {other}; start all with the same")
+        self._wait_for([key])
+        differences = describe_differences(identity, json.loads(self.store.get(key)))
+        if differences:
+            advice = "start all ranks with the same settings"
+            raise ValueError(f"rank {self.rank} has other settings than rank 0: {differences}; {advice}")
 
     def check_failures(self) -> None:
-        """Between two frames: whether this rank is to go on.
+        """Check between two frames that no rank has failed.
 
         Raises:
-            ChildProcessError: Another one has failed; the message says which, and how.
+            ChildProcessError: A rank has failed; the message has its number and its error.
         """
-        for key in (ABORTED, FAILED):
+        for key in (ABORTED_KEY, FAILED_KEY):
             if self.store.check([key]):
                 raise ChildProcessError(self.store.get(key).decode())
 
     @property
     def failure(self) -> str | None:
-        """Which rank has failed first, and how, in words."""
-        return self.store.get(FAILED).decode() if self.store.check([FAILED]) else None
+        """Number and error of the rank that failed first; None if none has failed."""
+        return self.store.get(FAILED_KEY).decode() if self.store.check([FAILED_KEY]) else None
 
-    def report_failure(self, error: BaseException, key: str = FAILED) -> None:
-        """Tell the others that this rank has failed, if it is the first, so that they stop."""
-        words = " ".join(str(error).split())
-        said = ": ".join([f"rank {self.rank}", type(error).__name__, *[words] * bool(words)])
-        self.store.compare_set(key, "", said)
+    def report_failure(self, error: BaseException, *, is_abort: bool = False) -> None:
+        """Report an error of this rank to the others, which then stop; only the first report is kept.
+
+        Args:
+            error: The error.
+            is_abort: Whether the run has no result, not even that of the frames so far.
+        """
+        message = " ".join(str(error).split())
+        report = f"rank {self.rank}: {type(error).__name__}"
+        if message:
+            report += f": {message}"
+        self.store.compare_set(ABORTED_KEY if is_abort else FAILED_KEY, "", report)
 
     @contextmanager
     def abort_on_error(self) -> Iterator[None]:
-        """Whatever leaves the block as an error ends all ranks, and nothing is added up."""
+        """Abort the run of all ranks if the block raises an error, which is raised again here."""
         try:
             yield
         except BaseException as error:
-            self.report_failure(error, ABORTED)
+            self.report_failure(error, is_abort=True)
             raise
 
     def merge(self, observers: Sequence[AnyObserver]) -> list[AnyObserver]:
-        """Add up what all ranks have seen, in their order; every rank gets all of it.
+        """Merge the observers of all ranks in the order of the ranks.
 
         Args:
-            observers: Those of this rank, which other ranks have likewise.
+            observers: Observers of this rank; the other ranks have the same ones.
+
+        Returns:
+            The merged observers, equal in every rank.
 
         Raises:
-            ValueError: Observers that do not measure the same.
+            ValueError: Two observers measure different things.
+            ChildProcessError: Another rank has aborted the run.
         """
-        return [self._from_first(self._merged(one)) for one in observers]
+        return [self._broadcast(self._merge_to_first_rank(observer)) for observer in observers]
 
-    def gather(self, value: Payload) -> list[Payload]:
-        """What each rank has, in their order; every rank gets all of it."""
-        values = [value, *(self._receive(rank) for rank in range(1, self.num_ranks))] if self.rank == 0 else []
-        if self.rank:
+    def gather(self, value: PayloadT) -> list[PayloadT]:
+        """Gather a value of every rank.
+
+        Args:
+            value: Value of this rank.
+
+        Returns:
+            Values in the order of the ranks, equal in every rank.
+
+        Raises:
+            ChildProcessError: Another rank has aborted the run.
+        """
+        values = [value]
+        if self.rank == 0:
+            values += [self._receive(sender, self.rank) for sender in range(1, self.num_ranks)]
+        else:
             self._send(value, 0)
-        return self._from_first(values)
+        return self._broadcast(values)
 
     def shut_down(self) -> None:
-        """Wait for rank 0, which writes the results: who ends with an error is the end of all of them."""
-        with suppress(RuntimeError):  # the store ends with the process that keeps it
+        """Wait until rank 0 has written the results; an error of a process would end the others before that."""
+        with suppress(RuntimeError):  # the store ends with the process of rank 0
             if self.rank == 0:
-                self.store.set(PARTED, "")
-                self._wait_for([f"{PARTED} {rank}" for rank in range(1, self.num_ranks)], at_most_s=PARTING_S)
+                self.store.set(SHUTDOWN_KEY, "")
+                replies = [f"{SHUTDOWN_KEY} {rank}" for rank in range(1, self.num_ranks)]
+                self._wait_for(replies, self._params.shutdown_timeout_s, raises_on_abort=False)
             else:
-                self._wait_for([PARTED])
-                self.store.set(f"{PARTED} {self.rank}", "")
+                self._wait_for([SHUTDOWN_KEY], raises_on_abort=False)
+                self.store.set(f"{SHUTDOWN_KEY} {self.rank}", "")
 
-    def _merged(self, observer: AnyObserver) -> AnyObserver:
-        """In rank 0 that of all: in pairs of neighbours, then in pairs of pairs, so that no rank merges many."""
-        apart = 1
-        while apart < self.num_ranks and self.rank % (2 * apart) == 0:
-            if self.rank + apart < self.num_ranks:
-                observer.merge_state(self._receive(self.rank + apart))
-            apart *= 2
+    def _merge_to_first_rank(self, observer: AnyObserver) -> AnyObserver:
+        """Merge pairs of neighbors, then pairs of pairs: each rank merges at most log2(num_ranks) observers."""
+        distance = 1
+        while distance < self.num_ranks and self.rank % (2 * distance) == 0:
+            if self.rank + distance < self.num_ranks:
+                observer.merge_state(self._receive(self.rank + distance, self.rank))
+            distance *= 2
         if self.rank:
-            self._send(observer, self.rank - apart)
+            self._send(observer, self.rank - distance)
         return observer
 
-    def _wait_for(self, keys: list[str], at_most_s: float = LONGEST_WAIT_S) -> None:
-        end_s = time.monotonic() + at_most_s
+    def _wait_for(self, keys: list[str], timeout_s: float | None = None, *, raises_on_abort: bool = True) -> None:
+        end_s = time.monotonic() + (self._params.max_wait_s if timeout_s is None else timeout_s)
         while not self.store.check(keys) and time.monotonic() < end_s:
-            if self.store.check([ABORTED]) and PARTED not in keys[0]:
-                raise ChildProcessError(self.store.get(ABORTED).decode())
-            time.sleep(LOOK_EVERY_S)
+            if raises_on_abort and self.store.check([ABORTED_KEY]):
+                raise ChildProcessError(self.store.get(ABORTED_KEY).decode())
+            time.sleep(self._params.poll_interval_s)
 
-    def _from_first(self, value: Payload) -> Payload:
+    def _broadcast(self, value: PayloadT) -> PayloadT:
+        """Return the value of rank 0 in every rank."""
         if self.rank == 0:
-            self._send(value, EVERYBODY)
+            self._send(value, ALL_RANKS)
             return value
-        received: Payload = self._receive(0, EVERYBODY)
+        received: PayloadT = self._receive(0, ALL_RANKS)
         return received
 
-    def _send(self, value: object, to: int) -> None:
-        letter, data = self._letter(self.rank, to), serialize(value)
-        for start in range(0, len(data), PART_BYTES):
-            part = data[start : start + PART_BYTES]
-            self.store.set(f"{letter} {start}", part)  # type: ignore[arg-type]  # it takes bytes, too
-        self.store.set(letter, f"{len(data)}")
+    def _send(self, value: object, receiver: int) -> None:
+        message_key, data = self._build_message_key(self.rank, receiver), serialize(value)
+        for start in range(0, len(data), self._params.max_part_bytes):
+            part = data[start : start + self._params.max_part_bytes]
+            self.store.set(f"{message_key} {start}", part)  # type: ignore[arg-type]  # the stub omits bytes
+        self.store.set(message_key, f"{len(data)}")
 
-    def _receive(self, rank: int, to: int | None = None) -> Any:  # noqa: ANN401  (what another rank has sent)
-        letter = self._letter(rank, self.rank if to is None else to)
-        self._wait_for([letter])
-        parts = [f"{letter} {start}" for start in range(0, int(self.store.get(letter)), PART_BYTES)]
-        data = b"".join(map(self.store.get, parts))
-        for part in parts if to is None else ():
-            self.store.delete_key(part)
-        return pickle.loads(data)  # as a process of the same run has packed it; nobody else's
+    def _receive(self, sender: int, receiver: int) -> Any:  # noqa: ANN401  (value of the sender)
+        """Receive the next message; its parts are deleted unless other ranks read them, too."""
+        message_key = self._build_message_key(sender, receiver)
+        self._wait_for([message_key])
+        starts = range(0, int(self.store.get(message_key)), self._params.max_part_bytes)
+        part_keys = [f"{message_key} {start}" for start in starts]
+        data = b"".join([self.store.get(key) for key in part_keys])
+        if receiver != ALL_RANKS:
+            for key in part_keys:
+                self.store.delete_key(key)
+        return pickle.loads(data)  # only processes of the same run write into the store
 
-    def _letter(self, rank: int, to: int) -> str:
-        """Its key, of the next one from one rank to another."""
-        self._letters[rank, to] += 1
-        return f"{rank} to {to}: {self._letters[rank, to]}"
+    def _build_message_key(self, sender: int, receiver: int) -> str:
+        """Build the key of the next message between two ranks."""
+        self._message_counts[sender, receiver] += 1
+        return f"{sender} to {receiver}: {self._message_counts[sender, receiver]}"
 
 
 def serialize(value: object) -> bytes:
-    """Any object that can be pickled, its tensors on the CPU."""
+    """Pickle an object after its tensors are copied to the CPU."""
     stream = io.BytesIO()
-    _OnTheCpu(stream, protocol=pickle.HIGHEST_PROTOCOL).dump(value)
+    _CpuPickler(stream, protocol=pickle.HIGHEST_PROTOCOL).dump(value)
     return stream.getvalue()
 
 
-class _OnTheCpu(pickle.Pickler):
-    def reducer_override(self, value: Any) -> Any:  # noqa: ANN401  (as pickle has it)
+class _CpuPickler(pickle.Pickler):
+    def reducer_override(self, value: Any) -> Any:  # noqa: ANN401  (signature of pickle)
         if type(value) is Tensor and value.device.type != "cpu":
             return value.cpu().__reduce_ex__(pickle.HIGHEST_PROTOCOL)  # type: ignore[no-untyped-call]
         return NotImplemented
 
 
 def count_ranks() -> int:
-    """How many processes `torchrun` has started, this one among them; 1 without it.
+    """Count the processes that `torchrun` has started, including this one.
+
+    Returns:
+        Value of the environment variable WORLD_SIZE; 1 without `torchrun`.
 
     Raises:
-        ValueError: The environment says what is no number.
+        ValueError: WORLD_SIZE is not an integer.
     """
     return int(os.environ.get("WORLD_SIZE", "1"))
 
 
 @contextmanager
 def join_ranks() -> Iterator[Ranks | None]:
-    """The ranks that `torchrun` has started, this process one of them; None where it has started one or none.
+    """Join the processes that `torchrun` has started; the end of the block waits for rank 0 to write the results.
+
+    Returns:
+        The ranks; None if there is a single process.
 
     Raises:
-        ValueError: The environment of a rank is not whole.
+        ValueError: An environment variable of `torchrun` is missing.
     """
     if count_ranks() < 2:
         yield None
         return
-    store, rank, size = next(iter(rendezvous("env://", timeout=timedelta(minutes=5))))
-    ranks = Ranks(store, rank, size)
-    with report_silent_ranks(store, rank, size):
+    store, rank, num_ranks = next(iter(rendezvous("env://", timeout=timedelta(minutes=5))))
+    ranks = Ranks(store, rank, num_ranks)
+    with report_silent_ranks(store, rank, num_ranks):
         try:
             yield ranks
         finally:
