@@ -1,4 +1,4 @@
-"""Every block of code in the documentation runs, each on its own; commands and documents are those that exist."""
+"""Documentation tests: every code block runs on its own; commands, options and YAML documents are valid."""
 
 import doctest
 import json
@@ -34,8 +34,8 @@ PAGES = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 BLOCK = re.compile(r"^(?P<indent> *)```(?P<language>\w+)\n(?P<code>.*?)^ *```", re.MULTILINE | re.DOTALL)
 
 
-def blocks(language):
-    """Each block with its place, without the indentation of a list."""
+def iterate_blocks(language):
+    """Yield the code blocks of a language, without the indentation of lists, as test parameters."""
     for page in PAGES:
         text = page.read_text(encoding="utf-8")
         for block in BLOCK.finditer(text):
@@ -45,23 +45,28 @@ def blocks(language):
                 yield pytest.param(code, id=f"{page.relative_to(ROOT)}:{line}")
 
 
-@pytest.mark.parametrize("code", [each for each in blocks("python") if ">>>" in each.values[0]])
-def test_an_example_prints_what_it_says(code, tmp_path, monkeypatch):
+def list_python_blocks(*, has_prompts):
+    """List the Python blocks with (doctests) or without prompts."""
+    return [block for block in iterate_blocks("python") if (">>>" in block.values[0]) == has_prompts]
+
+
+@pytest.mark.parametrize("code", list_python_blocks(has_prompts=True))
+def test_doctests_print_the_documented_output(code, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    said = []
+    report = []
     example = doctest.DocTestParser().get_doctest(code, {"__name__": "example"}, "example", None, 0)
-    assert doctest.DocTestRunner(verbose=False).run(example, out=said.append).failed == 0, "".join(said)
+    assert doctest.DocTestRunner(verbose=False).run(example, out=report.append).failed == 0, "".join(report)
 
 
 @pytest.fixture
-def stage(tmp_path, monkeypatch):
-    """What the other examples take as given: names of a user's own, his files, and less to compute."""
+def namespace(tmp_path, monkeypatch):
+    """Names and files that the examples without prompts assume; `evaluate` computes less."""
     monkeypatch.chdir(tmp_path)
     argoverse2_log(Drive(), tmp_path / "av2" / "LOG")
     kitti_raw(Drive(), tmp_path).rename(tmp_path / "2011_09_26" / "2011_09_26_drive_0005_sync")
     write_calibrations(tmp_path)
-    small = {"steps": 1, "workers": 0, "progress": False, "rays": 256, "cell_m": 8.0}
-    monkeypatch.setattr(torchcover, "evaluate", partial(measured_less, torchcover.evaluate, small))
+    small = {"num_frames": 1, "num_workers": 0, "progress": False, "num_rays": 256, "cell_m": 8.0}
+    monkeypatch.setattr(torchcover, "evaluate", partial(evaluate_with_less, torchcover.evaluate, small))
     frames = SimulatedFrames("courtyard", "front_roof_32", num_frames=1, boxes=True)
     grid = BevGrid(x_m=(0.0, 40.0), y_m=(-10.0, 10.0), cell_m=0.5, band_frame="ground")
     return {
@@ -72,16 +77,16 @@ def stage(tmp_path, monkeypatch):
         "frames": frames,
         "loader": DataLoader(frames, collate_fn=collate_frames),
         "grid": grid,
-        "metric": torchcover.CoverageMetric(grid, max_radius=50.0),
+        "metric": torchcover.CoverageMetric(grid, max_radius_m=50.0),
         "detector": lambda cloud: (torch.zeros(1, 7), torch.ones(1)),
     }
 
 
-def measured_less(real, less, *arguments, frames=None, **settings):
-    """With few steps, rays and cells, and of a recording with what it has."""
+def evaluate_with_less(evaluate, overrides, *arguments, frames=None, **settings):
+    """Call `evaluate` with few frames, rays and cells; a recording keeps its frames."""
     if frames is not None:
-        return real(*arguments, frames=frames, **settings, cell_m=less["cell_m"])
-    return real(*arguments, **{**settings, **less})
+        return evaluate(*arguments, frames=frames, **settings, cell_m=overrides["cell_m"])
+    return evaluate(*arguments, **{**settings, **overrides})
 
 
 def write_calibrations(folder):
@@ -109,30 +114,27 @@ def write_calibrations(folder):
     )
 
 
-@pytest.mark.filterwarnings("ignore")  # a drive of a few points is as suspicious as it looks
-@pytest.mark.parametrize("code", [each for each in blocks("python") if ">>>" not in each.values[0]])
-def test_an_example_without_output_runs(code, stage, blank_maps):
+@pytest.mark.filterwarnings("ignore")  # the data checks warn about a recording of a few points
+@pytest.mark.parametrize("code", list_python_blocks(has_prompts=False))
+def test_examples_without_output_run(code, namespace, blank_maps):
     if "results/coverage.npz" in code:
         torchcover.evaluate("front_roof_32", "courtyard").save("results")
-    exec(compile(code, "example", "exec"), stage)
+    exec(compile(code, "example", "exec"), namespace)
 
 
-def commands():
-    for parameter in blocks("console"):
-        for line in re.sub(r"\\\n", " ", parameter.values[0]).splitlines():
+def iterate_commands():
+    """Yield the words of every shell command, up to the first redirection, as test parameters."""
+    for block in iterate_blocks("console"):
+        for line in re.sub(r"\\\n", " ", block.values[0]).splitlines():
             if line.startswith("$ "):
                 words = list(takewhile(lambda word: word not in (">", "|"), shlex.split(line[2:], comments=True)))
-                yield pytest.param(words, id=f"{parameter.id} {' '.join(words)}"[:80])
+                yield pytest.param(words, id=f"{block.id} {' '.join(words)}"[:80])
 
 
-@pytest.mark.parametrize("words", list(commands()))
-def test_a_command_can_be_given(words):
-    """Its options exist and take such values; what it would measure, others measure."""
+@pytest.mark.parametrize("words", list(iterate_commands()))
+def test_commands_and_options_exist(words):
     if "torchcover" in words:
-        group = get_command(app)
-        context = typer.Context(group, info_name="torchcover")
-        name, command, rest = group.resolve_command(context, words[words.index("torchcover") + 1 :])
-        command.make_context(name, list(rest), parent=context)
+        check_torchcover_command(words[words.index("torchcover") + 1 :])
     elif words[:2] == ["make", *words[1:2]]:
         assert re.search(rf"(?m)^{words[1]}:", (ROOT / "Makefile").read_text())
     elif words[:2] == ["python", "-m"]:
@@ -144,7 +146,30 @@ def test_a_command_can_be_given(words):
         assert words[0] in ("pip", "uv", "git", "cd", "sudo", "bash"), words
 
 
-# Whatever reads a document of YAML.
+def check_torchcover_command(arguments):
+    """Parse the arguments of a command without running it."""
+    group = get_command(app)
+    context = typer.Context(group, info_name="torchcover")
+    name, command, remaining = group.resolve_command(context, arguments)
+    command.make_context(name, list(remaining), parent=context)
+
+
+def test_options_in_running_text_exist():
+    group = get_command(app)
+    context = typer.Context(group, info_name="torchcover")
+    options = {"--ages", "--constraint", "--help", "--labels"}  # of benchmarks, pip, typer and an example
+    for name in group.list_commands(context):
+        for parameter in group.get_command(context, name).params:
+            options.update(parameter.opts)
+    options.update(option for parameter in group.params for option in parameter.opts)
+    for page in PAGES:
+        if page.name == "renamed.md":  # its left column has the old names
+            continue
+        inline_code = " ".join(re.findall(r"`([^`\n]+)`", page.read_text(encoding="utf-8")))
+        assert set(re.findall(r"(?<!\S)--[a-z][a-z0-9-]+", inline_code)) <= options, page.name
+
+
+# Every function that reads a YAML document.
 READERS = (
     Rig.load,
     Scenario.load,
@@ -158,21 +183,21 @@ READERS = (
 )
 
 
-@pytest.mark.parametrize("text", list(blocks("yaml")))
-def test_a_document_is_valid_for_one_of_its_readers(text, tmp_path):
+@pytest.mark.parametrize("text", list(iterate_blocks("yaml")))
+def test_a_reader_accepts_each_yaml_block(text, tmp_path):
     path = tmp_path / "document.yaml"
     path.write_text(text, encoding="utf-8")
-    refusals = []
+    errors = []
     for read in READERS:
         try:
             read(path)
             return
         except ValueError as error:
-            refusals.append(str(error))
-    pytest.fail("\n".join(refusals))
+            errors.append(str(error))
+    pytest.fail("\n".join(errors))
 
 
-def test_make_targets_formats_of_recordings_and_imports_of_scripts_exist():
+def test_make_targets_formats_and_smoke_imports_exist():
     pages = "\n".join(page.read_text(encoding="utf-8") for page in (*PAGES, ROOT / "CONTRIBUTING.md"))
     targets = re.findall(r"^(\w+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
     lines = re.findall(r"(?:`|\$ )make ((?:[a-z]+\b ?)+)", pages)
@@ -181,3 +206,19 @@ def test_make_targets_formats_of_recordings_and_imports_of_scripts_exist():
     assert set(re.findall(r"^\| `(\w+)`", table.partition("\n\n")[0], re.MULTILINE)) == set(FORMATS)
     for line in re.findall(r"^from torchcover.*", (ROOT / ".ci" / "smoke").read_text(encoding="utf-8"), re.MULTILINE):
         exec(line, {})
+
+
+def test_links_lead_to_existing_headings():
+    for page in PAGES:
+        text = re.sub(r"```.*?```|`[^`\n]*`", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+        for target, anchor in re.findall(r"\]\((?!https?:)([^)#\s]*)#?([^)\s]*)\)", text):
+            path = (page.parent / target) if target else page
+            assert path.exists(), f"{page.name}: {target}"
+            if anchor:
+                assert anchor in list_anchors(path), f"{page.name}: {target}#{anchor}"
+
+
+def list_anchors(path):
+    """List the anchors of the headings of a Markdown page, as GitHub and MkDocs build them."""
+    headings = re.findall(r"(?m)^#+ (.+)$", path.read_text(encoding="utf-8"))
+    return [re.sub(r"[^\w\- ]", "", heading).strip().lower().replace(" ", "-") for heading in headings]
