@@ -12,18 +12,9 @@ from torchcover.simulation.traffic.city import CityBuilder
 from torchcover.simulation.traffic.fleet import Fleet, load_bodies
 from torchcover.simulation.traffic.flow import SPEED_LIMIT_SPACING_M
 from torchcover.simulation.traffic.hills import Hills
+from torchcover.simulation.traffic.main_street import MainStreetParams, sample_main_street
 from torchcover.simulation.traffic.scenery import build_slab
-from torchcover.simulation.traffic.streets import (
-    APART_M,
-    BRAKING_MPS2,
-    COMFORTABLE_MPS2,
-    GUTTER_M,
-    NEIGHBOURS_M,
-    SMALLEST_RADIUS_M,
-    CrossSection,
-    sample_main_street,
-    sample_street_plan,
-)
+from torchcover.simulation.traffic.streets import STREETS, CrossSection, sample_street_plan
 
 RADIUS_M, REACH_M = 20.0, 1500.0
 STATIONS_M = np.arange(-300.0, 1200.0, 0.37)
@@ -99,7 +90,7 @@ def test_courses_keep_within_bounds_and_away_from_themselves(seed):
         np.abs(STATIONS_M[:, None] - junctions[found.turn_directions != 0])
         < found.junction_half_lengths_m[found.turn_directions != 0]
     ).any(axis=1)
-    assert curvature[~in_turn].max() <= 1 / SMALLEST_RADIUS_M + 1e-9
+    assert curvature[~in_turn].max() <= 1 / MainStreetParams.min_radius_m + 1e-9
     # Junctions that are passed straight on lie on straights, with their crossings.
     for middle, half in zip(
         junctions[found.turn_directions == 0], found.junction_half_lengths_m[found.turn_directions == 0], strict=True
@@ -107,8 +98,8 @@ def test_courses_keep_within_bounds_and_away_from_themselves(seed):
         assert not found.alignment.compute_curvatures_per_m(middle + np.linspace(-half - 7.0, half + 7.0, 9)).any()
     places = found.alignment.compute_poses(np.arange(-REACH_M, REACH_M, 20.0), 0.0)[:, :2]
     away = np.linalg.norm(places[:, None] - places, axis=2)
-    far = np.abs(np.subtract.outer(np.arange(len(places)), np.arange(len(places)))) * 20.0 > NEIGHBOURS_M
-    assert away[far].min() >= APART_M
+    far = np.abs(np.subtract.outer(np.arange(len(places)), np.arange(len(places)))) * 20.0 > MainStreetParams.neighbor_m
+    assert away[far].min() >= MainStreetParams.min_clearance_m
 
 
 def test_without_bends_and_turns_a_course_is_straight():
@@ -142,10 +133,10 @@ def test_cars_may_drive_as_fast_as_is_comfortable_and_brake_gently_for_it():
     in_curves = (
         lane.centerline.street.compute_curvatures_per_m(lane.centerline.convert_distances_to_stations_m(places)) != 0.0
     )
-    assert across[in_curves & (lane.speed_limits_mps < 15.0)].max() < 1.1 * COMFORTABLE_MPS2
+    assert across[in_curves & (lane.speed_limits_mps < 15.0)].max() < 1.1 * STREETS.lateral_mps2
     assert lane.speed_limits_mps.min() < 8.0
     braking = -np.diff(lane.speed_limits_mps**2) / (2 * SPEED_LIMIT_SPACING_M)
-    assert braking.max() < 1.001 * BRAKING_MPS2
+    assert braking.max() < 1.001 * STREETS.braking_mps2
     # A bus keeps off the bus beside it.
     inner = section.min_turn_radius_m - (section.lanes_per_direction - 0.5) * section.lane_width_m
     corner = np.hypot(inner + 2.55 / 2, 6.0)
@@ -210,7 +201,9 @@ def test_beside_streets_there_is_pavement_and_between_pavements_no_bare_ground(s
     paved = shapely.union_all(shapely.polygons(triangles_m[up][..., :2])).buffer(0.02)
     lines = [(streets.main_alignment, np.arange(*span_m, 2.0), streets.cross_section.curb_offset_m)]
     for street, lanes in zip(streets.cross_streets, streets.cross_lanes_per_direction, strict=True):
-        lines.append((street, np.arange(-150.0, 150.0, 2.0), lanes * streets.cross_section.lane_width_m + GUTTER_M))
+        lines.append(
+            (street, np.arange(-150.0, 150.0, 2.0), lanes * streets.cross_section.lane_width_m + STREETS.gutter_m)
+        )
     driven = shapely.union_all([
         shapely.LineString(street.compute_poses(along_m, 0.0)[:, :2]).buffer(half_m, cap_style="flat", quad_segs=32)
         for street, along_m, half_m in lines

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from torchcover.simulation.traffic.flow import Agent
-from torchcover.simulation.traffic.highway import LANE_CENTRES_M, AuxiliaryLane
 from torchcover.simulation.traffic.idm import Driver
+from torchcover.simulation.traffic.motorway import MOTORWAY, AuxiliaryLane
 from torchcover.simulation.traffic.overtaking import LANES, SIDE_LANE, LaneChange, LaneChangeSimulation
 
 TIMES_S = np.arange(0.0, 60.0, 0.1)
@@ -160,7 +160,7 @@ def test_ramps_leave_gently_and_what_stands_there_keeps_off():
     assert (away_m[(stations >= 1000.0) & (stations <= 1500.0)] == 0.0).all()
     np.testing.assert_allclose(np.gradient(away_m, stations), slope, atol=3e-4)
     assert np.abs(np.gradient(slope, stations)).max() <= 1 / 500.0 + 1e-9
-    ramp_m = LANE_CENTRES_M[SIDE_LANE] + away_m
+    ramp_m = MOTORWAY.lane_centers_m[SIDE_LANE] + away_m
     for left_m, wide_m in ((16.8, 0.5), (19.5, 0.5), (30.0, 3.5)):
         kept_m = lane.find_clear_offsets_m(stations, left_m, wide_m)
         assert (np.abs(kept_m - ramp_m) > 1.8 + wide_m).all()

@@ -1,5 +1,7 @@
 """Whole worlds: who is where, what is under the wheels, and that nothing is chance."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from pydantic import ValidationError
@@ -265,7 +267,7 @@ def test_the_ego_may_have_a_body_of_its_own(bodies):
 
 def test_who_is_left_out_changes_nothing(monkeypatch, bodies):
     few = UrbanTraffic(duration_s=8.0).build_scene(3, bodies=bodies)
-    monkeypatch.setattr(urban, "_who_matter", lambda lanes, agents, duration_s: agents)
+    monkeypatch.setattr(urban, "select_relevant_agents", lambda lanes, agents, duration_s: agents)
     monkeypatch.setattr(urban, "find_nearby_agents", lambda lanes, agents, place_m: np.arange(len(agents)))
     everybody = UrbanTraffic(duration_s=8.0).build_scene(3, bodies=bodies)
     assert [actor.name for actor in few.actors] == [actor.name for actor in everybody.actors]
@@ -276,8 +278,8 @@ def test_who_is_left_out_changes_nothing(monkeypatch, bodies):
 
 def test_nobody_is_where_the_street_is_not_built(monkeypatch, bodies):
     # Farther on a street may come back, through what stands beside it here.
-    for name, way_m in {"BEHIND_M": 30.0, "AHEAD_M": 60.0, "ASIDE_M": 20.0}.items():
-        monkeypatch.setattr(urban, name, way_m)
+    small = replace(urban.PARAMS, behind_m=30.0, ahead_m=60.0, corridor_margin_m=20.0)
+    monkeypatch.setattr(urban, "PARAMS", small)
     city = UrbanTraffic(max_bend_deg=0.5, turn_share=0.0, duration_s=4.0, time_step_s=0.5).build_scene(0, bodies=bodies)
     first_m, last_m = city.ego.trajectory.positions_m[[0, -1], 0]
     along = [actor for actor in city.actors if abs(np.sin(np.deg2rad(actor.trajectory.angles_deg[0, 0]))) < 0.1]

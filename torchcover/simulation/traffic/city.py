@@ -14,7 +14,7 @@ from torchcover.simulation.traffic.fleet import Fleet
 from torchcover.simulation.traffic.frontage import RoadsideDensity, StreetSide, Zone, place_scenery
 from torchcover.simulation.traffic.hills import BlockParams, Bounds, BuildingSite, Hills
 from torchcover.simulation.traffic.scenery import Scenery, build_ground_plane, build_sidewalk, merge_by_kind
-from torchcover.simulation.traffic.streets import LONGEST_HALF_M, StreetPlan
+from torchcover.simulation.traffic.streets import STREETS, StreetPlan
 
 BLOCK_DEPTH_M = 95.0
 # Crossings and the sight of those who wait there stay free: of parked cars, and of furniture.
@@ -119,7 +119,7 @@ class CityBuilder(NamedTuple):
     def _in_plan(self) -> tuple[list[shapely.Geometry], list[shapely.Geometry]]:
         """All streets, without and with the sidewalks along them."""
         stations_m = [self.corridor.sample_stations_m(STREET_EVERY_M)]
-        bodies_m = self.streets.cross_street_spans_m + np.array([-LONGEST_HALF_M, LONGEST_HALF_M])
+        bodies_m = self.streets.cross_street_spans_m + np.array([-STREETS.half_vehicle_m, STREETS.half_vehicle_m])
         for street, ends_m in zip(self.streets.cross_streets, bodies_m, strict=True):
             stations_m.append(ends_m if street.is_straight else np.arange(-LANES_M, LANES_M, STREET_EVERY_M))
         streets = zip([self.streets.main_alignment, *self.streets.cross_streets], stations_m, strict=True)

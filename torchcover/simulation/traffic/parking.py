@@ -1,16 +1,17 @@
-"""A parking lot: the ego drives round and round its aisles, among parked cars, low obstacles and people.
+"""Parking lot: the ego vehicle circles through its aisles, among parked cars, low obstacles and pedestrians.
 
-From the middle outwards, on both sides alike: a walkway between two rows that face each other, a row of stalls (with it
-the island ends), an aisle, another row, a walkway along the edge.
+From the center outwards, on both sides: half of a walkway between two rows of stalls that face each other, a row of
+stalls with an island at each end, an aisle, another row of stalls, and a walkway along the edge.
 """
 
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 import shapely
 from pydantic import Field
 
-from torchcover.geometry.arrays import Float64
+from torchcover.geometry.arrays import Bools, Float64
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.traffic.alignment import build_rounded_rectangle
 from torchcover.simulation.traffic.assemble import (
@@ -38,145 +39,205 @@ from torchcover.simulation.traffic.scenery import (
     merge_by_kind,
 )
 
-STALL_WIDTH_M, STALL_DEPTH_M = 2.6, 5.0
-STALLS = 24
-STALLS_M = STALLS * STALL_WIDTH_M
-MIDDLE_WALKWAY_M = 1.9
-ISLAND_M = MIDDLE_WALKWAY_M / 2 + STALL_DEPTH_M
-AISLE_M = 6.5
-OUTER_HEAD_M = ISLAND_M + AISLE_M + STALL_DEPTH_M
-# y of the tracks on the walkways, each for one person.
-WALKWAYS_M = (-0.45, 0.45, OUTER_HEAD_M + 1.2, OUTER_HEAD_M + 2.1, -OUTER_HEAD_M - 1.2, -OUTER_HEAD_M - 2.1)
-EDGE_M = OUTER_HEAD_M + 3.2
 
-ISLAND_END_M = 3.0
-BOLLARDS_AT_X_M = 48.0
-BOLLARD_EVERY_M = 1.8
-BUILDING_AT_Y_M = 36.0
-# The lot with its lanes, as far as what stands around it keeps off; and what stands at its edge, and behind that.
-LOT_M = shapely.box(-BOLLARDS_AT_X_M - 14.0, -EDGE_M - 8.0, BOLLARDS_AT_X_M + 14.0, BUILDING_AT_Y_M)
-AROUND_M = (0.2, 2.5)
-# Crowns keep off the market.
-CROWN_M = 2.0
-NOSE_OFF_HEAD_M = 0.35
-PARKED = {"suv": 3.0, "sedan": 3.0, "hatchback": 4.0}
-TROLLEY_M = (0.9, 0.55, 1.0)
-TROLLEY_SHARE = 0.3
+@dataclass(frozen=True)
+class ParkingLotParams:
+    """Layout of a parking lot around the origin, with aisles along x, and behavior of its pedestrians.
+
+    Args:
+        num_stalls: Stalls in each row.
+        stall_width_m: Width of a stall.
+        stall_depth_m: Depth of a stall.
+        middle_walkway_m: Width of the walkway between the middle rows.
+        aisle_m: Width of an aisle.
+        island_length_m: Length of the islands at the ends of the middle rows.
+        bollard_x_m: Distance of the rows of bollards along the short sides from the center.
+        bollard_spacing_m: Distance between bollards.
+        building_y_m: y of the front of the supermarket.
+        nose_gap_m: Gap between a parked car and the head of its stall.
+        trolley_share: Share of the stalls without a car that hold a shopping trolley.
+        trolley_m: Length, width and height of a trolley.
+        loop_length_m: Length of the one-way loop through both aisles, along x.
+        corner_radius_m: Radius of the corners of the loop.
+        warm_up_s: Duration that is simulated before the run.
+        wait_offset_m: Distance of waiting pedestrians from the edges of an aisle.
+        clear_distance_m: Distance of cars, center to path, at which pedestrians start to cross.
+        path_spacing_m: Distance between two footpaths across an aisle.
+    """
+
+    num_stalls: int = 24
+    stall_width_m: float = 2.6
+    stall_depth_m: float = 5.0
+    middle_walkway_m: float = 1.9
+    aisle_m: float = 6.5
+    island_length_m: float = 3.0
+    bollard_x_m: float = 48.0
+    bollard_spacing_m: float = 1.8
+    building_y_m: float = 36.0
+    nose_gap_m: float = 0.35
+    trolley_share: float = 0.3
+    trolley_m: tuple[float, float, float] = (0.9, 0.55, 1.0)
+    loop_length_m: float = 84.0
+    corner_radius_m: float = 6.0
+    warm_up_s: float = 10.0
+    wait_offset_m: float = 1.8
+    clear_distance_m: float = 6.0
+    path_spacing_m: float = 1.2
+
+    @property
+    def half_row_m(self) -> float:
+        """Half of the length of a row."""
+        return self.num_stalls * self.stall_width_m / 2
+
+    @property
+    def inner_edge_m(self) -> float:
+        """Distance from the center line to the aisle."""
+        return self.middle_walkway_m / 2 + self.stall_depth_m
+
+    @property
+    def outer_head_m(self) -> float:
+        """Distance from the center line to the heads of the outer stalls."""
+        return self.inner_edge_m + self.aisle_m + self.stall_depth_m
+
+    @property
+    def edge_m(self) -> float:
+        """Distance from the center line to the edge of the lot."""
+        return self.outer_head_m + 3.2
+
+    def compute_stall_x_m(self, column: int) -> float:
+        """Compute the x of the center of a stall."""
+        return (column + 0.5 - self.num_stalls / 2) * self.stall_width_m
+
+
+LOT = ParkingLotParams()
 
 
 class ParkingLotBuilder:
-    """Draws a parking lot about the origin, with its aisles along x."""
+    """Builder of a parking lot.
+
+    Args:
+        settings: Settings of the traffic.
+        fleet: Bodies; receives the parked cars.
+        generator: Random generator.
+    """
 
     def __init__(self, settings: "ParkingTraffic", fleet: Fleet, generator: np.random.Generator) -> None:
-        self._options, self._fleet, self._generator = settings, fleet, generator
-        count = settings.crossings_per_aisle
-        self._empty = {side: set(generator.choice(STALLS, size=count, replace=False).tolist()) for side in (1, -1)}
+        self._settings, self._fleet, self._generator = settings, fleet, generator
+        # On each side, the stalls at which pedestrians cross the aisle stay empty.
+        self._crossing_columns: dict[int, list[int]] = {}
+        for side in (1, -1):
+            columns = generator.choice(LOT.num_stalls, size=settings.crossings_per_aisle, replace=False)
+            self._crossing_columns[side] = sorted(set(columns.tolist()))
 
-    @property
-    def crossing_positions(self) -> list[tuple[int, float]]:
-        """Side (1 is the aisle at positive y) and x of each place where people cross."""
-        return [(side, _stall_x(column)) for side in (1, -1) for column in sorted(self._empty[side])]
+    def build_footpaths(self) -> list[Footpath]:
+        """Build two footpaths across the aisle at each crossing."""
+        near_m = LOT.inner_edge_m - LOT.wait_offset_m
+        far_m = LOT.inner_edge_m + LOT.aisle_m + LOT.wait_offset_m
+        paths = []
+        for side, columns in self._crossing_columns.items():
+            for column in columns:
+                for shift_m in (-LOT.path_spacing_m / 2, LOT.path_spacing_m / 2):
+                    x_m = LOT.compute_stall_x_m(column) + shift_m
+                    paths.append(Footpath(np.array([x_m, side * near_m]), np.array([x_m, side * far_m])))
+        return paths
 
     def build_static_scenery(self) -> Scenery:
-        """Everything but the cars, with ground for 300 m around; the cars are parked."""
-        low = []
-        for side in (1, -1):
-            for head, inwards in ((MIDDLE_WALKWAY_M / 2, 1), (OUTER_HEAD_M, -1)):
-                for column in range(STALLS):
-                    wheel_stop = build_box((_stall_x(column), side * (head + inwards * 0.12)), (1.8, 0.15, 0.1))
-                    low.append(wheel_stop)
-                    if column not in self._empty[side]:
-                        place = (_stall_x(column), side * head, side * inwards)
-                        low += self._occupant(*place)
-        islands, trees = self._islands()
-        around, market = self._surroundings()
-        level, kerbs = build_ground_plane((-300.0, -300.0), (300.0, 300.0)), merge_by_kind(islands)
-
-        sides = find_street_sides(LOT_M, AROUND_M, lambda _: np.array(True), self._options.built_share, self._generator)
-        taken = [LOT_M, market.buffer(CROWN_M)]
-        stood = place_scenery(
+        """Build everything but the cars on 300 m of ground around the center, and park the cars."""
+        low_obstacles = self._build_stall_obstacles()
+        islands, island_trees = self._build_islands()
+        surroundings, market = self._build_surroundings()
+        ground, curbs = build_ground_plane((-300.0, -300.0), (300.0, 300.0)), merge_by_kind(islands)
+        half_length_m = LOT.bollard_x_m + 14.0
+        lot = shapely.box(-half_length_m, -LOT.edge_m - 8.0, half_length_m, LOT.building_y_m)
+        roadside_offsets_m = (0.2, 2.5)
+        sides = find_street_sides(
+            lot, roadside_offsets_m, _mark_all_visible, self._settings.built_share, self._generator
+        )
+        occupied = [lot, market.buffer(2.0)]  # tree crowns keep off the market
+        roadside = place_scenery(
             sides,
-            taken,
-            taken,
+            occupied,
+            occupied,
             (),
-            lambda places_m: np.zeros(len(places_m)),
-            self._options.roadside_density,
+            _compute_flat_heights_m,
+            self._settings.roadside_density,
             self._generator,
         )
-        return Scenery(
-            (level, *merge_by_kind(low, self._bollards()), *kerbs, *merge_by_kind(trees, around, *stood)), (0, 3)
-        )
+        low_meshes = merge_by_kind(low_obstacles, self._build_bollards())
+        high_meshes = merge_by_kind(island_trees, surroundings, *roadside)
+        return Scenery((ground, *low_meshes, *curbs, *high_meshes), (0, 3))
 
-    def _occupant(self, x: float, head_y: float, inwards: int) -> list[Mesh]:
-        """Park a car in a stall, nose or tail first; or return a trolley that somebody left there; or nothing."""
-        if self._generator.random() < self._options.parked_share:
-            kind = self._fleet.sample_kind(PARKED)
-            y = head_y + inwards * (NOSE_OFF_HEAD_M + self._fleet.get_length_m(kind) / 2)
-            yaw = self._generator.choice((90.0, -90.0)) + self._generator.uniform(-1.5, 1.5)
-            x += self._generator.uniform(-0.1, 0.1)
-            self._fleet.add_parked_vehicle(kind, (x, y, yaw))
+    def _build_stall_obstacles(self) -> list[Mesh]:
+        """Build the wheel stops and trolleys of all stalls, and park the cars."""
+        meshes = []
+        for side in (1, -1):
+            for head_m, inwards in ((LOT.middle_walkway_m / 2, 1), (LOT.outer_head_m, -1)):
+                for column in range(LOT.num_stalls):
+                    x_m = LOT.compute_stall_x_m(column)
+                    meshes.append(build_box((x_m, side * (head_m + inwards * 0.12)), (1.8, 0.15, 0.1)))
+                    if column not in self._crossing_columns[side]:
+                        meshes += self._fill_stall(x_m, side * head_m, side * inwards)
+        return meshes
+
+    def _fill_stall(self, x_m: float, head_y_m: float, inwards: int) -> list[Mesh]:
+        """Park a car in a stall, nose or tail first; otherwise return a shopping trolley or nothing."""
+        uniform = self._generator.uniform
+        if self._generator.random() < self._settings.parked_share:
+            kind = self._fleet.sample_kind({"suv": 3.0, "sedan": 3.0, "hatchback": 4.0})
+            y_m = head_y_m + inwards * (LOT.nose_gap_m + self._fleet.get_length_m(kind) / 2)
+            yaw_deg = self._generator.choice((90.0, -90.0)) + uniform(-1.5, 1.5)
+            self._fleet.add_parked_vehicle(kind, (x_m + uniform(-0.1, 0.1), y_m, yaw_deg))
             return []
-        if self._generator.random() < TROLLEY_SHARE:
-            x, y = x + self._generator.uniform(-0.6, 0.6), head_y + inwards * self._generator.uniform(1.0, 4.0)
-            return [build_box((x, y), TROLLEY_M, yaw_deg=self._generator.uniform(0.0, 360.0))]
+        if self._generator.random() < LOT.trolley_share:
+            center_m = x_m + uniform(-0.6, 0.6), head_y_m + inwards * uniform(1.0, 4.0)
+            return [build_box(center_m, LOT.trolley_m, yaw_deg=uniform(0.0, 360.0))]
         return []
 
-    def _islands(self) -> tuple[list[Mesh], list[Mesh]]:
-        """Kerbed ends of the double row, each with trees."""
-        kerbs, trees = [], []
+    def _build_islands(self) -> tuple[list[Mesh], list[Mesh]]:
+        """Build the islands at the ends of the middle rows, and their trees."""
+        islands, trees = [], []
+        start_m = LOT.half_row_m + 0.3
         for side in (1, -1):
-            ends = sorted((side * (STALLS_M / 2 + 0.3), side * (STALLS_M / 2 + 0.3 + ISLAND_END_M)))
+            x0_m, x1_m = sorted((side * start_m, side * (start_m + LOT.island_length_m)))
             for half in (1, -1):
-                across = sorted((half * MIDDLE_WALKWAY_M / 2, half * (ISLAND_M - 0.5)))
-                kerbs.append(
-                    build_box_from_bounds(
-                        (ends[0], ends[1]), (across[0], across[1]), (0.0, PAVEMENT_M)
-                    ).assign_material("pavement")
-                )
-                trees += build_tree((sum(ends) / 2, sum(across) / 2), PAVEMENT_M, 2.3, 5.5, 1.3)
-        return kerbs, trees
+                y0_m, y1_m = sorted((half * LOT.middle_walkway_m / 2, half * (LOT.inner_edge_m - 0.5)))
+                island = build_box_from_bounds((x0_m, x1_m), (y0_m, y1_m), (0.0, PAVEMENT_M))
+                islands.append(island.assign_material("pavement"))
+                trees += build_tree(((x0_m + x1_m) / 2, (y0_m + y1_m) / 2), PAVEMENT_M, 2.3, 5.5, 1.3)
+        return islands, trees
 
-    def _bollards(self) -> list[Mesh]:
-        """Along both short sides, and in front of the building."""
-        ends = [
-            build_post((x, y), 0.08, 0.0, 0.9)
-            for x in (-BOLLARDS_AT_X_M, BOLLARDS_AT_X_M)
-            for y in np.arange(-EDGE_M + 1.0, EDGE_M, BOLLARD_EVERY_M)
+    def _build_bollards(self) -> list[Mesh]:
+        """Build bollards along both short sides and in front of the market."""
+        meshes = []
+        for x_m in (-LOT.bollard_x_m, LOT.bollard_x_m):
+            for y_m in np.arange(-LOT.edge_m + 1.0, LOT.edge_m, LOT.bollard_spacing_m):
+                meshes.append(build_post((x_m, y_m), 0.08, 0.0, 0.9))
+        for x_m in np.arange(-LOT.half_row_m, LOT.half_row_m, LOT.bollard_spacing_m):
+            meshes.append(build_post((x_m, LOT.building_y_m - 4.0), 0.1, 0.0, 0.9))
+        return meshes
+
+    def _build_surroundings(self) -> tuple[list[Mesh], shapely.Geometry]:
+        """Build low walls along the edges, planters, lamps and the market; also return the outline of the market."""
+        half_m, edge_m, market_y_m = LOT.half_row_m, LOT.edge_m, LOT.building_y_m
+        market_x_m, market_end_m = half_m + 5.0, market_y_m + 40.0
+        meshes = [
+            build_box_from_bounds((-half_m - 12.0, half_m + 12.0), (-edge_m - 0.2, -edge_m), (0.0, 0.6)),
+            build_box_from_bounds((-half_m - 12.0, -6.0), (edge_m, edge_m + 0.2), (0.0, 0.6)),
+            build_box_from_bounds((6.0, half_m + 12.0), (edge_m, edge_m + 0.2), (0.0, 0.6)),
+            build_box_from_bounds((-market_x_m, market_x_m), (market_y_m, market_end_m), (0.0, 7.5)),
         ]
-        front = [
-            build_post((x, BUILDING_AT_Y_M - 4.0), 0.1, 0.0, 0.9)
-            for x in np.arange(-STALLS_M / 2, STALLS_M / 2, BOLLARD_EVERY_M)
-        ]
-        return ends + front
-
-    def _surroundings(self) -> tuple[list[Mesh], shapely.Geometry]:
-        """Low walls along the edges, planters, and the market; and the market in plan."""
-        half = STALLS_M / 2
-        market = (-half - 5.0, half + 5.0), (BUILDING_AT_Y_M, BUILDING_AT_Y_M + 40.0)
-        pieces = [
-            build_box_from_bounds((-half - 12.0, half + 12.0), (-EDGE_M - 0.2, -EDGE_M), (0.0, 0.6)),
-            build_box_from_bounds((-half - 12.0, -6.0), (EDGE_M, EDGE_M + 0.2), (0.0, 0.6)),
-            build_box_from_bounds((6.0, half + 12.0), (EDGE_M, EDGE_M + 0.2), (0.0, 0.6)),
-            build_box_from_bounds(*market, (0.0, 7.5)),
-        ]
-        for x in np.linspace(-half, half, 5):
-            pieces.append(build_post((x, EDGE_M + 1.0), 0.1, 0.0, 7.0))
-            pieces.append(build_box((x + 5.0, BUILDING_AT_Y_M - 7.0), (1.6, 0.6, 0.5)))
-        return pieces, shapely.box(market[0][0], market[1][0], market[0][1], market[1][1])
+        for x_m in np.linspace(-half_m, half_m, 5):
+            meshes.append(build_post((x_m, edge_m + 1.0), 0.1, 0.0, 7.0))
+            meshes.append(build_box((x_m + 5.0, market_y_m - 7.0), (1.6, 0.6, 0.5)))
+        return meshes, shapely.box(-market_x_m, market_y_m, market_x_m, market_end_m)
 
 
-def _stall_x(column: int) -> float:
-    return (column + 0.5 - STALLS / 2) * STALL_WIDTH_M
+def _mark_all_visible(positions_m: Float64) -> Bools:
+    return np.ones(len(positions_m), dtype=bool)
 
 
-WARM_UP_S = 10.0
-ROUND_M, CORNER_RADIUS_M = 84.0, 6.0
-# Aisles are one-way, so that the loop runs down their middle.
-AISLE_MIDDLE_M = ISLAND_M + AISLE_M / 2
-# Where people wait, off the aisle's edges, and how far they keep from a car's middle.
-WAITING_OFF_AISLE_M = 1.8
-KEEP_AWAY_M = 6.0
-PATHS_APART_M = 1.2
+def _compute_flat_heights_m(positions_m: Float64) -> Float64:
+    return np.zeros(len(positions_m))
 
 
 class ParkingTraffic(ProceduralTraffic):
@@ -200,50 +261,57 @@ class ParkingTraffic(ProceduralTraffic):
     roadside_density: RoadsideDensity = 1.0
 
     def _build(self, fleet: Fleet, times_s: Float64, generator: np.random.Generator) -> SceneParts:
-        lanes = [Lane(build_rounded_rectangle(ROUND_M, 2 * AISLE_MIDDLE_M, CORNER_RADIUS_M))]
-        agents = self._traffic(lanes[0].centerline.length_m, fleet, generator)
-        flow = LaneSimulation(lanes, agents, TrafficSignals.create_empty()).run(times_s, WARM_UP_S)
-        driving = compute_body_trajectories(lanes, agents, flow.lane_positions_m)
+        loop_width_m = 2 * (LOT.inner_edge_m + LOT.aisle_m / 2)
+        lanes = [Lane(build_rounded_rectangle(LOT.loop_length_m, loop_width_m, LOT.corner_radius_m))]
+        agents = self._create_agents(lanes[0].centerline.length_m, fleet, generator)
+        flow = LaneSimulation(lanes, agents, TrafficSignals.create_empty()).run(times_s, LOT.warm_up_s)
+        cars = compute_body_trajectories(lanes, agents, flow.lane_positions_m)
         lot = ParkingLotBuilder(self, fleet, generator)
-        driver = build_ego_actor(times_s, driving, flow, 0, fleet.meshes[EGO], generator)
-        walking = _people(lot, driving, times_s, fleet, generator)
-        others = build_nearby_actors(times_s, [driving, walking], driver, fleet)
-        return lot.build_static_scenery(), driver, others
+        ego = build_ego_actor(times_s, cars, flow, 0, fleet.meshes[EGO], generator)
+        pedestrians = simulate_pedestrians(lot, cars, times_s, fleet, generator)
+        actors = build_nearby_actors(times_s, [cars, pedestrians], ego, fleet)
+        return lot.build_static_scenery(), ego, actors
 
-    def _traffic(self, round_m: float, fleet: Fleet, generator: np.random.Generator) -> list[Agent]:
-        """The ego, a car not far ahead of it, and the others spread over the rest of the loop."""
-        start, ahead = generator.uniform(0.0, round_m), generator.uniform(14.0, 24.0)
-        agents = [fleet.create_agent(EGO, 0, start, Driver(self.speed_mps, 1.5, 2.0, 0.8))]
+    def _create_agents(self, loop_m: float, fleet: Fleet, generator: np.random.Generator) -> list[Agent]:
+        """Create the ego vehicle, a car not far ahead of it, and other cars spread over the remaining loop."""
+        start_m, leader_gap_m = generator.uniform(0.0, loop_m), generator.uniform(14.0, 24.0)
+        agents = [fleet.create_agent(EGO, 0, start_m, Driver(self.speed_mps, 1.5, 2.0, 0.8))]
         for index in range(self.num_moving_cars):
             kind = fleet.sample_kind({"suv": 1.0, "sedan": 2.0, "hatchback": 2.0})
-            place = start + ahead + index * (round_m - ahead) / self.num_moving_cars
+            position_m = start_m + leader_gap_m + index * (loop_m - leader_gap_m) / self.num_moving_cars
             driver = fleet.sample_driver(Driver(0.9 * self.speed_mps, 1.5, 2.0, 0.8), 0.05)
-            agents.append(fleet.create_agent(kind, 0, place, driver))
+            agents.append(fleet.create_agent(kind, 0, position_m, driver))
         return agents
 
 
-def _people(
-    lot: ParkingLotBuilder, driving: BodyTrajectories, times_s: Float64, fleet: Fleet, generator: np.random.Generator
+def simulate_pedestrians(
+    lot: ParkingLotBuilder, cars: BodyTrajectories, times_s: Float64, fleet: Fleet, generator: np.random.Generator
 ) -> BodyTrajectories:
-    """People who cross the aisles between parked cars, and people on the walkways."""
-    step_s = float(times_s[1] - times_s[0])
-    found, half = [], STALLS_M / 2
-    along = [Footpath(np.array([-half, y]), np.array([half, y])) for y in WALKWAYS_M]
-    for path, crosses in [*((p, True) for p in _across_aisles(lot)), *((p, False) for p in along)]:
+    """Simulate pedestrians that cross the aisles between parked cars, and pedestrians on the walkways.
+
+    Args:
+        lot: The parking lot.
+        cars: Trajectories of the moving cars, for which pedestrians wait.
+        times_s: (T,) evenly spaced times.
+        fleet: Bodies.
+        generator: Random generator.
+    """
+    frame_interval_s = float(times_s[1] - times_s[0])
+    crossing_paths = lot.build_footpaths()
+    paths = list(crossing_paths)
+    half_m, outer_m = LOT.half_row_m, LOT.outer_head_m
+    # Tracks on the walkways, each for one person.
+    for y_m in (-0.45, 0.45, outer_m + 1.2, outer_m + 2.1, -outer_m - 1.2, -outer_m - 2.1):
+        paths.append(Footpath(np.array([-half_m, y_m]), np.array([half_m, y_m])))
+    pedestrians = []
+    for index, path in enumerate(paths):
         kind = fleet.sample_kind({"adult": 4.0, "child": 1.0})
-        takes_s = path.length_m / float(PEDESTRIAN.desired_speed_mps * generator.uniform(0.8, 1.1))
-        may_go = np.ones(len(times_s), dtype=bool)
-        if crosses:  # when no car is on the piece of the aisle that is crossed
-            distance = np.linalg.norm(driving.positions_m[..., :2] - (path.start_m + path.end_m) / 2, axis=2)
-            may_go = is_free_for((distance < KEEP_AWAY_M).any(axis=1), takes_s, step_s)
-        found.append((*simulate_walking(path, may_go, takes_s, times_s, fleet.get_length_m(kind) / 2, generator), kind))
-    return BodyTrajectories.from_bodies(found)
-
-
-def _across_aisles(lot: ParkingLotBuilder) -> list[Footpath]:
-    near, far = ISLAND_M - WAITING_OFF_AISLE_M, ISLAND_M + AISLE_M + WAITING_OFF_AISLE_M
-    return [
-        Footpath(np.array([x + shift, side * near]), np.array([x + shift, side * far]))
-        for side, x in lot.crossing_positions
-        for shift in (-PATHS_APART_M / 2, PATHS_APART_M / 2)
-    ]
+        traversal_s = path.length_m / float(PEDESTRIAN.desired_speed_mps * generator.uniform(0.8, 1.1))
+        can_start = np.ones(len(times_s), dtype=bool)
+        if index < len(crossing_paths):
+            distances_m = np.linalg.norm(cars.positions_m[..., :2] - (path.start_m + path.end_m) / 2, axis=2)
+            is_blocked = (distances_m < LOT.clear_distance_m).any(axis=1)
+            can_start = is_free_for(is_blocked, traversal_s, frame_interval_s)
+        radius_m = fleet.get_length_m(kind) / 2
+        pedestrians.append((*simulate_walking(path, can_start, traversal_s, times_s, radius_m, generator), kind))
+    return BodyTrajectories.from_bodies(pedestrians)

@@ -1,155 +1,73 @@
-"""The plan of a city: a main street with bends and turns, and streets that cross it at lights."""
+"""Street plan of a city: a main street with bends and turns, and streets that cross it at traffic signals."""
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple
 
 import numpy as np
 
 from torchcover.geometry.arrays import Bools, Float64, Int64
-from torchcover.simulation.traffic.alignment import Alignment, OffsetPath, StreetCorridor, compute_squared_distances_m2
+from torchcover.simulation.traffic.alignment import Alignment, OffsetPath, StreetCorridor
 from torchcover.simulation.traffic.flow import CROSS, MAIN, SPEED_LIMIT_SPACING_M, JunctionPassage, Lane, TrafficSignals
-
-# Between junctions no curve is tighter; crossings and stop lines lie on straights.
-SMALLEST_RADIUS_M = 110.0
-STRAIGHT_BESIDE_M = 8.0
-SHORTEST_BEND_M = 20.0
-TURN_DEG = (82.0, 98.0)
-# At the beginning and the end of a turn, over which the steering wheel is turned.
-RAMP_M = 8.0
-# At least so many blocks between two turns.
-TURNS_APART = 2
-# Stretches that are not neighbours keep apart; what is nearer along the street is one.
-APART_M, NEIGHBOURS_M = 70.0, 200.0
-DRAWS = 30
+from torchcover.simulation.traffic.main_street import MainStreet, sample_main_street
 
 
-class MainStreet(NamedTuple):
-    """`alignment` has station 0 at the origin, along x; `turn_directions` (J,) 1 to the left, -1 to the right, 0: straight on.
+@dataclass(frozen=True)
+class StreetParams:
+    """Dimensions of streets, junctions and sidewalks of a city.
 
-    `junction_half_lengths_m` (J,) is how far from its middle each junction ends.
+    Args:
+        bicycle_lane_m: Width of bicycle lanes.
+        gutter_m: Width between the lanes of a cross street and its curbs.
+        block_m: Smallest and largest distance between junctions.
+        stop_line_m: Distance of stop lines before the curb of the cross street.
+        crossing_end_m: Distance behind the curb of the cross street at which a rear end has left the crossing.
+        sidewalk_tracks_m: Distances from the curb at which pedestrians walk along the street, in each direction,
+            between posts and facades.
+        wait_offset_m: Distance from the curb at which pedestrians wait.
+        footpaths_m: Distances of the footpaths of a crossing from the end of the junction; each holds one person.
+        walking_mps: Speed of pedestrians, for the green that they need.
+        green_wave_mps: Speed of a green wave, about 40 km/h.
+        green_wave_error_s: Largest deviation of a signal from the green wave.
+        sight_m: Distance along a cross street that is visible from the main street.
+        half_vehicle_m: Half of the length of the longest vehicle, with a margin.
+        lateral_mps2: Comfortable lateral acceleration in curves.
+        braking_mps2: Comfortable braking before curves.
+        bus_half_length_m: Half of the length of a bus of 12 m.
+        bus_width_m: Width of a bus of 2.55 m, with a margin to pass another one in a turn.
     """
 
-    alignment: Alignment
-    turn_directions: Int64
-    junction_half_lengths_m: Float64
+    bicycle_lane_m: float = 1.8
+    gutter_m: float = 0.5
+    block_m: tuple[float, float] = (80.0, 130.0)
+    stop_line_m: float = 5.0
+    crossing_end_m: float = 4.0
+    sidewalk_tracks_m: tuple[float, float] = (1.35, 2.25)
+    wait_offset_m: float = 0.5
+    footpaths_m: tuple[float, ...] = (1.6, 2.5, 3.4)
+    walking_mps: float = 1.2
+    green_wave_mps: float = 11.0
+    green_wave_error_s: float = 9.0
+    sight_m: float = 270.0
+    half_vehicle_m: float = 9.0
+    lateral_mps2: float = 2.0
+    braking_mps2: float = 1.2
+    bus_half_length_m: float = 6.0
+    bus_width_m: float = 2.65
 
 
-def sample_main_street(
-    junction_stations_m: Float64,
-    junction_half_lengths_m: Float64,
-    max_bend_deg: float,
-    turn_share: float,
-    turn_radius_m: float,
-    half_length_m: float,
-    generator: np.random.Generator,
-) -> MainStreet:
-    """Draw one that never comes near itself, and that begins and ends `half_length_m` from the origin.
-
-    Each of the junctions, at (J,) stations, ends `junction_half_lengths_m` from its middle where the street goes straight on. It bends
-    by `max_bend_deg` at most between two of them, and from its first direction. Of those that may have a turn, which is
-    neither the first nor the last, `turn_share` have one.
-    """
-    for _ in range(DRAWS):
-        found = _draw(
-            junction_stations_m, junction_half_lengths_m, np.deg2rad(max_bend_deg), turn_share, turn_radius_m, generator
-        )
-        if found.alignment.is_straight or _keeps_apart(found.alignment, half_length_m):
-            return found
-    return MainStreet(
-        Alignment([0.0], [0.0]), np.zeros(len(junction_stations_m), dtype=np.int64), junction_half_lengths_m
-    )
-
-
-def _draw(
-    junctions_m: Float64,
-    halves_m: Float64,
-    bend: float,
-    turn_share: float,
-    radius_m: float,
-    generator: np.random.Generator,
-) -> MainStreet:
-    turns, halves_m = np.zeros(len(junctions_m), dtype=np.int64), halves_m.copy()
-    angles, quarter, last = np.zeros(len(junctions_m)), 0, -TURNS_APART
-    for index in range(1, len(junctions_m) - 1):
-        if index - last >= TURNS_APART and generator.random() < turn_share:
-            turns[index] = -quarter if quarter else generator.choice([-1, 1])
-            quarter, last = quarter + int(turns[index]), index
-            angles[index] = np.deg2rad(generator.uniform(*TURN_DEG))
-            halves_m[index] = (angles[index] * radius_m + RAMP_M) / 2
-    stations, curvatures = [0.0], [0.0]
-    aside = 0.0
-    ends_m = junctions_m + halves_m + STRAIGHT_BESIDE_M
-    following_m = junctions_m[1:] - halves_m[1:] - STRAIGHT_BESIDE_M
-    for index, middle_m in enumerate(junctions_m.tolist()):
-        if turns[index]:
-            half_m = float(halves_m[index])
-            _append(stations, curvatures, middle_m - half_m, 2 * half_m, RAMP_M, turns[index] / radius_m)
-        angle = generator.uniform(-bend, bend)
-        length_m = float(following_m[index] - ends_m[index]) if index < len(following_m) else 0.0
-        if length_m > SHORTEST_BEND_M and angle:
-            # A curve turns by its curvature times three quarters of its length.
-            most = 0.75 * length_m / SMALLEST_RADIUS_M
-            angle = float(np.clip(-angle if abs(aside + angle) > bend else angle, -most, most))
-            _append(stations, curvatures, float(ends_m[index]), length_m, length_m / 4, angle / (0.75 * length_m))
-            aside += angle
-    if len(stations) == 1:
-        return MainStreet(Alignment([0.0], [0.0]), turns, halves_m)
-    stations, curvatures = stations[1:], curvatures[1:]
-    # Begun anywhere, and then moved: the origin is where station 0 is.
-    x, y, yaw_deg = Alignment(stations, curvatures).compute_poses(0.0, 0.0)
-    yaw = np.deg2rad(yaw_deg)
-    start = (-x * np.cos(yaw) - y * np.sin(yaw), x * np.sin(yaw) - y * np.cos(yaw), -yaw)
-    return MainStreet(Alignment(stations, curvatures, start), turns, halves_m)
-
-
-def _append(
-    stations: list[float], curvatures: list[float], start: float, length: float, ramp: float, curvature: float
-) -> None:
-    """A curve: in, round, out."""
-    stations += [start, start + ramp, start + length - ramp, start + length]
-    curvatures += [0.0, curvature, curvature, 0.0]
-
-
-def _keeps_apart(street: Alignment, reach_m: float) -> bool:
-    stations = np.arange(-reach_m, reach_m, 20.0)
-    places_m = street.compute_poses(stations, 0.0)[:, :2]
-    far = np.abs(stations[:, None] - stations) > NEIGHBOURS_M
-    return bool((compute_squared_distances_m2(places_m, places_m)[far] > APART_M**2).all())
-
-
-BICYCLE_LANE_M = 1.8
-GUTTER_M = 0.5
-MIN_BLOCK_M, MAX_BLOCK_M = 80.0, 130.0
-
-# Along the way of whoever drives: stop line, crossing, carriageway of the other street, crossing.
-CROSSING_ENDS_M = 4.0
-STOP_LINE_M = 5.0
-# People walk at these distances from the kerb, each way on its own, between the posts and the facades.
-TRACKS_M = (1.35, 2.25)
-WAITING_BEHIND_KERB_M = 0.5
-# A crossing of the main street holds one person on each of these paths.
-FOOTPATHS_M = (1.6, 2.5, 3.4)
-WALKED_METRES_PER_GREEN_SECOND = 1.2
-
-# A wave of green that a car with 40 km/h would ride, with a good deal of disorder.
-GREEN_WAVE_MPS = 11.0
-WAVE_DISORDER_S = 9.0
-
-# What is farther away along a cross street than this is not seen from the main street.
-SIGHT_M = 270.0
-# Half of the longest vehicle, and a little more.
-LONGEST_HALF_M = 9.0
-
-# Across a curve, and before it.
-COMFORTABLE_MPS2, BRAKING_MPS2 = 2.0, 1.2
-# Two buses of 12 x 2.55 m, and a little air, pass each other in a turn.
-BUS_HALF_M, BUS_M = 6.0, 2.65
+STREETS = StreetParams()
 
 
 @dataclass(frozen=True)
 class CrossSection:
-    """The main street from its middle to the houses: lanes of one width, as all streets have, bays (or 0), sidewalk."""
+    """Cross section of the main street from its middle to the houses.
+
+    Args:
+        lanes_per_direction: Lanes in each direction.
+        lane_width_m: Width of the lanes of all streets.
+        bay_width_m: Width of the parking bays; 0 without bays.
+        sidewalk_width_m: Width of the sidewalks.
+    """
 
     lanes_per_direction: int
     lane_width_m: float = 3.25
@@ -158,27 +76,34 @@ class CrossSection:
 
     @property
     def bay_center_offset_m(self) -> float:
-        """From the middle of the street to that of its parking bays."""
-        return self.lanes_per_direction * self.lane_width_m + BICYCLE_LANE_M + self.bay_width_m / 2
+        """Distance from the middle of the street to the middle of its parking bays."""
+        return self.lanes_per_direction * self.lane_width_m + STREETS.bicycle_lane_m + self.bay_width_m / 2
 
     @property
     def curb_offset_m(self) -> float:
-        """From the middle of the street to its kerb."""
+        """Distance from the middle of the street to its curb."""
         return self.bay_center_offset_m + self.bay_width_m / 2
 
     @property
     def min_turn_radius_m(self) -> float:
-        """The smallest radius of the middle of a turn in which a bus keeps off the bus on the lane outside its own."""
-        inner, outer = BUS_M / 2, self.lane_width_m - BUS_M / 2
-        innermost_m = (BUS_HALF_M**2 + inner**2 - outer**2) / (2 * (outer - inner))
+        """Smallest radius of the middle of a turn in which two buses on neighboring lanes do not touch."""
+        inner_m, outer_m = STREETS.bus_width_m / 2, self.lane_width_m - STREETS.bus_width_m / 2
+        half_m = STREETS.bus_half_length_m
+        innermost_m = (half_m**2 + inner_m**2 - outer_m**2) / (2 * (outer_m - inner_m))
         return innermost_m + (self.lanes_per_direction - 0.5) * self.lane_width_m
 
 
 @dataclass(frozen=True, eq=False)
 class StreetPlan:
-    """Where the streets are: the course of the main street, and (J,) stations at which others of 1 or 2 lanes cross it.
+    """Main street and the J streets that cross it.
 
-    Lanes begin and end `half_length_m` from the origin: beyond what is driven in the run.
+    Args:
+        cross_section: Cross section of the main street.
+        junction_stations_m: (J,) stations of the main street at which other streets cross it.
+        cross_lanes_per_direction: (J,) 1 or 2 lanes of each cross street.
+        signals: Traffic signals of the junctions.
+        half_length_m: Distance from the origin to the ends of the lanes, which no agent reaches during a run.
+        main_street: Alignment and turns of the main street.
     """
 
     cross_section: CrossSection
@@ -190,127 +115,125 @@ class StreetPlan:
 
     @property
     def main_alignment(self) -> Alignment:
-        """The main street."""
+        """Alignment of the main street."""
         return self.main_street.alignment
 
     @property
     def has_lights(self) -> Bools:
-        """(J,) whether somebody crosses the main street there: not where it turns, and others give way."""
+        """(J,) junctions with signals; where the main street turns, it has priority."""
         return np.asarray(self.main_street.turn_directions == 0)
 
     @cached_property
     def cross_streets(self) -> list[Alignment]:
-        """J streets that cross the main street, at right angles; where it turns, the two that meet it go on straight.
+        """J cross streets with station 0 on the junction.
 
-        They have station 0 on the junction, to which a straight one comes from the right of the main street.
+        A straight one crosses the main street at right angles from its right side to its left side. Where the main
+        street turns, the other street is the same turn on the opposite side of the junction.
         """
-        streets, middles = [], self.main_alignment.compute_poses(self.junction_stations_m, 0.0)
-        for index, (station, half) in enumerate(
-            zip(self.junction_stations_m, self.main_street.junction_half_lengths_m, strict=True)
-        ):
+        streets, middle_poses = [], self.main_alignment.compute_poses(self.junction_stations_m, 0.0)
+        half_lengths_m = self.main_street.junction_half_lengths_m
+        for index, (station_m, half_m) in enumerate(zip(self.junction_stations_m, half_lengths_m, strict=True)):
             if self.main_street.turn_directions[index] == 0:
-                x, y, yaw_deg = middles[index]
+                x, y, yaw_deg = middle_poses[index]
                 streets.append(Alignment([0.0], [0.0], (x, y, np.deg2rad(yaw_deg + 90.0))))
                 continue
-            # The same turn, opposite of where the main street would go on to and come from.
-            (x, y, yaw_deg), (end_x, end_y, end_yaw_deg) = self.main_alignment.compute_poses(
-                [station - half, station + half], 0.0
-            )
+            start_pose, end_pose = self.main_alignment.compute_poses([station_m - half_m, station_m + half_m], 0.0)
+            (x, y, yaw_deg), (end_x, end_y, end_yaw_deg) = start_pose, end_pose
             yaw, angle = np.deg2rad([yaw_deg, end_yaw_deg - yaw_deg])
-            to_corner = np.hypot(end_x - x, end_y - y) / 2 / np.cos(angle / 2)
-            start = x + 2 * to_corner * np.cos(yaw), y + 2 * to_corner * np.sin(yaw), yaw + np.pi
-            knots = self.main_alignment.stations_m
-            of_turn = (knots >= station - half - 1e-6) & (knots <= station + half + 1e-6)
-            streets.append(Alignment(knots[of_turn] - station, self.main_alignment.curvatures_per_m[of_turn], start))
+            corner_distance_m = np.hypot(end_x - x, end_y - y) / 2 / np.cos(angle / 2)
+            start = x + 2 * corner_distance_m * np.cos(yaw), y + 2 * corner_distance_m * np.sin(yaw), yaw + np.pi
+            knots_m = self.main_alignment.stations_m
+            is_in_turn = (knots_m >= station_m - half_m - 1e-6) & (knots_m <= station_m + half_m + 1e-6)
+            curvatures_per_m = self.main_alignment.curvatures_per_m[is_in_turn]
+            streets.append(Alignment(knots_m[is_in_turn] - station_m, curvatures_per_m, start))
         return streets
 
     @property
     def cross_curb_offsets_m(self) -> Float64:
-        """(J,) from the middle of each cross street to its kerb, of those that meet in a turn, too."""
-        return np.asarray(self.cross_lanes_per_direction * self.cross_section.lane_width_m + GUTTER_M)
+        """(J,) distances from the middle of each cross street to its curb, also where the main street turns."""
+        return np.asarray(self.cross_lanes_per_direction * self.cross_section.lane_width_m + STREETS.gutter_m)
 
     @cached_property
     def cross_street_spans_m(self) -> Float64:
-        """(J, 2) stations between which a cross street, in all its width, is far from all others of its kind."""
-        whole = StreetCorridor(self.main_alignment, (-self.half_length_m, self.half_length_m))
-        edges_m = self.junction_stations_m + np.array([[-1.0], [1.0]]) * (
-            self.main_street.junction_half_lengths_m + 1.0
-        )
-        ends_m = np.empty((len(self.junction_stations_m), 2))
+        """(J, 2) stations between which a cross street with all its width keeps off all other stretches."""
+        corridor = StreetCorridor(self.main_alignment, (-self.half_length_m, self.half_length_m))
+        half_lengths_m = self.main_street.junction_half_lengths_m + 1.0
+        edges_m = self.junction_stations_m + np.array([[-1.0], [1.0]]) * half_lengths_m
+        spans_m = np.empty((len(self.junction_stations_m), 2))
         for column, side in enumerate((-1, 1)):
-            reach_m = (
-                whole.find_half_widths_m(edges_m.ravel(), side, self.cross_section.curb_offset_m, SIGHT_M)
-                .reshape(2, -1)
-                .min(axis=0)
+            if self.main_alignment.is_straight:
+                spans_m[:, column] = side * 2 * self.half_length_m
+                continue
+            widths_m = corridor.find_half_widths_m(
+                edges_m.ravel(), side, self.cross_section.curb_offset_m, STREETS.sight_m
             )
-            ends_m[:, column] = side * (
-                2 * self.half_length_m if self.main_alignment.is_straight else reach_m - LONGEST_HALF_M
-            )
-        return ends_m
+            spans_m[:, column] = side * (widths_m.reshape(2, -1).min(axis=0) - STREETS.half_vehicle_m)
+        return spans_m
 
     def build_traffic_lanes(self) -> list[Lane]:
-        """The lanes for motor traffic of the main street: eastbound from the median outwards, then westbound."""
-        offsets = [
-            (lane + 0.5) * self.cross_section.lane_width_m for lane in range(self.cross_section.lanes_per_direction)
-        ]
-        return [self._main_lane(offset, way, STOP_LINE_M) for way in (1, -1) for offset in offsets]
-
-    def build_bicycle_lanes(self) -> list[Lane]:
-        """One eastbound, one westbound."""
-        left_m = self.cross_section.lanes_per_direction * self.cross_section.lane_width_m + BICYCLE_LANE_M / 2
-        return [self._main_lane(left_m, way, STOP_LINE_M) for way in (1, -1)]
-
-    def build_sidewalk_lanes(self) -> list[Lane]:
-        """Tracks of the people who walk along the main street: each way on both sides."""
-        tracks = [
-            (self.cross_section.curb_offset_m + TRACKS_M[0], 1),
-            (self.cross_section.curb_offset_m + TRACKS_M[1], -1),
-        ]
-        return [self._main_lane(side * offset, way, 0.0) for side in (1, -1) for offset, way in tracks]
-
-    def build_cross_lanes(self) -> list[Lane]:
-        """The lanes of all cross streets: northbound ones on the east side, southbound ones on the west side."""
+        """Build the lanes of the main street: eastbound from the median outwards, then westbound."""
         lanes = []
-        for index in np.flatnonzero(self.has_lights).tolist():
-            middle, half = self.half_length_m, self.cross_section.curb_offset_m
-            gate = JunctionPassage(middle - half - STOP_LINE_M, middle + half + CROSSING_ENDS_M, index, CROSS)
-            for way in (1, -1):
-                for lane in range(self.cross_lanes_per_direction[index]):
-                    left_m = -way * (lane + 0.5) * self.cross_section.lane_width_m
-                    lanes.append(Lane(OffsetPath(self.cross_streets[index], left_m, way, self.half_length_m), (gate,)))
+        for direction in (1, -1):
+            for index in range(self.cross_section.lanes_per_direction):
+                lanes.append(self._build_main_lane((index + 0.5) * self.cross_section.lane_width_m, direction))
         return lanes
 
-    def _main_lane(self, right_m: float, way: int, stop_line_m: float) -> Lane:
-        """A lane of the main street to the right of its middle, eastbound (1) or westbound (-1).
+    def build_bicycle_lanes(self) -> list[Lane]:
+        """Build the bicycle lanes of the main street: eastbound, westbound."""
+        lanes_m = self.cross_section.lanes_per_direction * self.cross_section.lane_width_m
+        offset_m = lanes_m + STREETS.bicycle_lane_m / 2
+        return [self._build_main_lane(offset_m, direction) for direction in (1, -1)]
 
-        Whoever stops right at the kerb of the cross street (`stop_line_m` of 0) walks.
-        """
-        line = OffsetPath(self.main_alignment, -way * right_m, way, self.half_length_m)
-        walks = stop_line_m == 0.0
-        before = WAITING_BEHIND_KERB_M if walks else stop_line_m
-        behind = WAITING_BEHIND_KERB_M if walks else CROSSING_ENDS_M
-        gates = []
-        for index in np.argsort(way * self.junction_stations_m):
+    def build_sidewalk_lanes(self) -> list[Lane]:
+        """Build the tracks of pedestrians along the main street: both directions on each side."""
+        lanes = []
+        for side in (1, -1):
+            for track_m, direction in zip(STREETS.sidewalk_tracks_m, (1, -1), strict=True):
+                offset_m = side * (self.cross_section.curb_offset_m + track_m)
+                lanes.append(self._build_main_lane(offset_m, direction, is_sidewalk=True))
+        return lanes
+
+    def build_cross_lanes(self) -> list[Lane]:
+        """Build the lanes of all cross streets with signals: northbound ones on the east side, then southbound ones."""
+        lanes = []
+        middle_m, half_m = self.half_length_m, self.cross_section.curb_offset_m
+        stop_line_m = middle_m - half_m - STREETS.stop_line_m
+        exit_m = middle_m + half_m + STREETS.crossing_end_m
+        for index in np.flatnonzero(self.has_lights).tolist():
+            passage = JunctionPassage(stop_line_m, exit_m, index, CROSS)
+            for direction in (1, -1):
+                for lane in range(self.cross_lanes_per_direction[index]):
+                    left_m = -direction * (lane + 0.5) * self.cross_section.lane_width_m
+                    path = OffsetPath(self.cross_streets[index], left_m, direction, self.half_length_m)
+                    lanes.append(Lane(path, (passage,)))
+        return lanes
+
+    def _build_main_lane(self, right_m: float, direction: int, is_sidewalk: bool = False) -> Lane:
+        """Build a lane or a track at an offset to the right of the main street, eastbound (1) or westbound (-1)."""
+        path = OffsetPath(self.main_alignment, -direction * right_m, direction, self.half_length_m)
+        before_m = STREETS.wait_offset_m if is_sidewalk else STREETS.stop_line_m
+        behind_m = STREETS.wait_offset_m if is_sidewalk else STREETS.crossing_end_m
+        passages = []
+        for index in np.argsort(direction * self.junction_stations_m):
             if self.has_lights[index]:
-                middle, half = (
-                    float(line.convert_stations_to_distances_m(self.junction_stations_m[index])),
-                    self.main_street.junction_half_lengths_m[index],
-                )
-                enter, leave = middle - half - before, middle + half + behind
-                needed = (leave - enter) / WALKED_METRES_PER_GREEN_SECOND if walks else 0.0
-                gates.append(JunctionPassage(float(enter), float(leave), int(index), MAIN, float(needed)))
-        return Lane(line, tuple(gates), None if walks or self.main_alignment.is_straight else _limits_mps(line))
+                middle_m = float(path.convert_stations_to_distances_m(self.junction_stations_m[index]))
+                half_m = self.main_street.junction_half_lengths_m[index]
+                enter_m, exit_m = middle_m - half_m - before_m, middle_m + half_m + behind_m
+                min_green_s = (exit_m - enter_m) / STREETS.walking_mps if is_sidewalk else 0.0
+                passages.append(JunctionPassage(float(enter_m), float(exit_m), int(index), MAIN, float(min_green_s)))
+        has_limits = not (is_sidewalk or self.main_alignment.is_straight)
+        return Lane(path, tuple(passages), compute_speed_limits_mps(path) if has_limits else None)
 
 
-def _limits_mps(line: OffsetPath) -> Float64:
-    """(K,) how fast a lane may be driven, at each `SPEED_LIMIT_SPACING_M`: in curves, and before them."""
-    places = np.arange(0.0, line.length_m, SPEED_LIMIT_SPACING_M)
-    curvature = line.street.compute_curvatures_per_m(line.convert_distances_to_stations_m(places))
-    curvature = np.abs(curvature / (1.0 - curvature * line.left_m))
-    square = COMFORTABLE_MPS2 / np.maximum(curvature, 1e-6)
-    # Whoever brakes gently from here is slow enough wherever it is needed ahead.
-    braked = 2 * BRAKING_MPS2 * places
-    return np.asarray(np.sqrt(np.minimum.accumulate((square + braked)[::-1])[::-1] - braked))
+def compute_speed_limits_mps(path: OffsetPath) -> Float64:
+    """Compute the speeds (K,) at which a lane can be driven, every `SPEED_LIMIT_SPACING_M`: in curves and before."""
+    distances_m = np.arange(0.0, path.length_m, SPEED_LIMIT_SPACING_M)
+    curvature_per_m = path.street.compute_curvatures_per_m(path.convert_distances_to_stations_m(distances_m))
+    curvature_per_m = np.abs(curvature_per_m / (1.0 - curvature_per_m * path.left_m))
+    squared_speed = STREETS.lateral_mps2 / np.maximum(curvature_per_m, 1e-6)
+    # Gentle braking from here must suffice for every curve ahead.
+    braked = 2 * STREETS.braking_mps2 * distances_m
+    return np.asarray(np.sqrt(np.minimum.accumulate((squared_speed + braked)[::-1])[::-1] - braked))
 
 
 def sample_street_plan(
@@ -322,20 +245,36 @@ def sample_street_plan(
     generator: np.random.Generator,
     layout_generator: np.random.Generator,
 ) -> StreetPlan:
-    """Draw the cross streets and their lights. The origin lies halfway between two junctions."""
-    middle = generator.uniform(MIN_BLOCK_M, MAX_BLOCK_M) / 2
-    east, west = [middle], [-middle]
-    while east[-1] < span_m[1]:
-        east.append(east[-1] + generator.uniform(MIN_BLOCK_M, MAX_BLOCK_M))
-    while west[-1] > span_m[0]:
-        west.append(west[-1] - generator.uniform(MIN_BLOCK_M, MAX_BLOCK_M))
-    junctions = np.array(west[::-1] + east)
-    # Two-lane and four-lane streets in turn.
-    cross_lanes = 1 + (np.arange(len(junctions)) + generator.integers(2)) % 2
-    disorder = generator.uniform(-WAVE_DISORDER_S, WAVE_DISORDER_S, size=len(junctions))
-    signals = TrafficSignals(disorder - junctions / GREEN_WAVE_MPS + generator.uniform(0.0, 60.0))
-    halves = np.asarray(cross_lanes * cross_section.lane_width_m + GUTTER_M)
-    drawn = sample_main_street(
-        junctions, halves, max_bend_deg, turn_share, cross_section.min_turn_radius_m, half_length_m, layout_generator
+    """Sample the streets of a city. The origin is halfway between two junctions.
+
+    Args:
+        cross_section: Cross section of the main street.
+        max_bend_deg: Largest bend between two junctions.
+        turn_share: Share of the junctions at which the main street turns.
+        span_m: Stations between which there are junctions.
+        half_length_m: Distance from the origin to the ends of the lanes.
+        generator: Random generator of the junctions and their signals.
+        layout_generator: Random generator of bends and turns.
+    """
+    middle_m = generator.uniform(*STREETS.block_m) / 2
+    east_m, west_m = [middle_m], [-middle_m]
+    while east_m[-1] < span_m[1]:
+        east_m.append(east_m[-1] + generator.uniform(*STREETS.block_m))
+    while west_m[-1] > span_m[0]:
+        west_m.append(west_m[-1] - generator.uniform(*STREETS.block_m))
+    stations_m = np.array(west_m[::-1] + east_m)
+    # Two-lane and four-lane streets alternate.
+    cross_lanes = 1 + (np.arange(len(stations_m)) + generator.integers(2)) % 2
+    max_error_s = STREETS.green_wave_error_s
+    errors_s = generator.uniform(-max_error_s, max_error_s, size=len(stations_m))
+    signals = TrafficSignals(errors_s - stations_m / STREETS.green_wave_mps + generator.uniform(0.0, 60.0))
+    main_street = sample_main_street(
+        stations_m,
+        np.asarray(cross_lanes * cross_section.lane_width_m + STREETS.gutter_m),
+        max_bend_deg,
+        turn_share,
+        cross_section.min_turn_radius_m,
+        half_length_m,
+        layout_generator,
     )
-    return StreetPlan(cross_section, junctions, cross_lanes, signals, half_length_m, drawn)
+    return StreetPlan(cross_section, stations_m, cross_lanes, signals, half_length_m, main_street)
