@@ -254,7 +254,7 @@ def test_too_few_steps_for_errors_are_told_and_a_recording_has_no_reference_sens
         (["evaluate", "front_roof_128", "--thresholds-m", "inf"], "thresholds"),
         (
             ["evaluate", "front_roof_128", "--num-rays", "99999999999"],
-            "rays a step (230,400 of the rig's sensors, 99,999",
+            "rays per frame (230,400 of the rig's sensors, 99,999",
         ),
         (
             ["evaluate", "front_roof_128", "--num-frames", "9" * 20],

@@ -14,7 +14,8 @@ from torchcover.geometry import build_transform, convert_euler_to_rotation
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation import Scenario, Simulator, SurfaceReference
 from torchcover.simulation.bodies import Vehicle
-from torchcover.simulation.local_ground import LocalGround, find_ground_faces, find_level_faces
+from torchcover.simulation.ground_faces import find_ground_faces, find_level_faces
+from torchcover.simulation.local_ground import LocalGround
 from torchcover.simulation.reference_sensor import ReferenceContext
 from torchcover.simulation.scene import SceneGeometry
 from torchcover.simulation.shapes import Box, Cylinder, Mesh

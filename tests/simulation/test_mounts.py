@@ -38,7 +38,7 @@ def test_a_sensor_below_the_ground_is_refused_by_name(tmp_path, mount, speed_mps
 def test_a_sensor_far_from_the_vehicle_is_taken_for_one_in_other_units(tmp_path):
     # The box of the ego ends at 2 m ahead and 1 m up: 20 m from its upper front edge on either axis.
     assert len(simulator(tmp_path, {"x_m": 2.0, "z_m": 20.9}).simulate_frame(0).clouds["mine"]) > 0
-    with pytest.raises(ValueError, match=r"'top' at .* lies 1799 m away from the ego .*in metres.* millimetres\?"):
+    with pytest.raises(ValueError, match=r"'top' at .* lies 1799 m away from the ego .*in meters.* millimeters\?"):
         simulator(tmp_path, {"z_m": 1800.0}).simulate_frame(0)
     with pytest.raises(ValueError, match=r"'top' at .* lies 20 m away from the ego"):
         simulator(tmp_path, {"x_m": -22.1, "z_m": 0.5}).simulate_frame(0)

@@ -76,7 +76,7 @@ def test_a_camera_with_one_used_column_is_as_wide_as_a_pixel(stride):
 def test_more_rays_than_there_is_memory_for_are_refused_before_they_are_made(small):
     lidar = Lidar(name="a", channels=1000, columns=1000, **SPACED)
     scenario, rigs = Scenario.load("courtyard"), {"r": Rig(name="r", sensors=(lidar,))}
-    with pytest.raises(ValueError, match=r"1,000,012 rays a step \(1,000,000 of the rig's .*, 12 of the reference\)"):
+    with pytest.raises(ValueError, match=r"1,000,012 rays per frame \(1,000,000 of the rig's .*, 12 of the reference\)"):
         Simulator(scenario, rigs, PaperReference(rows=3, columns=4))
     fits = Simulator(scenario, {}, PaperReference(rows=3, columns=4))
     with pytest.raises(ValueError, match=r"1,000,000 of the reference\): 0.3 GB"):

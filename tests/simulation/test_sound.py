@@ -8,7 +8,8 @@ import trimesh
 
 from torchcover.geometry import build_transform
 from torchcover.simulation import SurfaceReference, shapes
-from torchcover.simulation.local_ground import GroundHeightPyramid, find_level_faces
+from torchcover.simulation.ground_faces import find_level_faces
+from torchcover.simulation.local_ground import GroundHeightPyramid
 from torchcover.simulation.patches import Patches, UprightBoxes, find_outward_faces
 from torchcover.simulation.scene import SceneGeometry
 from torchcover.simulation.shapes import Box, Ellipsoid, Mesh, Plane
@@ -104,7 +105,7 @@ def test_how_many_faces_are_looked_at_together_changes_nothing(monkeypatch):
 
     at_once = found()
     assert [int(mask.sum()) for mask in at_once[6:9]] == [20, 0, 20]
-    monkeypatch.setattr(shapes, "PART", 7)
+    monkeypatch.setattr(shapes, "FACES_PER_CHUNK", 7)
     for one, other in zip(at_once, found(), strict=True):
         np.testing.assert_array_equal(one, other)
 

@@ -6,7 +6,6 @@ import pytest
 from torchcover.simulation import CameraSensor, Lidar, Pose, Radar, Scenario, SensorNoise
 from torchcover.simulation.camera_sensor import Stereo
 from torchcover.simulation.rays import (
-    FEW,
     SearchSpheres,
     compute_ray_pixel_indices,
     compute_unit_directions,
@@ -17,6 +16,7 @@ from torchcover.simulation.sensor import ScanTimes
 from torchcover.simulation.sight import MountedSensor
 
 ROOF = Pose(x_m=0.45, z_m=1.73, yaw_deg=20, pitch_deg=3)
+MAX_SEPARATE_POINTS = 800  # default of SearchSpheres.from_points
 ERRS = {"range_noise_m": 0.05, "dropout": 0.1}
 ROWS = {"channels": 40, "vertical_fov_deg": (-60, 10), "horizontal_fov_deg": 360, "columns": 150, "max_range_m": 90}
 SENSORS = {
@@ -96,9 +96,11 @@ def test_of_many_places_neighbours_are_looked_at_together(scene, name):
     mounted, generator = MountedSensor(sensor, scene, 90.0), np.random.default_rng(9)
     full = mounted.scan(instant, SensorNoise(np.random.default_rng(7), num_rays=len(mounted.ray_pixel_indices)))
     ahead = full.points[(full.points[:, 0] > 2) & (np.abs(full.points[:, 1]) < 4)]
-    ahead_m = ahead[generator.integers(0, len(ahead), FEW + 1)] + generator.normal(0, 0.3, (FEW + 1, 3))
+    ahead_m = ahead[generator.integers(0, len(ahead), MAX_SEPARATE_POINTS + 1)] + generator.normal(
+        0, 0.3, (MAX_SEPARATE_POINTS + 1, 3)
+    )
     around, each = SearchSpheres.from_points(ahead_m, 0.4), SearchSpheres(ahead_m, 0.4)
-    assert 1 < len(around.centers_m) < FEW
+    assert 1 < len(around.centers_m) < MAX_SEPARATE_POINTS
     assert (
         (np.linalg.norm(ahead_m[:, None] - around.centers_m, axis=2) + 0.4 <= around.radius_m + 1e-9).any(axis=1).all()
     )
@@ -111,7 +113,7 @@ def test_of_many_places_neighbours_are_looked_at_together(scene, name):
     of_full, of_spared = is_near(full, each), is_near(spared, each)
     np.testing.assert_array_equal(full.points[of_full], spared.points[of_spared])
     assert 0.2 * full.num_rays < spared.num_omitted_rays
-    everywhere = SearchSpheres.from_points(generator.normal(0, 9, (FEW + 1, 3)), 4.0)
+    everywhere = SearchSpheres.from_points(generator.normal(0, 9, (MAX_SEPARATE_POINTS + 1, 3)), 4.0)
     assert mounted.scan(instant, SensorNoise(None), search_spheres=everywhere).num_omitted_rays == 0
 
 

@@ -59,7 +59,7 @@ def test_shuffled_steps_build_each_world_once(built):
 @pytest.mark.parametrize(("room_for", "workers"), [(0.5, 1), (2.5, 1), (2.5, 4)])
 def test_no_more_worlds_are_kept_than_the_budget_has_room_for(monkeypatch, built, room_for, workers):
     size = simulator().get_scene_geometry(0)[0].num_bytes
-    monkeypatch.setattr(stage, "find_memory_limit_bytes", lambda: room_for * size / stage.KEPT_SHARE)
+    monkeypatch.setattr(stage, "find_memory_limit_bytes", lambda: room_for * size / stage.SceneStoreParams().max_memory_share)
     monkeypatch.setattr(stage, "get_worker_info", lambda: SimpleNamespace(num_workers=workers))
     built.clear()
     made = simulator()

@@ -132,7 +132,7 @@ def test_rays_that_were_cast_for_the_clouds_end_where_they_are_cast_again(tmp_pa
     stage, instant = frames.simulator.prepare_frame(3)
     (mounted,) = stage.sensors_by_rig["small"]
     known = mounted.compute_ray_ends(instant)
-    monkeypatch.setattr(mounted, "_scanned", None)
+    monkeypatch.setattr(mounted, "_last_scan", None)
     anew = mounted.compute_ray_ends(instant)
     assert np.array_equal(known.range_m, anew.range_m)
     assert np.array_equal(known.is_hit, anew.is_hit)

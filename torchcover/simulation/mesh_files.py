@@ -1,16 +1,19 @@
-"""What trimesh reads, in a process of its own; see `apart`: nothing that loads torch may be imported here."""
+"""Reading of mesh files by trimesh in an isolated process, and triangulation of polygons.
+
+Nothing that loads torch may be imported here, since the isolated process imports this module.
+"""
 
 import gc
 import io
 import math
 import re
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,134 +24,169 @@ from torchcover.recordings.unsupported_formats import find_remedy
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]
 
-# Polygons whose corners are held at once.
-POLYGONS_AT_ONCE = 1 << 16
-# Areas below this share of the squared size of a polygon are rounding.
-AREA_TOLERANCE = 1e-9
-
 
 def triangulate(vertices: Float64, polygons: Sequence[Int64]) -> Int64:
     """Split polygons into triangles that cover exactly their area.
 
     Args:
         vertices: (V, 3) positions.
-        polygons: The vertex indices of each, in order around it; those with fewer than three corners have no triangle.
+        polygons: Vertex indices of each polygon, in order around it; fewer than three corners give no triangle.
 
     Returns:
         (T, 3) vertex indices; the triangles of each polygon are together, in the order of the polygons.
 
     Raises:
-        ValueError: An index that no vertex has.
+        ValueError: A polygon has an index that no vertex has.
 
     Example:
         >>> square = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
         >>> triangulate(square, [np.arange(4)]).tolist()
         [[0, 1, 2], [0, 2, 3]]
     """
+    polygons_per_chunk = 1 << 16  # bounds the memory for the corners of polygons of one size
     sizes = np.array([len(polygon) for polygon in polygons], dtype=np.int64)
-    starts = np.cumsum([0, *np.maximum(sizes - 2, 0)])
-    triangles = np.empty((starts[-1], 3), dtype=np.int64)
+    first_triangles = np.cumsum([0, *np.maximum(sizes - 2, 0)])
+    triangles = np.empty((first_triangles[-1], 3), dtype=np.int64)
     for size in np.unique(sizes[sizes > 2]).tolist():
-        of_size = np.flatnonzero(sizes == size)
-        for first in range(0, len(of_size), POLYGONS_AT_ONCE):
-            numbers = of_size[first : first + POLYGONS_AT_ONCE]
-            corners = np.stack([polygons[number] for number in numbers])
+        polygon_indices = np.flatnonzero(sizes == size)
+        for start in range(0, len(polygon_indices), polygons_per_chunk):
+            chunk = polygon_indices[start : start + polygons_per_chunk]
+            corners = np.stack([polygons[index] for index in chunk])
             if corners.min() < 0 or corners.max() >= len(vertices):
                 raise ValueError(f"faces have vertices {corners.min()} to {corners.max()}; there are {len(vertices)}")
-            local = _triangulate_alike(vertices[corners])
-            rows = starts[numbers][:, None] + np.arange(size - 2)
-            triangles[rows] = np.take_along_axis(corners[:, None], local, axis=2)
+            local_triangles = _triangulate_polygons_of_one_size(vertices[corners])
+            rows = first_triangles[chunk][:, None] + np.arange(size - 2)
+            triangles[rows] = np.take_along_axis(corners[:, None], local_triangles, axis=2)
     return triangles
 
 
 def find_bad_fans(corners: Float64) -> NDArray[np.bool_]:
-    """(P,) whether the triangles between the first corner and the sides of (P, n, 3) polygons cover more than these."""
-    return _turned(corners)[0]
+    """Find polygons that a triangle fan does not cover exactly, because one of its triangles is turned over.
+
+    Args:
+        corners: (P, n, 3) corners of polygons; a fan joins the first corner with all sides.
+
+    Returns:
+        (P,) True where a fan covers more than the polygon.
+    """
+    return _compute_fans(corners).is_bad
 
 
-def _turned(corners: Float64) -> tuple[NDArray[np.bool_], Float64, Float64]:
-    """Which polygons have a triangle of their fan turned over, (P, 3) unit normals, (P,) areas that are rounding."""
-    away = corners - corners[:, :1]
-    areas = np.cross(away[:, 1:-1], away[:, 2:])
-    normals = areas.sum(axis=1)  # Newell's: of all triangles of the fan, those that are turned over included
+class _Fans(NamedTuple):
+    """Properties of the triangle fans of P polygons.
+
+    Args:
+        is_bad: (P,) True where a triangle is turned over.
+        normals: (P, 3) unit normals of the polygons.
+        area_tolerance: (P,) areas up to which a sign is rounding.
+    """
+
+    is_bad: NDArray[np.bool_]
+    normals: Float64
+    area_tolerance: Float64
+
+
+def _compute_fans(corners: Float64) -> _Fans:
+    """Compute the properties of the fans of (P, n, 3) polygons."""
+    from_first = corners - corners[:, :1]
+    areas = np.cross(from_first[:, 1:-1], from_first[:, 2:])
+    # Newell's normal: the sum over all triangles of the fan, including those that are turned over.
+    normals = areas.sum(axis=1)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), np.finfo(np.float64).tiny)
-    tolerance = AREA_TOLERANCE * np.linalg.norm(np.ptp(corners, axis=1), axis=1) ** 2
-    return ((areas * normals[:, None]).sum(axis=2) < -tolerance[:, None]).any(axis=1), normals, tolerance
+    # Areas below this share of the squared size of a polygon are rounding.
+    area_tolerance = 1e-9 * np.linalg.norm(np.ptp(corners, axis=1), axis=1) ** 2
+    is_bad = ((areas * normals[:, None]).sum(axis=2) < -area_tolerance[:, None]).any(axis=1)
+    return _Fans(is_bad, normals, area_tolerance)
 
 
-def _triangulate_alike(corners: Float64) -> Int64:
-    """(P, n - 2, 3) corner numbers of the triangles of (P, n, 3) polygons: a fan where that is right, else ears."""
-    polygons, size, _ = corners.shape
+def _triangulate_polygons_of_one_size(corners: Float64) -> Int64:
+    """Compute (P, n - 2, 3) corner numbers of triangles of (P, n, 3) polygons: a fan if exact, else ear clipping."""
+    num_polygons, size, _ = corners.shape
     fan = np.stack([np.zeros(size - 2, dtype=np.int64), np.arange(1, size - 1), np.arange(2, size)], axis=1)
-    triangles = np.tile(fan, (polygons, 1, 1))
-    is_turned, normals, tolerance = _turned(corners)
-    for number in np.flatnonzero(is_turned).tolist():
-        normal = normals[number]
-        first = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
-        first /= np.linalg.norm(first)
-        points = corners[number] @ np.stack([first, np.cross(normal, first)], axis=1)
-        triangles[number] = _clip_ears(points - points[0], tolerance[number])
+    triangles = np.tile(fan, (num_polygons, 1, 1))
+    is_bad, normals, area_tolerance = _compute_fans(corners)
+    for index in np.flatnonzero(is_bad).tolist():
+        normal = normals[index]
+        first_axis = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
+        first_axis /= np.linalg.norm(first_axis)
+        points = corners[index] @ np.stack([first_axis, np.cross(normal, first_axis)], axis=1)
+        triangles[index] = _clip_ears(points - points[0], area_tolerance[index])
     return triangles
 
 
-def _clip_ears(points: Float64, tolerance: float) -> list[tuple[int, int, int]]:
-    """Corner numbers of the n - 2 triangles of an (n, 2) polygon that runs counterclockwise (Meisters 1975)."""
+def _clip_ears(points: Float64, area_tolerance: float) -> list[tuple[int, int, int]]:
+    """Triangulate an (n, 2) polygon that runs counter-clockwise by ear clipping (Meisters 1975).
+
+    Returns:
+        Corner numbers of the n - 2 triangles.
+    """
     triangles = []
-    left = list(range(len(points)))
-    position = 0
-    while len(left) > 3:
-        for step in range(len(left)):
-            at = (position + step) % len(left)
-            ear = left[at - 1], left[at], left[(at + 1) % len(left)]
-            if _is_ear(points, ear, left, tolerance):
+    remaining = list(range(len(points)))
+    start = 0
+    while len(remaining) > 3:
+        for offset in range(len(remaining)):
+            tip = (start + offset) % len(remaining)
+            ear = _get_ear(remaining, tip)
+            if _is_ear(points, ear, remaining, area_tolerance):
                 break
         else:  # the polygon crosses itself: the flattest corner does the least harm
-            areas = [abs(_turn(*points[[left[k - 1], left[k], left[(k + 1) % len(left)]]])) for k in range(len(left))]
-            at = int(np.argmin(areas))
-            ear = left[at - 1], left[at], left[(at + 1) % len(left)]
+            ears = [_get_ear(remaining, tip) for tip in range(len(remaining))]
+            areas = [abs(_compute_doubled_area(*points[list(ear)])) for ear in ears]
+            tip = int(np.argmin(areas))
+            ear = ears[tip]
         triangles.append(ear)
-        del left[at]
-        position = at - 1
-    a, b, c = left
+        del remaining[tip]
+        start = tip - 1
+    a, b, c = remaining
     return [*triangles, (a, b, c)]
 
 
-def _is_ear(points: Float64, ear: tuple[int, int, int], left: list[int], tolerance: float) -> bool:
-    """Whether a corner can be cut off: it is convex, and no other corner lies in its triangle or on its edges."""
+def _get_ear(corners: list[int], tip: int) -> tuple[int, int, int]:
+    """Get the corner at a position with its two neighbors."""
+    return corners[tip - 1], corners[tip], corners[(tip + 1) % len(corners)]
+
+
+def _is_ear(points: Float64, ear: tuple[int, int, int], remaining: list[int], area_tolerance: float) -> bool:
+    """Return True if a corner is convex and no other corner lies in its triangle or on its edges."""
     a, b, c = points[list(ear)]
-    if _turn(a, b, c) <= tolerance:
+    if _compute_doubled_area(a, b, c) <= area_tolerance:
         return False
-    others = points[left]
-    others = others[~((others[:, None] == (a, b, c)).all(axis=2)).any(axis=1)]
-    inside = [_turn(start, end, others) >= -tolerance for start, end in ((a, b), (b, c), (c, a))]
-    return not np.all(inside, axis=0).any()
+    candidates = points[remaining]
+    candidates = candidates[~((candidates[:, None] == (a, b, c)).all(axis=2)).any(axis=1)]
+    is_inside_edge = [
+        _compute_doubled_area(start, end, candidates) >= -area_tolerance for start, end in ((a, b), (b, c), (c, a))
+    ]
+    return not np.all(is_inside_edge, axis=0).any()
 
 
-def _turn(a: Float64, b: Float64, c: Float64) -> Float64:
-    """Twice the signed area of triangles a, b, c; positive if they turn left."""
+def _compute_doubled_area(a: Float64, b: Float64, c: Float64) -> Float64:
+    """Compute twice the signed area of triangles a, b, c in 2D; positive if they turn left."""
     return np.asarray((b[0] - a[0]) * (c[..., 1] - a[1]) - (b[1] - a[1]) * (c[..., 0] - a[0]))
 
 
-# Faces of an OBJ file with four corners or more, those with indices that count back from the last vertex, and what
-# follows the index of the position in a corner.
-OBJ_POLYGON = re.compile(rb"^[ \t]*f(?:(?:[ \t]+[^\s#]+){4}|[^\n#]*[\s/]-)", re.MULTILINE)
-OBJ_BACKWARDS = re.compile(rb"^[ \t]*f[^\n#]*[\s/]-", re.MULTILINE)
-OBJ_TEXTURE = re.compile(rb"/\S*")
+class _MeshPart(NamedTuple):
+    """One mesh of a file: vertices in meters, (F, 3) faces, names of object and material, and transparency."""
 
-# Compressed glTF whose uncompressed accessors are placeholders; trimesh would go on with these.
-COMPRESSED_GLTF = re.compile(rb'"extensionsRequired"\s*:\s*\[[^\]]*"(KHR_draco_mesh|(?:EXT|KHR)_meshopt)_compression"')
-# How to install modules that are called otherwise than their packages.
-PACKAGES = {"collada": "'torchcover[urdf]'", "openctm": "python-openctm"}
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int64]
+    names: tuple[str, str]
+    is_transparent: bool
 
 
 @run_isolated
 def read_mesh_arrays(path: Path) -> dict[str, NDArray[Any]]:
-    """All meshes of a file of any format of trimesh's.
+    """Read all meshes of a file in any format of trimesh.
+
+    Args:
+        path: Mesh file.
 
     Returns:
-        `vertices` (V, 3) float64 and `faces` (F, 3) int64; `part` (F,) int64, which part each face belongs to; of each
-        of the P parts `names` (P, 2), those of its object and material, and `is_clear` (P,), whether the material is
-        partly transparent.
+        `vertices` (V, 3) float64 and `faces` (F, 3) int64; `part` (F,) int64, the part of each face; for each of the P
+        parts `names` (P, 2), object and material, and `is_clear` (P,), True for a partly transparent material.
+
+    Raises:
+        ValueError: The format is not supported, or the file is damaged.
+        ImportError: The format needs a package that is not installed.
     """
     try:
         parts = list(_read_parts(path))
@@ -156,164 +194,191 @@ def read_mesh_arrays(path: Path) -> dict[str, NDArray[Any]]:
         raise
     except ModuleNotFoundError as error:
         module = str(error).split("'")[1].partition(".")[0]  # trimesh raises a copy of the error without its name
-        package = PACKAGES.get(module, module)
+        packages = {"collada": "'torchcover[urdf]'", "openctm": "python-openctm"}  # names other than the module's
+        package = packages.get(module, module)
         raise ImportError(f"{path}: {path.suffix} needs {module}: pip install {package}") from error
     except NotImplementedError as error:
         remedy = find_remedy(path) or "export it as GLB, OBJ, PLY or STL, as by Blender"
         raise ValueError(f"{path.suffix or 'a file without a suffix'} is no mesh that can be read; {remedy}") from error
     except Exception as error:  # trimesh raises whatever the reader of the format raises
         raise ValueError(f"trimesh cannot read it as a mesh ({error})") from error
-    offsets = np.cumsum([0, *(len(vertices) for vertices, *_ in parts)])
-    faces = [faces + offset for (_, faces, *_), offset in zip(parts, offsets, strict=False)]
+    first_vertices = np.cumsum([0, *(len(part.vertices) for part in parts)])
+    faces = [part.faces + first for part, first in zip(parts, first_vertices, strict=False)]
     arrays = {
-        "vertices": np.concatenate([np.empty((0, 3)), *(vertices for vertices, *_ in parts)]),
+        "vertices": np.concatenate([np.empty((0, 3)), *(part.vertices for part in parts)]),
         "faces": np.concatenate([np.empty((0, 3), dtype=np.int64), *faces]),
-        "part": np.repeat(np.arange(len(parts)), [len(of_part) for of_part in faces]),
-        "names": np.array([names for _, _, names, _ in parts], dtype=str).reshape(-1, 2),
-        "is_clear": np.array([is_clear for *_, is_clear in parts], dtype=bool),
+        "part": np.repeat(np.arange(len(parts)), [len(part_faces) for part_faces in faces]),
+        "names": np.array([part.names for part in parts], dtype=str).reshape(-1, 2),
+        "is_clear": np.array([part.is_transparent for part in parts], dtype=bool),
     }
     del parts, faces
-    gc.collect()  # it stands in a circle with what it was read from, four times as large as the mesh
+    gc.collect()  # a reference cycle holds the source data, four times as large as the mesh
     return arrays
 
 
-def _read_parts(path: Path) -> Iterator[tuple[NDArray[np.float64], NDArray[np.int64], tuple[str, str], bool]]:
-    """Vertices, triangles, names and transparency of each mesh of a file."""
+def _read_parts(path: Path) -> Iterator[_MeshPart]:
+    """Read the meshes of a file one by one."""
     import trimesh
 
-    kind = path.suffix.lstrip(".").lower()
-    if kind == "dae":
-        with suppress(ImportError):  # trimesh says that it is missing
-            _triangulate_collada()
-    # What trimesh asks for the encoding of text that is not UTF-8.
-    latin_1 = ModuleType("charset_normalizer")
-    vars(latin_1)["detect"] = lambda _: {"encoding": "latin-1", "confidence": 0.0}
-    sys.modules["charset_normalizer"] = latin_1
+    file_type = path.suffix.lstrip(".").lower()
+    if file_type == "dae":
+        with suppress(ImportError):  # trimesh reports that it is missing
+            _use_exact_triangulation_in_collada()
+    # trimesh asks this module for the encoding of text that is not UTF-8.
+    encoding_detector = ModuleType("charset_normalizer")
+    vars(encoding_detector)["detect"] = _detect_latin_1
+    sys.modules["charset_normalizer"] = encoding_detector
     data = path.read_bytes()
-    if kind == "obj":
-        data = _obj_with_triangles(data)
-    if (compressed := COMPRESSED_GLTF.search(data)) and kind in ("glb", "gltf"):
-        if b"draco" not in compressed[1]:
-            raise ValueError(f"it is compressed by {compressed[1].decode()}_compression; export it without")
-        import_module("DracoPy")
-    unit_m = _read_unit_m(data) if kind == "dae" else 1.0
-    scene = trimesh.load_scene(io.BytesIO(data), file_type=kind, process=False, resolver=_parts_of(path))
+    if file_type == "obj":
+        data = _triangulate_obj(data)
+    if file_type in ("glb", "gltf"):
+        _check_gltf_compression(data)
+    unit_m = _read_unit_m(data) if file_type == "dae" else 1.0
+    scene = trimesh.load_scene(io.BytesIO(data), file_type=file_type, process=False, resolver=_create_resolver(path))
     for mesh in scene.dump():
         if not isinstance(mesh, trimesh.Trimesh):
             continue
         vertices, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
-        if kind == "ply":
-            vertices, faces = _with_ply_polygons(mesh, vertices, faces)
-        elif kind == "off":
-            faces = triangulate(vertices, list(_off_polygons(data.decode("utf-8", "replace"))))
+        if file_type == "ply":
+            vertices, faces = _triangulate_ply(mesh, vertices, faces)
+        elif file_type == "off":
+            faces = triangulate(vertices, list(_read_off_polygons(data.decode("utf-8", "replace"))))
         material = getattr(mesh.visual, "material", None)
         names = str(mesh.metadata.get("name", "")), str(getattr(material, "name", None) or "")
-        yield vertices * unit_m, faces, names, _is_clear(material)
+        yield _MeshPart(vertices * unit_m, faces, names, _is_transparent(material))
+
+
+def _detect_latin_1(data: bytes) -> dict[str, Any]:
+    """Report Latin-1, which decodes any bytes, in place of `charset_normalizer.detect`."""
+    return {"encoding": "latin-1", "confidence": 0.0}
+
+
+def _check_gltf_compression(data: bytes) -> None:
+    """Refuse compressed glTF that cannot be decompressed: trimesh would read its placeholder arrays."""
+    pattern = rb'"extensionsRequired"\s*:\s*\[[^\]]*"(KHR_draco_mesh|(?:EXT|KHR)_meshopt)_compression"'
+    compression = re.search(pattern, data)
+    if compression is None:
+        return
+    if b"draco" not in compression[1]:
+        raise ValueError(f"it is compressed by {compression[1].decode()}_compression; export it without")
+    import_module("DracoPy")
 
 
 def _read_unit_m(data: bytes) -> float:
-    """Meters of a unit of a COLLADA file, which states it; trimesh ignores it."""
-    stated = re.search(rb"<unit\b[^>]*\bmeter\s*=\s*[\"']([^\"']+)", data[:100_000])
-    unit_m = float(stated[1]) if stated else 1.0
+    """Read the unit of a COLLADA file in meters; trimesh ignores it."""
+    unit = re.search(rb"<unit\b[^>]*\bmeter\s*=\s*[\"']([^\"']+)", data[:100_000])
+    unit_m = float(unit[1]) if unit else 1.0
     if not 0.0 < unit_m < math.inf:
         raise ValueError(f"its unit of {unit_m:g} m is no positive number")
     return unit_m
 
 
-def _is_clear(material: object) -> bool:
-    """Whether a glTF material blends with what is behind it, or an MTL material is not opaque."""
-    keys = getattr(material, "kwargs", None) or {}
-    opacity = float(keys["d"][-1]) if "d" in keys else 1.0 - float(keys["tr"][0]) if "tr" in keys else 1.0
+def _is_transparent(material: object) -> bool:
+    """Return True if a glTF material blends with its background, or an MTL material is not opaque."""
+    mtl_keys = getattr(material, "kwargs", None) or {}
+    opacity = 1.0
+    if "d" in mtl_keys:
+        opacity = float(mtl_keys["d"][-1])
+    elif "tr" in mtl_keys:
+        opacity = 1.0 - float(mtl_keys["tr"][0])
     return getattr(material, "alphaMode", None) == "BLEND" or opacity < 1.0
 
 
-def _obj_with_triangles(data: bytes) -> bytes:
-    """The text of an OBJ file whose polygons are triangles unless a fan covers them, and whose indices are positive."""
+def _triangulate_obj(data: bytes) -> bytes:
+    """Replace polygons of an OBJ file that a fan does not cover by triangles, and make vertex indices positive."""
     data = data.replace(b"\r\n", b"\n").replace(b"\\\n", b"")
-    if not OBJ_POLYGON.search(data):
+    has_negative_indices = re.search(rb"^[ \t]*f[^\n#]*[\s/]-", data, re.MULTILINE)
+    has_polygons = re.search(rb"^[ \t]*f(?:[ \t]+[^\s#]+){4}", data, re.MULTILINE)
+    if not has_negative_indices and not has_polygons:
         return data
     lines = [line.lstrip() for line in data.split(b"\n")]
-    if OBJ_BACKWARDS.search(data):
-        _count_from_first(lines)
+    if has_negative_indices:
+        _make_obj_indices_positive(lines)
     # Numbers go straight into arrays: lists of words would take several times the memory of the text.
     coordinates = (float(word) for line in lines if line.startswith(b"v ") for word in line.split()[1:4])
     positions = np.fromiter(coordinates, dtype=np.float64).reshape(-1, 3)
-    faces = np.array([k for k, line in enumerate(lines) if line.startswith((b"f ", b"f\t"))])
-    sizes = np.array([len(_corners_of(lines[k])) for k in faces])
+    face_lines = np.array([number for number, line in enumerate(lines) if line.startswith((b"f ", b"f\t"))])
+    sizes = np.array([len(_split_corners(lines[number])) for number in face_lines])
     for size in np.unique(sizes[sizes > 3]).tolist():
-        of_size = faces[sizes == size]
-        words = b" ".join(b" ".join(_corners_of(lines[k])) for k in of_size)
-        # The index of the position is what stands before the first slash.
-        polygons = np.fromstring(OBJ_TEXTURE.sub(b"", words), dtype=np.int64, sep=" ").reshape(-1, size) - 1
+        polygon_lines = face_lines[sizes == size]
+        words = b" ".join(b" ".join(_split_corners(lines[number])) for number in polygon_lines)
+        # The index of the position stands before the first slash.
+        position_indices = re.sub(rb"/\S*", b"", words)
+        polygons = np.fromstring(position_indices, dtype=np.int64, sep=" ").reshape(-1, size) - 1
         if polygons.min() < 0 or polygons.max() >= len(positions):
             raise ValueError(f"faces have vertices up to {polygons.max() + 1}; there are {len(positions)}")
-        for k in np.flatnonzero(find_bad_fans(positions[polygons])).tolist():
-            corners = _corners_of(lines[of_size[k]])
-            triangles = triangulate(positions[polygons[k]], [np.arange(size)])
-            of_face = (b"f " + b" ".join(corners[c] for c in triangle) for triangle in triangles.tolist())
-            lines[of_size[k]] = b"\n".join(of_face)
+        for polygon in np.flatnonzero(find_bad_fans(positions[polygons])).tolist():
+            corners = _split_corners(lines[polygon_lines[polygon]])
+            triangles = triangulate(positions[polygons[polygon]], [np.arange(size)])
+            triangle_lines = [b"f " + b" ".join(corners[k] for k in triangle) for triangle in triangles.tolist()]
+            lines[polygon_lines[polygon]] = b"\n".join(triangle_lines)
     return b"\n".join(lines)
 
 
-def _corners_of(line: bytes) -> list[bytes]:
-    """The words `v/vt/vn` of a face."""
+def _split_corners(line: bytes) -> list[bytes]:
+    """Split the line of an OBJ face into its words `v/vt/vn`."""
     return line.partition(b"#")[0].split()[1:]
 
 
-def _count_from_first(lines: list[bytes]) -> None:
-    """Let the indices of all faces count from the first vertex; negative ones count back from the last one so far."""
+def _make_obj_indices_positive(lines: list[bytes]) -> None:
+    """Replace negative indices of OBJ faces, which count back from the last vertex so far, in place."""
     counts = {b"v": 0, b"vt": 0, b"vn": 0}
     for number, line in enumerate(lines):
         key, *words = line.partition(b"#")[0].split() or [b""]
         if key in counts:
             counts[key] += 1
         elif key == b"f":
-            lasts = tuple(counts.values())
-            corners = [
-                b"/".join(
-                    b"%d" % (int(index) + last + 1) if index.startswith(b"-") else index
-                    for index, last in zip(word.split(b"/"), lasts, strict=False)
-                )
-                for word in words
-            ]
+            corners = []
+            for word in words:
+                indices = word.split(b"/")
+                for position, (index, count) in enumerate(zip(indices, counts.values(), strict=False)):
+                    if index.startswith(b"-"):
+                        indices[position] = b"%d" % (int(index) + count + 1)
+                corners.append(b"/".join(indices[: len(counts)]))
             lines[number] = b"f " + b" ".join(corners)
 
 
-def _with_ply_polygons(
+def _triangulate_ply(
     mesh: Any,  # noqa: ANN401  (trimesh has no types)
     vertices: NDArray[np.float64],
     faces: NDArray[np.int64],
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Vertices and triangles of a PLY file from what it holds, if that is polygons, of which trimesh makes fans."""
+    """Triangulate the polygons of a PLY file from its raw content, since trimesh makes fans of them.
+
+    Returns:
+        Vertices and triangles; the arguments themselves if the file has triangles only.
+    """
     raw = mesh.metadata.get("_ply_raw", {})
-    of_faces, of_vertices = (raw.get(key, {}).get("data") for key in ("face", "vertex"))
-    names = of_faces.keys() if isinstance(of_faces, dict) else getattr(of_faces.dtype, "names", None) or ()
-    name = next((name for name in ("vertex_index", "vertex_indices") if name in names), None)
-    if name is None and not (isinstance(of_faces, np.ndarray) and of_faces.ndim == 2):
+    raw_faces, raw_vertices = (raw.get(key, {}).get("data") for key in ("face", "vertex"))
+    names = raw_faces.keys() if isinstance(raw_faces, dict) else getattr(raw_faces.dtype, "names", None) or ()
+    if name := next((name for name in ("vertex_index", "vertex_indices") if name in names), None):
+        polygon_lists = raw_faces[name]
+    elif isinstance(raw_faces, np.ndarray) and raw_faces.ndim == 2:
+        polygon_lists = raw_faces
+    else:
         return vertices, faces
-    lists: Iterable[Any] = of_faces if name is None else of_faces[name]
-    if getattr(getattr(lists, "dtype", None), "names", None):
-        lists = of_faces[name]["f1"]
-    if isinstance(lists, np.ndarray) and lists.shape[1:] == (3,):
+    if getattr(getattr(polygon_lists, "dtype", None), "names", None):
+        polygon_lists = polygon_lists["f1"]
+    if isinstance(polygon_lists, np.ndarray) and polygon_lists.shape[1:] == (3,):
         return vertices, faces
-    polygons = [np.asarray(corners, dtype=np.int64).ravel() for corners in lists]
+    polygons = [np.asarray(corners, dtype=np.int64).ravel() for corners in polygon_lists]
     if all(len(polygon) == 3 for polygon in polygons):
         return vertices, faces
-    vertices = np.column_stack([of_vertices[axis] for axis in "xyz"]).astype(np.float64)
+    vertices = np.column_stack([raw_vertices[axis] for axis in "xyz"]).astype(np.float64)
     return vertices, triangulate(vertices, polygons)
 
 
-def _off_polygons(text: str) -> Iterator[NDArray[np.int64]]:
-    """The vertex indices of each face of an OFF file, which trimesh has found to be one."""
+def _read_off_polygons(text: str) -> Iterator[NDArray[np.int64]]:
+    """Read the vertex indices of each face of an OFF file that trimesh has accepted."""
     text = re.split("C?OFF", text, maxsplit=1)[1]
     rows = [words for line in text.splitlines() if (words := line.partition("#")[0].split())]
-    vertices, faces = int(rows[0][0]), int(rows[0][1])
-    for words in rows[vertices + 1 : vertices + faces + 1]:
+    num_vertices, num_faces = int(rows[0][0]), int(rows[0][1])
+    for words in rows[num_vertices + 1 : num_vertices + num_faces + 1]:
         yield np.array(words[1 : int(words[0]) + 1], dtype=np.int64)
 
 
-def _triangulate_collada() -> None:
-    """Let pycollada triangulate polygons as here, in place of fans; this process reads meshes and nothing else."""
+def _use_exact_triangulation_in_collada() -> None:
+    """Replace the fans of pycollada by `triangulate`; this process reads meshes and nothing else."""
     from collada.polylist import Polylist
     from collada.triangleset import TriangleSet
 
@@ -328,17 +393,17 @@ def _triangulate_collada() -> None:
     Polylist.triangleset = triangleset
 
 
-def _parts_of(path: Path) -> object:
-    """Where a mesh finds what it refers to, such as its buffers: regular files below its folder, and not too large."""
+def _create_resolver(path: Path) -> object:
+    """Create a trimesh resolver that reads only regular files of limited size below the folder of the mesh."""
     from trimesh.resolvers import FilePathResolver
 
-    class Parts(FilePathResolver):  # type: ignore[misc]  # trimesh has no types
+    class FolderResolver(FilePathResolver):  # type: ignore[misc]  # trimesh has no types
         def get(self, name: str) -> bytes:
-            place = (path.parent / name.strip()).resolve()
-            if not place.is_relative_to(path.parent.resolve()):
+            part_path = (path.parent / name.strip()).resolve()
+            if not part_path.is_relative_to(path.parent.resolve()):
                 raise ValueError(f"it refers to {name}, outside of its folder")
-            check_regular(place, "a part of a mesh")
-            check_memory(place.stat().st_size)
-            return place.read_bytes()
+            check_regular(part_path, "a part of a mesh")
+            check_memory(part_path.stat().st_size)
+            return part_path.read_bytes()
 
-    return Parts(path)
+    return FolderResolver(path)

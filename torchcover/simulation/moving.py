@@ -1,4 +1,4 @@
-"""Bodies that move: the geometry of each kind, made once for all that share a mesh, and all placed at one instant."""
+"""Moving bodies: geometry of each kind of body, shared by all bodies with the same mesh, and their poses in a frame."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,9 +13,8 @@ from torchcover.geometry.arrays import Bools, Float32, Float64, Int32, Int64
 from torchcover.simulation.patches import Patches
 from torchcover.simulation.raycaster import HitAttributes, Hits, RayCaster
 from torchcover.simulation.rays import (
-    SLACK_M,
-    SLACK_SHARE,
     BoxOutlines,
+    CullingParams,
     Tile,
     find_blocks_towards_boxes,
     find_boxes_in_cone,
@@ -26,51 +25,63 @@ from torchcover.simulation.shapes import Mesh
 
 
 class BodyGeometry:
-    """The geometry of one kind of body in its own frame.
+    """Geometry of one kind of body in its own frame.
 
-    `outline_points_m` (9, 3) has the corners of its box, grown a little, and the centre; no vertex is farther from that than
-    `radius_m`, nor from the origin of the frame than `reach_m`.
+    Args:
+        mesh: Mesh in the frame of the body.
+        params: Margins of the box.
+
+    Attributes:
+        bounding_box: Box around the mesh.
+        outline_points_m: (9, 3) float64 corners of the box, enlarged for rounding, and its center.
+        radius_m: Largest distance of a vertex from that center.
+        reach_m: Upper bound of the distance of a vertex from the origin of the frame.
     """
 
-    def __init__(self, mesh: Mesh) -> None:
+    def __init__(self, mesh: Mesh, params: CullingParams = CullingParams()) -> None:
         self.mesh = mesh
         self.bounding_box = BoundingBox.from_points(mesh.vertices_m)
-        centre_m = (np.array(self.bounding_box.lower_m) + np.array(self.bounding_box.upper_m)) / 2
-        self.radius_m = float(np.linalg.norm(mesh.vertices_m - centre_m, axis=1).max())
-        # Of the corners as they are cast: in float32.
-        slack_m = SLACK_M + SLACK_SHARE * float(np.abs(self.bounding_box.corners_m).max())
-        grown_m = self.bounding_box.corners_m + slack_m * np.sign(self.bounding_box.corners_m - centre_m)
-        self.outline_points_m: Float64 = np.vstack([grown_m, centre_m])
-        self.reach_m = float(np.linalg.norm(centre_m)) + self.radius_m
+        center_m = (np.array(self.bounding_box.lower_m) + np.array(self.bounding_box.upper_m)) / 2
+        self.radius_m = float(np.linalg.norm(mesh.vertices_m - center_m, axis=1).max())
+        # Rays are cast at float32 coordinates, which may lie slightly outside the box.
+        slack_m = params.slack_m + params.relative_slack * float(np.abs(self.bounding_box.corners_m).max())
+        enlarged_m = self.bounding_box.corners_m + slack_m * np.sign(self.bounding_box.corners_m - center_m)
+        self.outline_points_m: Float64 = np.vstack([enlarged_m, center_m])
+        self.reach_m = float(np.linalg.norm(center_m)) + self.radius_m
 
     @cached_property
     def caster(self) -> RayCaster:
-        """It alone, to cast rays at."""
+        """Ray caster of this body alone."""
         return RayCaster([self.mesh])
 
     @cached_property
     def patches(self) -> Patches:
-        """All of its surface, cut small."""
+        """Surface of the body, divided into small patches."""
         return Patches.from_mesh(self.mesh)
 
 
 class BodyGeometryCache:
-    """The solids of meshes, each made when first asked for and kept: one for each mesh object, whoever shares it."""
+    """Cache of one `BodyGeometry` per mesh object, built on first use."""
 
     def __init__(self) -> None:
-        self._of: dict[int, tuple[Mesh, BodyGeometry]] = {}
+        self._geometries: dict[int, tuple[Mesh, BodyGeometry]] = {}
 
     def get_geometry(self, mesh: Mesh) -> BodyGeometry:
-        """That of a mesh."""
-        if id(mesh) not in self._of:
-            self._of[id(mesh)] = mesh, BodyGeometry(mesh)  # with the mesh, so that no other one gets its id
-        return self._of[id(mesh)][1]
+        """Get the geometry of a mesh; the same object gives the same geometry."""
+        if id(mesh) not in self._geometries:
+            # The mesh is stored as well, so that no other object gets its id.
+            self._geometries[id(mesh)] = mesh, BodyGeometry(mesh)
+        return self._geometries[id(mesh)][1]
 
 
 class BodyHits(NamedTuple):
-    """L times that a ray meets a body: (L,) number of the body in `Moving`, of the ray in its tile, and where.
+    """L hits of rays on moving bodies; one ray may hit several bodies.
 
-    `triangle_indices` (L,) says on which face of the body.
+    Args:
+        part_indices: (L,) body in `MovingBodies`.
+        ray_indices: (L,) ray in its tile.
+        range_m: (L,) float32 range.
+        triangle_indices: (L,) int32 face in the mesh of the body.
     """
 
     part_indices: Int64
@@ -81,10 +92,15 @@ class BodyHits(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class MovingBodies:
-    """P bodies that move, placed at one instant: casters in their own frames, which one kind shares, and numbers.
+    """P moving bodies with their poses in one frame.
 
-    In the vehicle frame, `box_corners_m` (P, 8, 3) are of boxes around them; of balls around them `center_m` is (P, 3),
-    `radius_m` (P,).
+    Args:
+        casters: Ray caster of each body in its own frame; bodies of one kind share it.
+        vehicle_T_part: (P, 4, 4) poses in the vehicle frame.
+        body_indices: (P,) indices of the bodies in the scene.
+        box_corners_m: (P, 8, 3) corners of their boxes in the vehicle frame.
+        center_m: (P, 3) centers of spheres around them in the vehicle frame.
+        radius_m: (P,) radii of these spheres.
     """
 
     casters: Sequence[RayCaster]
@@ -96,16 +112,22 @@ class MovingBodies:
 
     @classmethod
     def from_geometries(cls, geometries: Sequence[BodyGeometry], vehicle_T_part: Float64, body_indices: Int64) -> Self:
-        """Bodies of these kinds, (P,), where they are, (P, 4, 4), with their numbers, (P,)."""
-        outlines_m = np.array([solid.outline_points_m for solid in geometries]).reshape(-1, 9, 3)
+        """Place bodies.
+
+        Args:
+            geometries: Geometry of each of P bodies.
+            vehicle_T_part: (P, 4, 4) poses in the vehicle frame.
+            body_indices: (P,) indices of the bodies in the scene.
+        """
+        outlines_m = np.array([geometry.outline_points_m for geometry in geometries]).reshape(-1, 9, 3)
         outlines_m = outlines_m @ vehicle_T_part[:, :3, :3].swapaxes(1, 2) + vehicle_T_part[:, None, :3, 3]
         return cls(
-            casters=[solid.caster for solid in geometries],
+            casters=[geometry.caster for geometry in geometries],
             vehicle_T_part=vehicle_T_part,
             body_indices=body_indices,
             box_corners_m=outlines_m[:, :8],
             center_m=outlines_m[:, 8],
-            radius_m=np.array([solid.radius_m for solid in geometries]),
+            radius_m=np.array([geometry.radius_m for geometry in geometries]),
         )
 
     def __len__(self) -> int:
@@ -113,28 +135,40 @@ class MovingBodies:
 
     @cached_property
     def part_T_vehicle(self) -> Float64:
-        """(P, 4, 4) from the vehicle frame to theirs."""
+        """(P, 4, 4) transforms from the vehicle frame to the frames of the bodies."""
         return invert(self.vehicle_T_part)
 
     @cached_property
     def unique_casters(self) -> tuple[Sequence[RayCaster], Int64]:
-        """The different casters, and (P,) which of them each body has."""
-        different = list(dict.fromkeys(self.casters))
-        number = {caster: k for k, caster in enumerate(different)}
-        return different, np.array([number[caster] for caster in self.casters], dtype=np.int64)
+        """Distinct casters, and (P,) index of the caster of each body."""
+        casters = list(dict.fromkeys(self.casters))
+        caster_index = {caster: index for index, caster in enumerate(casters)}
+        return casters, np.array([caster_index[caster] for caster in self.casters], dtype=np.int64)
 
-    def find_touched_bodies(self, position_m: Float64, part_positions_m: Float64) -> Bools:
-        """(P,) whether a (3,) place of the vehicle frame, `part_positions_m` (P, 3) from there, lies on a face of each body."""
-        touched: Bools = np.linalg.norm(self.center_m - position_m, axis=1) <= self.radius_m + SLACK_M
-        for k in np.flatnonzero(touched).tolist():
-            touched[k] = len(self.casters[k].find_touched_bodies(part_positions_m[k])) > 0
-        return touched
+    def find_touched_bodies(
+        self, position_m: Float64, part_positions_m: Float64, params: CullingParams = CullingParams()
+    ) -> Bools:
+        """Find the bodies on whose faces a position lies.
+
+        Args:
+            position_m: (3,) position in the vehicle frame.
+            part_positions_m: (P, 3) the same position in the frame of each body.
+            params: Tolerances.
+
+        Returns:
+            (P,) True for these bodies.
+        """
+        is_touched: Bools = np.linalg.norm(self.center_m - position_m, axis=1) <= self.radius_m + params.slack_m
+        for part in np.flatnonzero(is_touched).tolist():
+            is_touched[part] = len(self.casters[part].find_touched_bodies(part_positions_m[part])) > 0
+        return is_touched
 
     def transform_to_parts_m(self, position_m: Float64) -> Float64:
-        """(P, 3) a (3,) place of the vehicle frame in the frame of each body, as `transform` has it."""
+        """Transform a (3,) position from the vehicle frame to the frame of each body; (P, 3)."""
         rotation, translation = self.part_T_vehicle[:, :3, :3], self.part_T_vehicle[:, :3, 3:]
-        back = rotation.swapaxes(1, 2)
-        return np.asarray(((position_m + (back @ translation)[..., 0])[:, None] @ back)[:, 0])
+        inverse_rotation = rotation.swapaxes(1, 2)
+        offset_m = position_m + (inverse_rotation @ translation)[..., 0]
+        return np.asarray((offset_m[:, None] @ inverse_rotation)[:, 0])
 
     def find_candidate_pairs(
         self,
@@ -146,20 +180,29 @@ class MovingBodies:
         *,
         excluded_body: int | None = None,
     ) -> tuple[Int64, Int64]:
-        """Which rays of a tile may meet which body before their (n,) limits: (K,) bodies and (K,) rays.
+        """Find the pairs of a ray of a tile and a body that may meet.
 
-        `directions` (3, n) are those of the tile in the vehicle frame, `outlines` what they look like from there, from
-        `outlines`; `excluded_body` is the number of a body that they are not cast at.
+        Args:
+            vehicle_R_sensor: (3, 3) orientation of the sensor.
+            tile: Rays in the sensor frame.
+            directions: (3, n) float32 directions of the tile in the vehicle frame.
+            limit_m: (n,) largest range of each ray.
+            outlines: Boxes of the bodies as seen from the sensor.
+            excluded_body: Scene index of a body at which no ray is cast.
+
+        Returns:
+            (K,) bodies in this object and (K,) rays of the tile.
         """
-        near = find_boxes_in_cone(
-            outlines, vehicle_R_sensor @ tile.axis, tile.half_angle_rad, float(limit_m.max(initial=0.0))
-        )
+        max_range_m = float(limit_m.max(initial=0.0))
+        parts = find_boxes_in_cone(outlines, vehicle_R_sensor @ tile.axis, tile.half_angle_rad, max_range_m)
+        # The ego vehicle is excluded if its hits are already known.
         if excluded_body is not None:
-            near = near[self.body_indices[near] != excluded_body]
-        if len(near) == 0:
+            parts = parts[self.body_indices[parts] != excluded_body]
+        if len(parts) == 0:
             return np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64)
-        of_near, block = np.nonzero(find_blocks_towards_boxes(outlines.select(near), tile, vehicle_R_sensor, limit_m))
-        return find_rays_towards_boxes(outlines, near[of_near], tile.block_rays[block], directions, limit_m)
+        may_hit = find_blocks_towards_boxes(outlines.select(parts), tile, vehicle_R_sensor, limit_m)
+        row, block = np.nonzero(may_hit)
+        return find_rays_towards_boxes(outlines, parts[row], tile.block_rays[block], directions, limit_m)
 
     def find_body_hits(
         self,
@@ -172,32 +215,60 @@ class MovingBodies:
         *,
         excluded_body: int | None = None,
     ) -> tuple[BodyHits, int]:
-        """Where the rays of one tile meet each body, as if it were alone, and of how many pairs; as `pairs`."""
-        part, ray = self.find_candidate_pairs(
+        """Cast the rays of a tile at each body separately.
+
+        Args:
+            origin_m: (3,) origin of the rays in the vehicle frame.
+            vehicle_R_sensor: See `find_candidate_pairs`, as for the arguments that follow.
+            tile: Rays in the sensor frame.
+            directions: (3, n) float32 directions in the vehicle frame.
+            limit_m: (n,) largest range of each ray.
+            outlines: Boxes of the bodies as seen from the sensor.
+            excluded_body: Scene index of a body at which no ray is cast.
+
+        Returns:
+            All hits, and the number of pairs of a ray and a body that were cast.
+        """
+        parts, rays = self.find_candidate_pairs(
             vehicle_R_sensor, tile, directions, limit_m, outlines, excluded_body=excluded_body
         )
-        if len(ray) == 0:
-            return BodyHits(part, ray, np.empty(0, dtype=np.float32), np.empty(0, dtype=np.int32)), 0
-        places_m = self.transform_to_parts_m(origin_m)
-        towards = rotate_each(self.part_T_vehicle[:, :3, :3].astype(np.float32)[part], directions.take(ray, axis=1))
-        hits = self.cast_pairs(part, places_m.astype(np.float32)[part], towards, limit_m[ray], (origin_m, places_m))
-        met = hits.body_indices >= 0
-        return BodyHits(part[met], ray[met], hits.range_m[met], hits.triangle_indices[met]), len(met)
+        if len(rays) == 0:
+            return BodyHits(parts, rays, np.empty(0, dtype=np.float32), np.empty(0, dtype=np.int32)), 0
+        origins_m = self.transform_to_parts_m(origin_m)
+        part_directions = self._rotate_to_parts(parts, directions.take(rays, axis=1))
+        starts_m = origins_m.astype(np.float32)[parts]
+        hits = self.cast_pairs(parts, starts_m, part_directions, limit_m[rays], (origin_m, origins_m))
+        is_hit = hits.body_indices >= 0
+        return BodyHits(parts[is_hit], rays[is_hit], hits.range_m[is_hit], hits.triangle_indices[is_hit]), len(is_hit)
+
+    def _rotate_to_parts(self, part_indices: Int64, directions: Float32) -> Float32:
+        """Rotate (3, K) directions from the vehicle frame to the frames of (K,) bodies."""
+        return rotate_each(self.part_T_vehicle[:, :3, :3].astype(np.float32)[part_indices], directions)
 
     def compute_hit_attributes(
         self, part_indices: Int64, triangle_indices: Int32, directions: Float32
     ) -> HitAttributes:
-        """What the rays hit that met some of the bodies, as `RayCaster.struck`."""
-        towards = rotate_each(self.part_T_vehicle[:, :3, :3].astype(np.float32)[part_indices], directions)
-        casters, kind = self.unique_casters
-        cosine, material = np.empty(len(part_indices), dtype=np.float32), np.empty(len(part_indices), dtype=np.uint8)
-        for number in np.unique(kind[part_indices]).tolist():
-            some = np.flatnonzero(kind[part_indices] == number)
-            alone = casters[number].compute_hit_attributes(
-                np.zeros(len(some), dtype=np.int32), triangle_indices[some], towards[:, some]
+        """Compute incidence angles and materials of hits on the bodies.
+
+        Args:
+            part_indices: (N,) bodies in this object.
+            triangle_indices: (N,) faces in their meshes.
+            directions: (3, N) float32 unit directions of the rays in the vehicle frame.
+        """
+        part_directions = self._rotate_to_parts(part_indices, directions)
+        casters, caster_indices = self.unique_casters
+        cos_incidence = np.empty(len(part_indices), dtype=np.float32)
+        material_indices = np.empty(len(part_indices), dtype=np.uint8)
+        for caster_index in np.unique(caster_indices[part_indices]).tolist():
+            rows = np.flatnonzero(caster_indices[part_indices] == caster_index)
+            bodies = np.zeros(len(rows), dtype=np.int32)
+            attributes = casters[caster_index].compute_hit_attributes(
+                bodies, triangle_indices[rows], part_directions[:, rows]
             )
-            cosine[some], material[some] = alone.cos_incidence, alone.material_indices
-        return HitAttributes(self.body_indices[part_indices].astype(np.int32), triangle_indices, cosine, material)
+            cos_incidence[rows] = attributes.cos_incidence
+            material_indices[rows] = attributes.material_indices
+        body_indices = self.body_indices[part_indices].astype(np.int32)
+        return HitAttributes(body_indices, triangle_indices, cos_incidence, material_indices)
 
     def cast_pairs(
         self,
@@ -207,42 +278,50 @@ class MovingBodies:
         limit_m: Float32,
         common_origin_m: tuple[Float64, Float64] | None = None,
     ) -> Hits:
-        """Cast K pairs of a ray and a body, each as if it were alone.
+        """Cast K pairs of a ray and a body, each as if the body were alone.
 
-        Starts (K, 3) and directions (3, K) are in the frames of the (K,) bodies, `limit_m` (K,) is where rays end. If
-        they start at one place, which may lie on a face, `common_origin_m` is that, (3,), and the same in the frame of each
-        body, (P, 3).
+        Args:
+            part_indices: (K,) bodies in this object.
+            starts_m: (K, 3) float32 origins in the frames of the bodies.
+            directions: (3, K) float32 unit directions in the frames of the bodies.
+            limit_m: (K,) largest range of each ray.
+            common_origin_m: Common origin of all rays, which may lie on a face: (3,) in the vehicle frame and (P, 3) in
+                the frame of each body. None if the rays have different origins.
         """
-        casters, kind = self.unique_casters
-        touched = (
-            np.zeros(len(self), dtype=bool) if common_origin_m is None else self.find_touched_bodies(*common_origin_m)
-        )
-        # Bodies of one kind are cast at together. A ray that starts on a face is cast as one that leaves it.
-        group = np.where(touched, len(casters) + np.arange(len(self)), kind)[part_indices]
-        order = np.argsort(group, kind="stable")
-        part_indices, group = part_indices[order], group[order]
+        casters, caster_indices = self.unique_casters
+        is_touched = np.zeros(len(self), dtype=bool)
+        if common_origin_m is not None:
+            is_touched = self.find_touched_bodies(*common_origin_m)
+        # Bodies with the same caster are cast together, except bodies on whose faces the origin lies.
+        groups = np.where(is_touched, len(casters) + np.arange(len(self)), caster_indices)[part_indices]
+        order = np.argsort(groups, kind="stable")
+        part_indices, groups = part_indices[order], groups[order]
         starts_m, directions, limit_m = starts_m[order], directions[:, order], limit_m[order]
-        first, answers = np.flatnonzero(np.diff(group, prepend=-1)).tolist(), []
-        for start, end in pairwise([*first, len(group)]):
-            some, body = slice(start, end), part_indices[start]
-            if common_origin_m is not None and touched[body]:
-                answers.append(self.casters[body].cast(common_origin_m[1][body], directions[:, some], limit_m[some]))
+        group_starts, group_hits = np.flatnonzero(np.diff(groups, prepend=-1)).tolist(), []
+        for start, end in pairwise([*group_starts, len(groups)]):
+            rows, part = slice(start, end), part_indices[start]
+            if common_origin_m is not None and is_touched[part]:
+                origin_m = common_origin_m[1][part]
+                group_hits.append(self.casters[part].cast(origin_m, directions[:, rows], limit_m[rows]))
             else:
-                caster = casters[group[start]]
-                answers.append(caster.cast_from_each(starts_m[some], directions[:, some], limit_m[some]))
-        back = np.empty_like(order)
-        back[order] = np.arange(len(order))
-        return Hits._make(np.concatenate(column)[back] for column in zip(*answers, strict=True))
+                caster = casters[groups[start]]
+                group_hits.append(caster.cast_from_each(starts_m[rows], directions[:, rows], limit_m[rows]))
+        original_order = np.empty_like(order)
+        original_order[order] = np.arange(len(order))
+        return Hits._make(np.concatenate(column)[original_order] for column in zip(*group_hits, strict=True))
 
     def update_nearest_hits(self, hits: Hits, body_hits: BodyHits) -> None:
-        """Bring the hits of all rays of a tile up to date with what they meet of the bodies."""
+        """Replace hits of a tile by nearer hits on the bodies, in place.
+
+        Args:
+            hits: Hits of all rays of the tile on static bodies.
+            body_hits: Hits on the moving bodies, none farther than the hit of its ray.
+        """
         # The nearest counts; of two that coincide, the last in the order of the bodies.
-        part, ray, range_m, triangle = body_hits
+        parts, rays, range_m, triangles = body_hits
         nearest_m = np.full(len(hits.range_m), np.inf, dtype=np.float32)
-        np.minimum.at(nearest_m, ray, range_m)
-        first = range_m == nearest_m[ray]
-        hits.range_m[ray[first]] = range_m[first]
-        hits.body_indices[ray[first]], hits.triangle_indices[ray[first]] = (
-            self.body_indices[part[first]],
-            triangle[first],
-        )
+        np.minimum.at(nearest_m, rays, range_m)
+        is_nearest = range_m == nearest_m[rays]
+        hits.range_m[rays[is_nearest]] = range_m[is_nearest]
+        hits.body_indices[rays[is_nearest]] = self.body_indices[parts[is_nearest]]
+        hits.triangle_indices[rays[is_nearest]] = triangles[is_nearest]

@@ -1,16 +1,19 @@
-"""Ray casting with Embree. Everything that one must know about embreex is written here.
+"""Ray casting with Embree, or with Warp on a device.
 
-embreex computes in float32, so a scene is given in coordinates near the vehicle; it does not check that origins and
-directions are equal in number; it writes into the distances it is given, and answers a miss with them; it releases the
-interpreter lock, so that threads add up. An origin may lie on a face, as far as float32 can tell.
+Properties of embreex that this module relies on:
 
-Its threads build scenes, and nothing tells it to do without. A forked process, such as a worker of a DataLoader, has
-none of them but the locks that they held, and one in a thousand waits for ever. TBB counts the cores that it may use
-when it is first used: so that is done with one (`_have_no_threads`).
+- It computes in float32: a scene needs coordinates near the vehicle, and an origin may lie on a face by rounding.
+- It does not check that there are as many origins as directions.
+- It writes ranges into the array of limits that it receives; a miss keeps its limit.
+- It releases the interpreter lock, so that several threads cast in parallel.
+- It builds scenes with threads of its own. A forked process, such as a DataLoader worker, inherits their locks but not
+  the threads, and about one in a thousand deadlocks. TBB counts the available cores at its first use, which therefore
+  happens with one core (`_disable_embree_threads`).
 """
 
 import os
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import cache, cached_property
 from typing import Any, NamedTuple
 
@@ -24,28 +27,13 @@ from torchcover.geometry.arrays import Bools, Float32, Float64, Int32, Int64
 from torchcover.geometry.rigid import Matrix
 from torchcover.simulation.patches import find_outward_faces
 from torchcover.simulation.rays import rotate
-from torchcover.simulation.shapes import PART, Mesh, compute_normals, get_corners_m, iterate_mesh_parts
-
-# Farther from the origin float32 resolves no better than 64 m, and at 2e18 Embree drops faces without a word.
-MAX_M = 1e9
-# How far beyond a face that it leaves a ray goes on, in contact distances; farther each time that it hits one again.
-CONTACTS_BEYOND = 2.0 ** np.arange(1, 13)
-# An origin lies on a face if it is no farther from its plane than four times what rounding makes of that; as a share.
-CONTACT = 4 * float(np.finfo(np.float32).eps)
-# Twice that, of the largest coordinate of a face, and what rounding its box to float32 adds.
-MOST_CONTACT = 3 * CONTACT
-# Origins are rounded too, before they come here: in float64, as a share of the largest coordinate.
-MIN_CONTACT = 1e-12
-# More faces than so many are no lists: they would take some hundred bytes each.
-MOST_LISTS = 2**18
-# So far beside a place the line upwards starts if it would run through an edge.
-BESIDE_M = ((0.0, 0.0), (1.1e-7, 2.3e-7), (-3.7e-7, 1.9e-7))
+from torchcover.simulation.shapes import FACES_PER_CHUNK, Mesh, compute_normals, get_corners_m, iterate_mesh_parts
 
 
 @cache
-def _have_no_threads() -> None:
-    """Use Embree for the first time, on one core of those that this thread may use."""
-    if not hasattr(os, "sched_setaffinity"):  # where processes are started anew, not forked
+def _disable_embree_threads() -> None:
+    """Use Embree for the first time on a single core of this thread, so that it starts no threads."""
+    if not hasattr(os, "sched_setaffinity"):  # systems that start new processes instead of forking
         return
     cores = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {min(cores)})
@@ -57,118 +45,154 @@ def _have_no_threads() -> None:
         os.sched_setaffinity(0, cores)
 
 
-def _embree(bodies: Sequence[Mesh]) -> EmbreeScene:
-    _have_no_threads()
+def _build_embree_scene(bodies: Sequence[Mesh]) -> EmbreeScene:
+    """Build an Embree scene whose geometries are the bodies, in their order."""
+    _disable_embree_threads()
     # Robust: a ray through a shared edge hits one of the two faces instead of slipping between them.
     scene = EmbreeScene(robust=True)
     for body in bodies:
-        TriangleMesh(scene, body.vertices_m.astype(np.float32), _as_read(body.faces))
-    # embreex commits the scene when it is first used; do it before several threads do.
+        TriangleMesh(scene, body.vertices_m.astype(np.float32), _convert_faces_for_embreex(body.faces))
+    # embreex commits the scene at its first use; do it before several threads do.
     scene.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
     return scene
 
 
-def _as_read(faces: NDArray[np.integer]) -> NDArray[Any]:
-    """Of (F, 3) faces what embreex, which asks for one number after another, reads soonest: lists, but of very many."""
-    if len(faces) > MOST_LISTS:
+def _convert_faces_for_embreex(faces: NDArray[np.integer]) -> NDArray[Any]:
+    """Convert (F, 3) faces to the type that embreex reads fastest: lists, since it indexes number by number."""
+    max_list_count = 2**18  # lists take some hundred bytes per face
+    if len(faces) > max_list_count:
         return faces.astype(np.int32)
     return np.fromiter(faces.tolist(), dtype=object, count=len(faces))
 
 
-def _warp(bodies: Sequence[Mesh], device: str) -> Any:  # noqa: ANN401  (answers as Embree's scene)
+def _build_warp_scene(bodies: Sequence[Mesh], device: str) -> Any:  # noqa: ANN401  (same interface as EmbreeScene)
+    """Build a Warp scene of the bodies on a device; Warp is imported on first use."""
     from torchcover.simulation.warp_scene import WarpScene
 
     return WarpScene(bodies, device)
 
 
-class FaceGeometry:
-    """The faces of all bodies, one after the other, and how far from each a place counts as on it.
+@dataclass(frozen=True)
+class ContactParams:
+    """Distances from a face up to which a point counts as on the face.
 
-    `normals` (3, F) are of length one, or 0 where a face has no area. What is kept of all is float32, for there may be
-    ten million; what a question needs in float64 is computed for the few faces that it is about.
+    Args:
+        rounding: Tolerance per meter of coordinates: four times the rounding of float32.
+        max_rounding: Upper bound of the tolerance per meter of the largest coordinate of a face: twice `rounding`, and
+            the rounding of bounding boxes to float32.
+        min_rounding: Smallest tolerance per meter of the largest coordinate of all bodies, since origins are rounded in
+            float64.
     """
 
-    def __init__(self, bodies: Sequence[Mesh], reach_m: float) -> None:
+    rounding: float = 4 * float(np.finfo(np.float32).eps)
+    max_rounding: float = 3 * 4 * float(np.finfo(np.float32).eps)
+    min_rounding: float = 1e-12
+
+
+class FaceGeometry:
+    """Faces of all bodies, numbered consecutively, with the distance up to which a point counts as on a face.
+
+    Arrays over all faces are float32, since there may be ten million; float64 values are computed per query for the few
+    faces that it concerns.
+
+    Args:
+        bodies: Meshes.
+        max_coordinate_m: Largest absolute coordinate of all bodies.
+        params: Contact distances.
+    """
+
+    def __init__(
+        self, bodies: Sequence[Mesh], max_coordinate_m: float, params: ContactParams = ContactParams()
+    ) -> None:
         self._bodies = bodies
-        self._least_contact_m = MIN_CONTACT * reach_m
-        self._count = sum(len(body.faces) for body in bodies)
-        # Of the boxes of places that may lie on a face: no contact distance is more than a share of its coordinates.
-        self._lower_m, self._upper_m = (np.empty((3, self._count), dtype=np.float32) for _ in range(2))
-        first = 0
+        self._params = params
+        self._min_contact_m = params.min_rounding * max_coordinate_m
+        self._num_faces = sum(len(body.faces) for body in bodies)
+        # Boxes of all points that may lie on a face.
+        self._lower_m = np.empty((3, self._num_faces), dtype=np.float32)
+        self._upper_m = np.empty((3, self._num_faces), dtype=np.float32)
+        first_face = 0
         for body in bodies:
             vertices_m = np.ascontiguousarray(body.vertices_m.T, dtype=np.float32)
-            for start in range(0, len(body.faces), PART):
-                corners_m = vertices_m.take(body.faces[start : start + PART].T, axis=1)
+            for start in range(0, len(body.faces), FACES_PER_CHUNK):
+                corners_m = vertices_m.take(body.faces[start : start + FACES_PER_CHUNK].T, axis=1)
                 lower_m, upper_m = corners_m.min(axis=1), corners_m.max(axis=1)
                 largest_m = np.maximum(np.abs(lower_m).max(axis=0), np.abs(upper_m).max(axis=0))
-                beside_m = np.float32(MOST_CONTACT) * largest_m + np.float32(2 * self._least_contact_m)
-                faces = slice(first, first + corners_m.shape[2])
-                first = faces.stop
-                self._lower_m[:, faces], self._upper_m[:, faces] = lower_m - beside_m, upper_m + beside_m
-        self._least_m, self._most_m = (
-            self._lower_m.min(axis=1, initial=np.inf),
-            self._upper_m.max(axis=1, initial=-np.inf),
-        )
+                margin_m = np.float32(params.max_rounding) * largest_m + np.float32(2 * self._min_contact_m)
+                faces = slice(first_face, first_face + corners_m.shape[2])
+                first_face = faces.stop
+                self._lower_m[:, faces] = lower_m - margin_m
+                self._upper_m[:, faces] = upper_m + margin_m
+        self._min_m = self._lower_m.min(axis=1, initial=np.inf)
+        self._max_m = self._upper_m.max(axis=1, initial=-np.inf)
 
     @cached_property
     def normals(self) -> Float32:
-        """Asked where light returns."""
-        normals = np.empty((3, self._count), dtype=np.float32)
+        """(3, F) unit normals, 0 for faces without area; computed only for sensors with range-limited returns."""
+        normals = np.empty((3, self._num_faces), dtype=np.float32)
         for faces, corners_m in iterate_mesh_parts(self._bodies):
             normals[:, faces] = compute_normals(corners_m)
         return normals
 
     def find_containing_faces(self, position_m: NDArray[np.floating]) -> Int64:
-        """Numbers of those that a (3,) place lies on."""
-        if ((position_m < self._least_m) | (position_m > self._most_m)).any():
+        """Find the faces on which a (3,) position lies, as face numbers."""
+        if ((position_m < self._min_m) | (position_m > self._max_m)).any():
             return np.empty(0, dtype=np.int64)
         x, y, z = position_m
-        # One axis after the other: the first, which asks all faces, leaves few to the second. Most are near the ground.
-        near = np.flatnonzero((self._lower_m[0] <= x) & (x <= self._upper_m[0]))
+        # The height comes last, since most faces are near the ground and would pass its test.
+        candidates = np.flatnonzero((self._lower_m[0] <= x) & (x <= self._upper_m[0]))
         for axis, coordinate_m in ((1, y), (2, z)):
-            near = near[(self._lower_m[axis, near] <= coordinate_m) & (coordinate_m <= self._upper_m[axis, near])]
-        if len(near) == 0:
-            return near
-        corners_m, within_m = get_corners_m(self._bodies, near), 2 * self.compute_contact_distances_m(near)
-        apart_m = np.maximum(corners_m.min(axis=0) - position_m[:, None], position_m[:, None] - corners_m.max(axis=0))
-        return np.asarray(
-            near[(apart_m <= within_m).all(axis=0) & (self.compute_plane_distances_m(position_m, near) <= within_m)]
-        )
+            is_within = self._lower_m[axis, candidates] <= coordinate_m
+            is_within &= coordinate_m <= self._upper_m[axis, candidates]
+            candidates = candidates[is_within]
+        if len(candidates) == 0:
+            return candidates
+        corners_m = get_corners_m(self._bodies, candidates)
+        tolerance_m = 2 * self.compute_contact_distances_m(candidates)
+        outside_m = np.maximum(corners_m.min(axis=0) - position_m[:, None], position_m[:, None] - corners_m.max(axis=0))
+        is_near_box = (outside_m <= tolerance_m).all(axis=0)
+        is_near_plane = self.compute_plane_distances_m(position_m, candidates) <= tolerance_m
+        return np.asarray(candidates[is_near_box & is_near_plane])
 
     def find_faces_above(self, position_m: NDArray[np.floating]) -> Int64:
-        """Numbers of those that a line upwards from a (3,) place may meet."""
+        """Find the faces whose boxes a vertical line upwards from a (3,) position meets, as face numbers."""
         x, y, z = position_m
-        near = np.flatnonzero((self._lower_m[0] <= x) & (x <= self._upper_m[0]))
-        near = near[(self._lower_m[1, near] <= y) & (y <= self._upper_m[1, near])]
-        return np.asarray(near[z <= self._upper_m[2, near]])
+        candidates = np.flatnonzero((self._lower_m[0] <= x) & (x <= self._upper_m[0]))
+        candidates = candidates[(self._lower_m[1, candidates] <= y) & (y <= self._upper_m[1, candidates])]
+        return np.asarray(candidates[z <= self._upper_m[2, candidates]])
 
     def compute_contact_distances_m(self, face_indices: Int64) -> Float64:
-        """(N,) from the planes of some of them, as far as float32 may find a place that lies on it, but of slivers."""
-        return np.maximum(_contact_m(get_corners_m(self._bodies, face_indices)), self._least_contact_m)
+        """Compute the distance from the plane of each face at which float32 may place a point that lies on it.
+
+        Args:
+            face_indices: (N,) face numbers.
+
+        Returns:
+            (N,) distances; for slivers, whose plane is ill-defined, an upper bound by their coordinates.
+        """
+        first, second, third = corners_m = get_corners_m(self._bodies, face_indices)
+        (ax, ay, az), (bx, by, bz) = np.abs(second - first), np.abs(third - first)
+        length = np.linalg.norm(np.cross(second - first, third - first, axis=0), axis=0)
+        # To first order, the rounding of n . x with n = a x b is proportional to the sum of all its products.
+        products = np.stack([ay * bz + az * by, az * bx + ax * bz, ax * by + ay * bx])
+        largest = np.abs(corners_m).max(axis=0)
+        rounding_m = (products * largest).sum(axis=0) / np.where(length == 0, np.inf, length)
+        contact_m = np.minimum(rounding_m, largest.max(axis=0)) * self._params.rounding
+        return np.asarray(np.maximum(contact_m, self._min_contact_m))
 
     def compute_plane_distances_m(self, position_m: NDArray[np.floating], face_indices: Int64) -> Float64:
-        """Distance of a (3,) place from the planes of some of them."""
+        """Compute (N,) distances of a (3,) position from the planes of (N,) faces."""
         corners_m = get_corners_m(self._bodies, face_indices)
         return np.asarray(np.abs(((position_m[:, None] - corners_m[0]) * compute_normals(corners_m)).sum(axis=0)))
 
 
-def _contact_m(corners_m: Matrix) -> Matrix:
-    """(N,) how far from its plane float32 may find a place that lies on a face, of (3, 3, N) corners."""
-    first, second, third = corners_m
-    (ax, ay, az), (bx, by, bz) = np.abs(second - first), np.abs(third - first)
-    length = np.linalg.norm(np.cross(second - first, third - first, axis=0), axis=0)
-    # To first order, the roundings of n . x, where n = a x b, are the sum of all its products.
-    products = np.stack([ay * bz + az * by, az * bx + ax * bz, ax * by + ay * bx])
-    largest = np.abs(corners_m).max(axis=0)
-    rounding_m = (products * largest).sum(axis=0) / np.where(length == 0, np.inf, length)
-    # The plane of a sliver is anybody's guess, but the sliver is not far from where it is.
-    return np.asarray(np.minimum(rounding_m, largest.max(axis=0)) * CONTACT)
-
-
 class Hits(NamedTuple):
-    """For each of N rays: `range_m` (N,) float32 where it ended, and `body_indices` (N,) int32, -1 if at its limit.
+    """Hits of N rays.
 
-    `triangle_indices` (N,) int32 is the number of the face among those of its body.
+    Args:
+        range_m: (N,) float32 range of each hit; the limit of the ray if it hit nothing.
+        body_indices: (N,) int32 body; -1 if the ray hit nothing.
+        triangle_indices: (N,) int32 face in the mesh of that body.
     """
 
     range_m: Float32
@@ -177,9 +201,13 @@ class Hits(NamedTuple):
 
 
 class HitAttributes(NamedTuple):
-    """What N rays hit: the number of the body, see `Instant`, or -1, the face of its mesh, and what that is made of.
+    """Attributes of the surfaces that N rays hit.
 
-    `cos_incidence` is the cosine of the angle between the ray and the normal of the face, on either side.
+    Args:
+        body_indices: (N,) int32 body, see `SceneSnapshot`; -1 if the ray hit nothing.
+        triangle_indices: (N,) int32 face in the mesh of that body.
+        cos_incidence: (N,) float32 cosine of the angle between ray and surface normal, 0 to 1 on either side.
+        material_indices: (N,) uint8 material of the face.
     """
 
     body_indices: Int32
@@ -189,152 +217,201 @@ class HitAttributes(NamedTuple):
 
 
 class RayCaster:
-    """A set of bodies that rays can be cast at, from several threads at once: a closed or open mesh each, in metres.
+    """Bodies at which rays can be cast, from several threads at once.
 
-    Coordinates should be near the origin of the rays' frame: they become float32. ValueError: there is no body, or one
-    with a vertex that is not a number or farther than 1e9 m. Warp casts on a `device` that is given, such as `cuda:0`,
-    else Embree; they agree but for the last bits.
+    Args:
+        bodies: Closed or open meshes with coordinates near the origin of the rays' frame, since they become float32.
+        device: Warp device, such as `cuda:0`; None for Embree. Both agree up to the last bits.
+
+    Raises:
+        ValueError: There is no body, or a vertex is NaN or farther than 1e9 m from the origin.
     """
 
     def __init__(self, bodies: Sequence[Mesh], device: str | None = None) -> None:
         if not bodies:
             raise ValueError("a scene needs at least one body")
-        reach_m = float(np.max([np.abs(body.vertices_m).max(initial=0.0) for body in bodies]))  # NaN if one is
-        if not reach_m <= MAX_M:
+        max_coordinate_m = float(np.max([np.abs(body.vertices_m).max(initial=0.0) for body in bodies]))  # may be NaN
+        # Farther out float32 resolves no better than 64 m, and at 2e18 m Embree drops faces silently.
+        limit_m = 1e9
+        if not max_coordinate_m <= limit_m:
             raise ValueError(
-                f"bodies within {MAX_M:g} m of the origin are needed; a vertex has the coordinate {reach_m}"
+                f"bodies within {limit_m:g} m of the origin are needed; a vertex has the coordinate {max_coordinate_m}"
             )
-        self._reach_m = reach_m
-        self._first_face = np.cumsum([0] + [len(body.faces) for body in bodies])
+        self._max_coordinate_m = max_coordinate_m
+        self._first_faces = np.cumsum([0] + [len(body.faces) for body in bodies])
         self._bodies = bodies
-        self._closed: dict[int, Bools] = {}  # asked of few: hardly any ray meets a face from behind
-        self._last_asked: tuple[bytes, Int64] = b"", np.empty(0, dtype=np.int64)
-        self._scene = _embree(bodies) if device is None else _warp(bodies, device)
+        self._outward_masks: dict[int, Bools] = {}  # by body; needed for few, since rays hardly ever start inside
+        self._last_touched: tuple[bytes, Int64] = b"", np.empty(0, dtype=np.int64)
+        self._scene = _build_embree_scene(bodies) if device is None else _build_warp_scene(bodies, device)
 
     @cached_property
     def _faces(self) -> FaceGeometry:
-        """Asked where rays have a common origin, which may lie on a face."""
-        return FaceGeometry(self._bodies, self._reach_m)
+        """Faces of all bodies; needed only if rays start at one origin, which may lie on a face."""
+        return FaceGeometry(self._bodies, self._max_coordinate_m)
 
     @cached_property
-    def _materials(self) -> NDArray[np.uint8]:
-        """(F,) what each of all faces is made of."""
+    def _material_indices(self) -> NDArray[np.uint8]:
+        """(F,) material of each face."""
         return np.concatenate([body.filled_material_indices for body in self._bodies])
 
     @property
     def num_bodies(self) -> int:
-        """How many there are; their numbers begin with 0."""
+        """Number of bodies; their indices begin at 0."""
         return len(self._bodies)
 
     def cast(self, origin_m: NDArray[np.floating], directions: Float32, limit_m: Float32) -> Hits:
-        """Cast (3, N) unit directions from one origin, up to (N,) limits, which may be infinite.
+        """Cast rays from one origin; a ray that starts on a face does not hit that face.
 
-        A ray that starts on a face does not hit that face. What hits nothing has its limit as range, and body -1.
+        Args:
+            origin_m: (3,) origin of all rays.
+            directions: (3, N) float32 unit directions.
+            limit_m: (N,) float32 largest range of each ray, possibly infinite.
+
+        Returns:
+            Hits; rays that hit nothing have their limit as range and body -1.
         """
-        # One origin for all rays: an array that steps over no memory from row to row.
-        origins = np.ndarray(
-            (directions.shape[1], 3), np.float32, origin_m.astype(np.float32).tobytes(), strides=(0, 4)
-        )
+        # A stride of 0 repeats one origin for all rays without copies.
+        num_rays = directions.shape[1]
+        origins = np.ndarray((num_rays, 3), np.float32, origin_m.astype(np.float32).tobytes(), strides=(0, 4))
         hits = self.cast_from_each(origins, directions, limit_m)
         if len(self.find_touched_bodies(origin_m)):
-            self._leave_faces(origin_m, directions, limit_m, hits)
+            self._recast_rays_that_start_on_faces(origin_m, directions, limit_m, hits)
         return hits
 
     def cast_from_each(self, origins_m: Float32, directions: Float32, limit_m: Float32) -> Hits:
-        """Cast (3, N) unit directions from (N, 3) origins up to (N,) limits; none starts on a face, see `touched`."""
-        answer = self._scene.run(origins_m, directions.T, dists=limit_m.copy(), output=True)
-        return Hits(answer["tfar"], answer["geomID"], answer["primID"])
+        """Cast rays that have an origin each, none of which lies on a face.
+
+        Args:
+            origins_m: (N, 3) float32 origins.
+            directions: (3, N) float32 unit directions.
+            limit_m: (N,) float32 largest range of each ray, possibly infinite.
+
+        Returns:
+            Hits, see `cast`.
+        """
+        result = self._scene.run(origins_m, directions.T, dists=limit_m.copy(), output=True)
+        return Hits(result["tfar"], result["geomID"], result["primID"])
 
     def compute_hit_attributes(
         self, body_indices: Int32, triangle_indices: Int32, directions: Float32
     ) -> HitAttributes:
-        """What N rays with (3, N) unit directions hit that ended on some faces, as `Hits` has them, none of them -1."""
-        face = self._first_face.take(body_indices) + triangle_indices
-        (nx, ny, nz), (x, y, z) = self._faces.normals.take(face, axis=1), directions
+        """Compute incidence angles and materials of hits.
+
+        Args:
+            body_indices: (N,) bodies, none of them -1.
+            triangle_indices: (N,) faces in the meshes of these bodies.
+            directions: (3, N) float32 unit directions of the rays.
+        """
+        face_indices = self._first_faces.take(body_indices) + triangle_indices
+        (nx, ny, nz), (x, y, z) = self._faces.normals.take(face_indices, axis=1), directions
         cosine = np.abs(nx * x + ny * y + nz * z)
-        return HitAttributes(
-            body_indices, triangle_indices, np.minimum(cosine, 1.0, out=cosine), self._materials.take(face)
-        )
+        np.minimum(cosine, 1.0, out=cosine)
+        return HitAttributes(body_indices, triangle_indices, cosine, self._material_indices.take(face_indices))
 
     def find_first_faces(
         self, origins_m: NDArray[np.floating], directions: NDArray[np.floating], limit_m: float
     ) -> Int64:
-        """(N,) which face each ray meets first within a limit, counted through those of all bodies; -1 for none."""
-        ends_m = np.full(len(origins_m), limit_m, dtype=np.float32)
-        hits = self.cast_from_each(origins_m.astype(np.float32), directions.astype(np.float32).T, ends_m)
-        return np.asarray(np.where(hits.body_indices >= 0, self._numbers(hits), -1))
+        """Find the first face that each ray hits.
 
-    def _numbers(self, hits: Hits) -> Int64:
-        """(N,) which of all faces each ray hit; any number where it hit none."""
-        return np.asarray(self._first_face[np.maximum(hits.body_indices, 0)] + np.maximum(hits.triangle_indices, 0))
+        Args:
+            origins_m: (N, 3) origins.
+            directions: (N, 3) unit directions.
+            limit_m: Largest range.
+
+        Returns:
+            (N,) face numbers, consecutive over all bodies; -1 where a ray hits nothing.
+        """
+        limits_m = np.full(len(origins_m), limit_m, dtype=np.float32)
+        hits = self.cast_from_each(origins_m.astype(np.float32), directions.astype(np.float32).T, limits_m)
+        return np.asarray(np.where(hits.body_indices >= 0, self._compute_face_indices(hits), -1))
+
+    def _compute_face_indices(self, hits: Hits) -> Int64:
+        """Compute the (N,) face numbers over all bodies; arbitrary for rays that hit nothing."""
+        return np.asarray(self._first_faces[np.maximum(hits.body_indices, 0)] + np.maximum(hits.triangle_indices, 0))
 
     def find_touched_bodies(self, position_m: NDArray[np.floating]) -> Int64:
-        """Numbers of the bodies on whose faces a place lies: hardly any does, and the faces are sooner asked than rays.
+        """Find the bodies on whose faces a (3,) position lies; usually none.
 
-        The last answer is kept, for all tiles of a scan start at one place.
+        The last result is cached, since all ray tiles of a scan have the same origin.
         """
-        asked, answer = self._last_asked  # read at once: other threads may ask about other places
-        if asked != position_m.tobytes():
-            answer = np.searchsorted(self._first_face, self._faces.find_containing_faces(position_m), side="right") - 1
-            self._last_asked = (position_m.tobytes(), answer)
-        return answer
+        last_position, touched = self._last_touched  # one read: other threads may replace the pair
+        if last_position != position_m.tobytes():
+            faces = self._faces.find_containing_faces(position_m)
+            touched = np.searchsorted(self._first_faces, faces, side="right") - 1
+            self._last_touched = (position_m.tobytes(), touched)
+        return touched
 
-    def _leave_faces(self, origin_m: NDArray[np.floating], directions: Float32, limit_m: Float32, hits: Hits) -> None:
-        """Let the rays go on that hit a face whose plane they start on: by rounding alone, as they leave it."""
+    def _recast_rays_that_start_on_faces(
+        self, origin_m: NDArray[np.floating], directions: Float32, limit_m: Float32, hits: Hits
+    ) -> None:
+        """Continue rays beyond a face on whose plane they start, which they hit by rounding only; changes `hits`."""
 
         def starts_on_plane(faces: Int64) -> Bools:
-            return np.asarray(
-                self._faces.compute_plane_distances_m(origin_m, faces) <= self._faces.compute_contact_distances_m(faces)
-            )
+            plane_distances_m = self._faces.compute_plane_distances_m(origin_m, faces)
+            return np.asarray(plane_distances_m <= self._faces.compute_contact_distances_m(faces))
 
-        rays, travelled_m, faces = np.flatnonzero(hits.body_indices >= 0), 0.0, self._numbers(hits)
+        rays, faces = np.flatnonzero(hits.body_indices >= 0), self._compute_face_indices(hits)
         rays = rays[starts_on_plane(faces[rays])]
-        range_m, faces = hits.range_m[rays], faces[rays]
-        for beyond in CONTACTS_BEYOND:
+        range_m, faces, travelled_m = hits.range_m[rays], faces[rays], np.zeros(len(rays))
+        for attempt in range(1, 13):
             if len(rays) == 0:
                 return
-            # The hit is the nearest one, so nothing lies before it.
-            travelled_m = travelled_m + range_m + beyond * self._faces.compute_contact_distances_m(faces)
-            towards, left_m = directions.T[rays], np.maximum(limit_m[rays] - travelled_m, 0.0)
-            starts_m = origin_m + travelled_m[:, None] * towards
-            found = self.cast_from_each(starts_m.astype(np.float32), towards.T, left_m.astype(np.float32))
-            hit, range_m, faces = found.body_indices >= 0, found.range_m, self._numbers(found)
-            hits.range_m[rays] = np.where(hit, travelled_m + range_m, limit_m[rays])
-            hits.body_indices[rays], hits.triangle_indices[rays] = found.body_indices, found.triangle_indices
-            again = hit & starts_on_plane(faces)
+            # Each attempt skips twice the distance. The hit is the nearest one, so that nothing before it is skipped.
+            travelled_m = travelled_m + range_m + 2.0**attempt * self._faces.compute_contact_distances_m(faces)
+            ray_directions = directions.T[rays]
+            remaining_m = np.maximum(limit_m[rays] - travelled_m, 0.0)
+            starts_m = origin_m + travelled_m[:, None] * ray_directions
+            new_hits = self.cast_from_each(
+                starts_m.astype(np.float32), ray_directions.T, remaining_m.astype(np.float32)
+            )
+            is_hit, range_m, faces = new_hits.body_indices >= 0, new_hits.range_m, self._compute_face_indices(new_hits)
+            hits.range_m[rays] = np.where(is_hit, travelled_m + range_m, limit_m[rays])
+            hits.body_indices[rays], hits.triangle_indices[rays] = new_hits.body_indices, new_hits.triangle_indices
+            again = is_hit & starts_on_plane(faces)
             rays, travelled_m, range_m, faces = rays[again], travelled_m[again], range_m[again], faces[again]
 
     def find_enclosing_bodies(self, position_m: NDArray[np.floating]) -> Int64:
-        """Numbers of the bodies that a (3,) place lies inside of; a sheet has no inside.
+        """Find the bodies inside which a (3,) position lies; an open surface has no inside.
 
-        It is inside a closed surface that is turned outwards if a line upwards leaves that more often than it enters.
-        No ray is cast: which of two faces it met first where bodies touch would be up to how the processor rounds.
+        A position is inside a closed surface with outward normals if a vertical line upwards leaves the surface more
+        often than it enters. No ray is cast, since the order of hits where bodies touch depends on the processor.
         """
         faces = self._faces.find_faces_above(position_m)
-        body = np.searchsorted(self._first_face, faces, side="right") - 1
-        bodies, of = np.unique(body, return_inverse=True)
+        face_bodies = np.searchsorted(self._first_faces, faces, side="right") - 1
+        bodies, body_rows = np.unique(face_bodies, return_inverse=True)
         is_closed = np.zeros(len(faces), dtype=bool)
-        for number in bodies.tolist():
-            if number not in self._closed:
-                self._closed[number] = find_outward_faces(self._bodies[number])
-            is_closed[body == number] = self._closed[number][faces[body == number] - self._first_face[number]]
+        for body in bodies.tolist():
+            if body not in self._outward_masks:
+                self._outward_masks[body] = find_outward_faces(self._bodies[body])
+            in_body = face_bodies == body
+            is_closed[in_body] = self._outward_masks[body][faces[in_body] - self._first_faces[body]]
         corners_m = get_corners_m(self._bodies, faces) - position_m[:, None]
-        for beside_m in BESIDE_M:
-            x_m, y_m = corners_m[:, 0] - beside_m[0], corners_m[:, 1] - beside_m[1]
-            # Twice the signed areas between the line and each edge: of an edge of two faces the same, to the bit.
+        # Small shifts are tried where the line meets an edge exactly.
+        for shift_x_m, shift_y_m in ((0.0, 0.0), (1.1e-7, 2.3e-7), (-3.7e-7, 1.9e-7)):
+            x_m, y_m = corners_m[:, 0] - shift_x_m, corners_m[:, 1] - shift_y_m
+            # Twice the signed areas between the line and each edge; two faces compute identical bits for their edge.
             areas = np.roll(x_m, -1, 0) * np.roll(y_m, -2, 0) - np.roll(y_m, -1, 0) * np.roll(x_m, -2, 0)
-            whole = areas.sum(axis=0)
-            if not ((areas == 0).any(axis=0) & (whole != 0)).any():
+            total_area = areas.sum(axis=0)
+            if not ((areas == 0).any(axis=0) & (total_area != 0)).any():
                 break
         with np.errstate(divide="ignore", invalid="ignore"):
-            is_above = (areas * corners_m[:, 2]).sum(axis=0) / whole > self._faces.compute_contact_distances_m(faces)
-        way = (areas > 0).all(axis=0).astype(np.int64) - (areas < 0).all(axis=0)
-        return bodies[np.bincount(of, way * (is_above & is_closed), len(bodies)) > 0]
+            height_m = (areas * corners_m[:, 2]).sum(axis=0) / total_area
+            is_above = height_m > self._faces.compute_contact_distances_m(faces)
+        crossing = (areas > 0).all(axis=0).astype(np.int64) - (areas < 0).all(axis=0)  # 1 leaves, -1 enters
+        return bodies[np.bincount(body_rows, crossing * (is_above & is_closed), len(bodies)) > 0]
 
 
 def cast_from_vehicle(
     caster: RayCaster, part_T_vehicle: Matrix, origin_m: Matrix, directions: Float32, limit_m: Float32
 ) -> Hits:
-    """Cast rays of the vehicle frame at a caster in its own frame."""
-    towards = rotate(part_T_vehicle[:3, :3], directions)
-    return caster.cast(transform_points(part_T_vehicle, origin_m[None])[0], towards, limit_m)
+    """Cast rays of the vehicle frame at bodies in another frame.
+
+    Args:
+        caster: Bodies.
+        part_T_vehicle: (4, 4) transform from the vehicle frame to that of the bodies.
+        origin_m: (3,) origin in the vehicle frame.
+        directions: (3, N) unit directions in the vehicle frame.
+        limit_m: (N,) largest range of each ray.
+    """
+    part_directions = rotate(part_T_vehicle[:3, :3], directions)
+    return caster.cast(transform_points(part_T_vehicle, origin_m[None])[0], part_directions, limit_m)

@@ -1,8 +1,8 @@
-"""The directions of a sensor's rays in tiles, each a narrow cone; and which of them may hit which of the bodies around.
+"""Ray tiles of sensors, and conservative culling tests of rays against bodies.
 
-That is a test that is cheaper than casting. Seen from one place, a box fills a pyramid: four planes through that place
-bound it. A ray on the outer side of one of them misses the box, and so does a whole cone of rays that lies there.
-Nothing is left out that could be hit.
+The tests are cheaper than casting. From one origin a box fills a pyramid that is bounded by four planes through the
+origin. A ray on the outer side of a plane misses the box, and so does a cone of rays that lies there. The tests never
+exclude a ray that could hit.
 """
 
 from collections.abc import Iterator
@@ -14,46 +14,48 @@ from numpy.typing import NDArray
 
 from torchcover.geometry.arrays import Bools, Float32, Float64, Int64
 
-# Rows and columns in a tile. A constant, so that the order of points depends on the sensor alone.
+# Rows and columns of a tile. They are fixed, so that the order of points depends on the sensor alone.
 TILE_ROWS = 128
 TILE_COLUMNS = 256
-# Rows and columns in a block of a tile: what is cast at a body is first looked for by the block.
-BLOCK = 8
-# Angles between float32 directions are off by less than this, in radians.
-ROUNDING = 1e-5
-# A box whose corners are not all this far in front of the sensor has no pyramid, in metres.
-CLOSEST_M = 0.05
-# Of a box.
-CORNERS = 8
-# By how much boxes are grown for their bodies' float32 coordinates: in metres, and as a share of their coordinates.
-SLACK_M = 1e-3
-SLACK_SHARE = 1e-6
-# Ranges are compared with this much to spare, in metres: a grazing ray's range is not exact.
-RANGE_SLACK_M = 0.01
-# A cosine between two float32 directions is off by less.
-COSINE_ROUNDING = 5e-7
-# So many pairs of a ball and a block are looked at together.
-PAIRS_AT_ONCE = 1 << 20
-# Of so many places or less it is found out of each which rays may meet it; of more, those within such an angle of each
-# other, as seen from the vehicle, are looked at together.
-FEW = 800
-TOGETHER_RAD = 0.2
+# Rows and columns of a block of a tile, the unit of the first culling test.
+BLOCK_SIZE = 8
 
 
 AnyFloat = TypeVar("AnyFloat", np.float32, np.float64)
 
 
-@dataclass(frozen=True, eq=False)
-class Tile:
-    """Rays that point to about the same place, cut into blocks that are narrower still.
+@dataclass(frozen=True)
+class CullingParams:
+    """Tolerances by which culling tests allow for the rounding of float32.
 
     Args:
-        directions: (3, n) float32 unit directions in the sensor's frame.
-        axis: (3,) float64 middle of the cone that holds them.
-        half_angle_rad: Half the opening of that cone in radians.
-        block_rays: (B, m) numbers of the rays in each block; one with fewer rays than others repeats one of them.
-        min_block_directions: (3, B) float64 smallest x, y, z among the directions of each block.
-        max_block_directions: (3, B) largest.
+        angle_rounding_rad: Bound on the error of an angle between float32 directions.
+        cosine_rounding: Bound on the error of a cosine between two float32 directions.
+        slack_m: Margin around boxes and spheres, for float32 coordinates of their bodies.
+        relative_slack: The same, per meter of coordinates.
+        range_slack_m: Margin of range comparisons, since the range of a grazing ray is inexact.
+        min_depth_m: Boxes with a corner less than this in front of the origin have no bounding pyramid.
+    """
+
+    angle_rounding_rad: float = 1e-5
+    cosine_rounding: float = 5e-7
+    slack_m: float = 1e-3
+    relative_slack: float = 1e-6
+    range_slack_m: float = 0.01
+    min_depth_m: float = 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class Tile:
+    """Rays of a sensor in similar directions, divided into blocks of even closer rays.
+
+    Args:
+        directions: (3, n) float32 unit directions in the sensor frame.
+        axis: (3,) float64 axis of the cone around all rays.
+        half_angle_rad: Half the opening angle of that cone.
+        block_rays: (B, m) ray indices of each block; a block with fewer rays repeats one of its rays.
+        min_block_directions: (3, B) float64 smallest x, y, z of the directions of each block.
+        max_block_directions: (3, B) float64 largest x, y, z.
     """
 
     directions: Float32
@@ -64,73 +66,115 @@ class Tile:
     max_block_directions: Float64
 
     def select(self, mask: Bools) -> "Tile":
-        """The tile of those of its rays for which (n,) is true, in the same cone."""
-        filled = mask[self.block_rays]
-        kept = filled.any(axis=1)
-        # The others repeat the first one of their block.
-        blocks, filled = self.block_rays[kept], filled[kept]
-        first = np.take_along_axis(blocks, filled.argmax(axis=1)[:, None], axis=1)
-        numbers = (np.cumsum(mask) - 1)[np.where(filled, blocks, first)]
-        lower, upper = self.min_block_directions[:, kept], self.max_block_directions[:, kept]
-        return Tile(self.directions[:, mask], self.axis, self.half_angle_rad, numbers, lower, upper)
+        """Select the rays of a (n,) mask; the cone and the bounds of the blocks stay."""
+        is_selected = mask[self.block_rays]
+        has_rays = is_selected.any(axis=1)
+        blocks, is_selected = self.block_rays[has_rays], is_selected[has_rays]
+        # Rays that were removed are replaced by the first selected ray of their block.
+        first_rays = np.take_along_axis(blocks, is_selected.argmax(axis=1)[:, None], axis=1)
+        ray_indices = (np.cumsum(mask) - 1)[np.where(is_selected, blocks, first_rays)]
+        lower, upper = self.min_block_directions[:, has_rays], self.max_block_directions[:, has_rays]
+        return Tile(self.directions[:, mask], self.axis, self.half_angle_rad, ray_indices, lower, upper)
 
 
 class SearchSpheres(NamedTuple):
-    """Balls in the vehicle frame: (K, 3) `centers_m`, and one `radius_m` of all or (K,) of each, if each holds many."""
+    """Spheres around query points, outside of which no sensor point matters.
+
+    Args:
+        centers_m: (K, 3) centers in the vehicle frame.
+        radius_m: One radius of all, or (K,) radii if each sphere stands for several points.
+    """
 
     centers_m: NDArray[np.floating]
     radius_m: float | Float64
 
     @classmethod
-    def from_points(cls, points_m: NDArray[np.floating], radius_m: float) -> Self:
-        """One around each of (N, 3) points; of more than a few, larger ones that hold those of neighbours."""
-        if len(points_m) <= FEW:
+    def from_points(
+        cls,
+        points_m: NDArray[np.floating],
+        radius_m: float,
+        *,
+        max_separate_points: int = 800,
+        cluster_angle_rad: float = 0.2,
+    ) -> Self:
+        """Build spheres around points.
+
+        Args:
+            points_m: (N, 3) points in the vehicle frame.
+            radius_m: Search radius around each point.
+            max_separate_points: Up to this number each point has a sphere; more points share larger spheres.
+            cluster_angle_rad: Size of the clusters that share a sphere, as seen from the vehicle.
+        """
+        if len(points_m) <= max_separate_points:
             return cls(points_m, radius_m)
         points = points_m.astype(np.float64)
-        away_m = np.maximum(np.hypot(points[:, 0], points[:, 1]), 1.0)
-        # About as wide as they are high and deep, seen from the vehicle.
-        shells, towards = np.log(away_m) / TOGETHER_RAD, np.arctan2(points[:, 1], points[:, 0]) / TOGETHER_RAD
-        cells = np.floor([shells, towards, points[:, 2] / (away_m * TOGETHER_RAD)]).astype(np.int64)
+        distance_m = np.maximum(np.hypot(points[:, 0], points[:, 1]), 1.0)
+        # Cells of logarithmic polar coordinates are about as deep and high as they are wide.
+        radial = np.log(distance_m) / cluster_angle_rad
+        angular = np.arctan2(points[:, 1], points[:, 0]) / cluster_angle_rad
+        cells = np.floor([radial, angular, points[:, 2] / (distance_m * cluster_angle_rad)]).astype(np.int64)
         cells -= cells.min(axis=1, keepdims=True)
-        key = np.ravel_multi_index(tuple(cells), tuple(cells.max(axis=1) + 1))
-        order = np.argsort(key, kind="stable")
-        first, points = np.flatnonzero(np.diff(key[order], prepend=-1)), points[order]
-        centres_m = (np.minimum.reduceat(points, first) + np.maximum.reduceat(points, first)) / 2
-        of_each = np.repeat(centres_m, np.diff(first, append=len(points)), axis=0)
-        return cls(centres_m, np.maximum.reduceat(np.linalg.norm(points - of_each, axis=1), first) + radius_m)
+        cell_indices = np.ravel_multi_index(tuple(cells), tuple(cells.max(axis=1) + 1))
+        order = np.argsort(cell_indices, kind="stable")
+        starts, points = np.flatnonzero(np.diff(cell_indices[order], prepend=-1)), points[order]
+        centers_m = (np.minimum.reduceat(points, starts) + np.maximum.reduceat(points, starts)) / 2
+        point_centers_m = np.repeat(centers_m, np.diff(starts, append=len(points)), axis=0)
+        point_distances_m = np.linalg.norm(points - point_centers_m, axis=1)
+        return cls(centers_m, np.maximum.reduceat(point_distances_m, starts) + radius_m)
 
-    def find_rays_through(self, tile: Tile, vehicle_T_sensor: Float64) -> Bools:
-        """(n,) whether each ray of a tile may pass through one of them, and of the others some."""
-        ways_m = (self.centers_m - vehicle_T_sensor[:3, 3]) @ vehicle_T_sensor[:3, :3]
-        distance_m = np.linalg.norm(ways_m, axis=1)
-        radius_m = self.radius_m + SLACK_M + SLACK_SHARE * distance_m
+    def find_rays_through(
+        self, tile: Tile, vehicle_T_sensor: Float64, params: CullingParams = CullingParams()
+    ) -> Bools:
+        """Find the rays of a tile that may pass through a sphere.
+
+        Args:
+            tile: Rays of the sensor.
+            vehicle_T_sensor: (4, 4) extrinsics of the sensor.
+            params: Tolerances.
+
+        Returns:
+            (n,) False only where a ray certainly passes through no sphere.
+        """
+        pairs_per_chunk = 1 << 20  # pairs of a sphere and a block, bounds the memory
+        centers_m = (self.centers_m - vehicle_T_sensor[:3, 3]) @ vehicle_T_sensor[:3, :3]
+        distance_m = np.linalg.norm(centers_m, axis=1)
+        radius_m = self.radius_m + params.slack_m + params.relative_slack * distance_m
         if (distance_m <= radius_m).any():
             return np.ones(tile.directions.shape[1], dtype=bool)
-        towards, angle = ways_m / distance_m[:, None], np.arcsin(radius_m / distance_m) + ROUNDING
+        towards = centers_m / distance_m[:, None]
+        angle = np.arcsin(radius_m / distance_m) + params.angle_rounding_rad
         off_axis = np.arccos(np.clip(towards @ tile.axis, -1.0, 1.0))
-        near = np.flatnonzero(off_axis <= angle + tile.half_angle_rad + ROUNDING)
-        met = np.zeros(tile.directions.shape[1], dtype=bool)
-        middle, half = (
-            (tile.min_block_directions + tile.max_block_directions) / 2,
-            (tile.max_block_directions - tile.min_block_directions) / 2,
-        )
-        for some in np.array_split(near, len(near) * len(tile.block_rays) // PAIRS_AT_ONCE + 1):
-            # By the chords between directions: those of a block are within half of its diagonal of its middle.
-            chord = 2 * np.sin(angle[some] / 2)[:, None] + np.linalg.norm(half, axis=0)
-            touched = 1 + (middle**2).sum(axis=0) - 2 * towards[some] @ middle <= chord**2 + ROUNDING**2
-            if isinstance(self.radius_m, np.ndarray):  # wide ones, next to which a block is small
-                met[tile.block_rays[touched.any(axis=0)]] = True
+        in_cone = np.flatnonzero(off_axis <= angle + tile.half_angle_rad + params.angle_rounding_rad)
+        may_pass = np.zeros(tile.directions.shape[1], dtype=bool)
+        block_center = (tile.min_block_directions + tile.max_block_directions) / 2
+        block_half_size = (tile.max_block_directions - tile.min_block_directions) / 2
+        for chunk in np.array_split(in_cone, len(in_cone) * len(tile.block_rays) // pairs_per_chunk + 1):
+            # Compare chords between unit directions: those of a block are within half its diagonal of its center.
+            chord = 2 * np.sin(angle[chunk] / 2)[:, None] + np.linalg.norm(block_half_size, axis=0)
+            squared_distance = 1 + (block_center**2).sum(axis=0) - 2 * towards[chunk] @ block_center
+            is_touched = squared_distance <= chord**2 + params.angle_rounding_rad**2
+            if isinstance(self.radius_m, np.ndarray):  # large spheres, compared with which a block is small
+                may_pass[tile.block_rays[is_touched.any(axis=0)]] = True
                 continue
-            ball, block = np.nonzero(touched)
+            sphere, block = np.nonzero(is_touched)
             rays = tile.block_rays[block]
-            x, y, z = towards[some].astype(np.float32).T[:, ball, None]
-            along = x * tile.directions[0][rays] + y * tile.directions[1][rays] + z * tile.directions[2][rays]
-            met[rays[along >= (np.cos(angle[some]) - COSINE_ROUNDING).astype(np.float32)[ball, None]]] = True
-        return met
+            x, y, z = towards[chunk].astype(np.float32).T[:, sphere, None]
+            cosine = x * tile.directions[0][rays] + y * tile.directions[1][rays] + z * tile.directions[2][rays]
+            min_cosine = (np.cos(angle[chunk]) - params.cosine_rounding).astype(np.float32)[sphere, None]
+            may_pass[rays[cosine >= min_cosine]] = True
+        return may_pass
 
 
 def compute_unit_directions(elevation_deg: Float64, azimuth_deg: Float64) -> Float64:
-    """(3, rows, columns) float64 unit vectors, of elevations above x-y and azimuths from x towards y, in degrees."""
+    """Compute unit vectors from elevations above the x-y plane and azimuths from x towards y.
+
+    Args:
+        elevation_deg: Elevations in degrees, broadcast with the azimuths to (rows, columns).
+        azimuth_deg: Azimuths in degrees.
+
+    Returns:
+        (3, rows, columns) float64 unit vectors.
+    """
     elevation, azimuth = np.broadcast_arrays(np.deg2rad(elevation_deg), np.deg2rad(azimuth_deg))
     horizontal = np.cos(elevation)
     return np.stack([horizontal * np.cos(azimuth), horizontal * np.sin(azimuth), np.sin(elevation)])
@@ -139,178 +183,262 @@ def compute_unit_directions(elevation_deg: Float64, azimuth_deg: Float64) -> Flo
 def split_into_tiles(
     directions: Float64, max_rows: int = TILE_ROWS, max_columns: int = TILE_COLUMNS
 ) -> tuple[Tile, ...]:
-    """Cut a sensor's rows and columns into tiles.
+    """Split the rays of a sensor into tiles.
 
     Args:
-        directions: (3, rows, columns) unit vectors; NaN for a pixel that has no ray.
-        max_rows: Most rows in a tile.
-        max_columns: Most columns in a tile.
+        directions: (3, rows, columns) unit vectors; NaN for a pixel without a ray.
+        max_rows: Largest number of rows of a tile.
+        max_columns: Largest number of columns of a tile.
 
     Returns:
-        The tiles, row by row; together they hold every ray once; a pixel without one is left out.
+        Tiles, row by row; together they have each ray once.
     """
-    return tuple(_tile(directions[:, *cut]) for cut in _cuts(directions.shape, max_rows, max_columns))
+    slices = _iterate_tile_slices(directions.shape, max_rows, max_columns)
+    return tuple(_build_tile(directions[:, *tile_slice]) for tile_slice in slices)
 
 
 def compute_ray_pixel_indices(directions: Float64) -> Int64:
-    """(rays,) where each ray, counted over the tiles of `split_into_tiles`, stands in (3, rows, columns), row by row."""
+    """Compute the pixel of each ray in the order of the tiles of `split_into_tiles`.
+
+    Args:
+        directions: (3, rows, columns) unit vectors; NaN for a pixel without a ray.
+
+    Returns:
+        (rays,) pixel indices, row by row.
+    """
     has_ray = ~np.isnan(directions[0])
-    pixel = np.arange(has_ray.size).reshape(has_ray.shape)
-    return np.concatenate([pixel[cut][has_ray[cut]] for cut in _cuts(directions.shape, TILE_ROWS, TILE_COLUMNS)])
+    pixels = np.arange(has_ray.size).reshape(has_ray.shape)
+    tile_pixels = []
+    for tile_slice in _iterate_tile_slices(directions.shape, TILE_ROWS, TILE_COLUMNS):
+        tile_pixels.append(pixels[tile_slice][has_ray[tile_slice]])
+    return np.concatenate(tile_pixels)
 
 
-def _cuts(shape: tuple[int, ...], tile_rows: int, tile_columns: int) -> Iterator[tuple[slice, slice]]:
+def _iterate_tile_slices(shape: tuple[int, ...], max_rows: int, max_columns: int) -> Iterator[tuple[slice, slice]]:
+    """Iterate over the row and column slices of the tiles."""
     _, rows, columns = shape
-    for top in range(0, rows, tile_rows):
-        for left in range(0, columns, tile_columns):
-            yield slice(top, top + tile_rows), slice(left, left + tile_columns)
+    for top in range(0, rows, max_rows):
+        for left in range(0, columns, max_columns):
+            yield slice(top, top + max_rows), slice(left, left + max_columns)
 
 
-def _tile(directions: Float64) -> Tile:
+def _build_tile(directions: Float64) -> Tile:
+    """Build the tile of (3, rows, columns) directions."""
     has_ray = ~np.isnan(directions[0])
     rays = directions.reshape(3, -1) if has_ray.all() else directions[:, has_ray]
-    rounded = np.ascontiguousarray(rays, dtype=np.float32)
+    float_rays = np.ascontiguousarray(rays, dtype=np.float32)
     if rays.shape[1] == 0:
-        blocks, none = np.empty((0, 1), dtype=np.int64), np.empty((3, 0))
-        return Tile(rounded, np.array([1.0, 0.0, 0.0]), 0.0, blocks, none, none)
-    middle = rays.mean(axis=1)
-    length = float(np.linalg.norm(middle))
-    # Directions that cancel have no middle; any axis will do, for the cone is then the whole sphere.
-    axis = middle / length if length > 1e-6 else np.array([1.0, 0.0, 0.0])
-    # From the longest chord: the arc cosine would lose angles below 1e-8.
+        no_blocks, no_bounds = np.empty((0, 1), dtype=np.int64), np.empty((3, 0))
+        return Tile(float_rays, np.array([1.0, 0.0, 0.0]), 0.0, no_blocks, no_bounds, no_bounds)
+    mean = rays.mean(axis=1)
+    length = float(np.linalg.norm(mean))
+    # Directions that cancel have no mean direction; any axis will do, since the cone is then the whole sphere.
+    axis = mean / length if length > 1e-6 else np.array([1.0, 0.0, 0.0])
+    # The angle follows from the longest chord, since the arc cosine loses angles below 1e-8.
     chord = np.linalg.norm(rays - axis[:, None], axis=0).max()
-    half_angle = float(2.0 * np.arcsin(min(chord / 2.0, 1.0)))
-    blocks = _blocks(has_ray)
-    in_blocks = rounded.take(blocks, axis=1)
-    lower, upper = in_blocks.min(axis=2).astype(np.float64), in_blocks.max(axis=2).astype(np.float64)
-    return Tile(rounded, axis, half_angle, blocks, lower, upper)
+    half_angle_rad = float(2.0 * np.arcsin(min(chord / 2.0, 1.0)))
+    block_rays = _build_blocks(has_ray)
+    block_directions = float_rays.take(block_rays, axis=1)
+    lower = block_directions.min(axis=2).astype(np.float64)
+    upper = block_directions.max(axis=2).astype(np.float64)
+    return Tile(float_rays, axis, half_angle_rad, block_rays, lower, upper)
 
 
-def _blocks(has_ray: Bools) -> Int64:
-    """(B, m) numbers of the rays in each block of the pixels of a tile, where (rows, columns) pixels have a ray."""
+def _build_blocks(has_ray: Bools) -> Int64:
+    """Divide a tile into square blocks of pixels; (B, m) ray indices of the blocks that have rays."""
     rows, columns = has_ray.shape
-    high, wide = min(BLOCK, rows), min(BLOCK, columns)
+    height, width = min(BLOCK_SIZE, rows), min(BLOCK_SIZE, columns)
     # Blocks at the lower and right border repeat the last row and column.
-    row = np.minimum(np.arange(-(-rows // high) * high), rows - 1).reshape(-1, 1, high, 1)
-    column = np.minimum(np.arange(-(-columns // wide) * wide), columns - 1).reshape(1, -1, 1, wide)
-    pixels = (row * columns + column).reshape(-1, high * wide)
-    filled = has_ray.ravel()[pixels]
-    # Pixels without a ray repeat the first one of their block that has one.
-    first = np.take_along_axis(pixels, filled.argmax(axis=1)[:, None], axis=1)
-    pixels = np.where(filled, pixels, first)[filled.any(axis=1)]
+    row = np.minimum(np.arange(-(-rows // height) * height), rows - 1).reshape(-1, 1, height, 1)
+    column = np.minimum(np.arange(-(-columns // width) * width), columns - 1).reshape(1, -1, 1, width)
+    pixels = (row * columns + column).reshape(-1, height * width)
+    is_filled = has_ray.ravel()[pixels]
+    # Pixels without a ray repeat the first pixel of their block that has one.
+    first_pixels = np.take_along_axis(pixels, is_filled.argmax(axis=1)[:, None], axis=1)
+    pixels = np.where(is_filled, pixels, first_pixels)[is_filled.any(axis=1)]
     return np.asarray(has_ray.cumsum()[pixels] - 1)
 
 
 def rotate(rotation: Float64, directions: Float32) -> Float32:
-    """Turn (3, n) directions. What becomes of one does not depend on the others."""
+    """Rotate directions; the result of one direction does not depend on the others.
+
+    Args:
+        rotation: (3, 3) rotation.
+        directions: (3, n) float32 directions.
+    """
     if np.array_equal(rotation, np.eye(3)):
         return directions
     return rotate_each(rotation.astype(np.float32)[None], directions)
 
 
 def rotate_each(rotations: NDArray[AnyFloat], directions: NDArray[AnyFloat]) -> NDArray[AnyFloat]:
-    """Turn each of (3, n) directions by its own of (n, 3, 3) rotations, to the bits of `rotate`."""
-    # No matrix product: BLAS rounds a single column differently, and wakes threads of its own for many.
+    """Rotate each direction by a rotation of its own, with the same rounding as `rotate`.
+
+    Args:
+        rotations: (n, 3, 3) rotations, or (1, 3, 3) for all directions.
+        directions: (3, n) directions.
+    """
+    # Not a matrix product: BLAS rounds a single column differently, and starts threads for many.
     (x, y, z), rows = directions, rotations.swapaxes(0, 1)
     return np.stack([row[:, 0] * x + row[:, 1] * y + row[:, 2] * z for row in rows])
 
 
 class BoxOutlines(NamedTuple):
-    """P boxes as one place sees them.
+    """Bounding planes of P boxes as seen from one origin.
 
-    `normals` (P, 4, 3) of planes through the place with the box on the inner side, zeros where there is none;
-    `min_distance_m` (P,) is a distance that no point of the box falls below.
+    Args:
+        normals: (P, 4, 3) normals of planes through the origin with the box on the inner side; zeros for no plane.
+        min_distance_m: (P,) lower bound of the distance of all points of the box.
     """
 
     normals: Float64
     min_distance_m: Float64
 
     def select(self, box_indices: NDArray[np.intp]) -> "BoxOutlines":
-        """Some of them."""
+        """Select boxes by their indices."""
         return BoxOutlines(self.normals[box_indices], self.min_distance_m[box_indices])
 
 
-def compute_outlines(corners_m: Float64, origin_m: Float64) -> BoxOutlines:
-    """How boxes with (P, 8, 3) corners, or (P, C, 3) at several times, look from a (3,) place in their frame."""
-    ways_m = corners_m - origin_m
-    forward = _unit(ways_m.mean(axis=1))
-    # Upright bodies fill a pyramid whose sides are upright.
+def compute_outlines(corners_m: Float64, origin_m: Float64, params: CullingParams = CullingParams()) -> BoxOutlines:
+    """Compute the bounding planes of boxes as seen from an origin.
+
+    Args:
+        corners_m: (P, 8, 3) corners of boxes in the order of `BoundingBox.corners_m`, or (P, C, 3) corners of each box
+            at several times.
+        origin_m: (3,) origin in the same frame.
+        params: Tolerances.
+    """
+    from_origin_m = corners_m - origin_m
+    forward = _normalize(from_origin_m.mean(axis=1))
+    # Upright bodies fill a pyramid with upright sides.
     x, y, z = forward.T
-    steep = np.abs(z) > 0.99
-    left = _unit(np.where(steep, [np.zeros_like(x), -z, y], [-y, x, np.zeros_like(x)]).T)
-    up = _cross(forward, left)
-    # (P, 8) of each: how far ahead, to the left, and up the corners are.
-    depth_m, left_m, up_m = np.moveaxis(ways_m @ np.stack([forward, left, up], axis=2), 2, 0)
-    nearest_m = depth_m.min(axis=1)
-    too_close = nearest_m < CLOSEST_M
-    depth_m[too_close] = 1.0
+    is_steep = np.abs(z) > 0.99
+    left = _normalize(np.where(is_steep, [np.zeros_like(x), -z, y], [-y, x, np.zeros_like(x)]).T)
+    up = _compute_cross_products(forward, left)
+    # (P, C) forward, left and up coordinates of the corners.
+    depth_m, left_m, up_m = np.moveaxis(from_origin_m @ np.stack([forward, left, up], axis=2), 2, 0)
+    min_depth_m = depth_m.min(axis=1)
+    is_close = min_depth_m < params.min_depth_m
+    depth_m[is_close] = 1.0
     normals = []
-    for side, aside_m in ((left, left_m), (up, up_m)):
-        slope = aside_m / depth_m
+    for side, side_m in ((left, left_m), (up, up_m)):
+        slope = side_m / depth_m
         normals += [side - slope.max(axis=1, keepdims=True) * forward]
         normals += [slope.min(axis=1, keepdims=True) * forward - side]
-    planes = _unit(np.stack(normals, axis=1))
-    planes[too_close] = _faces_towards(ways_m[too_close]) if corners_m.shape[1] == CORNERS else 0.0
-    return BoxOutlines(planes, np.where(too_close, 0.0, nearest_m) - RANGE_SLACK_M)
+    planes = _normalize(np.stack(normals, axis=1))
+    is_single_box = corners_m.shape[1] == 8
+    planes[is_close] = _compute_facing_normals(from_origin_m[is_close]) if is_single_box else 0.0
+    return BoxOutlines(planes, np.where(is_close, 0.0, min_depth_m) - params.range_slack_m)
 
 
-def _faces_towards(ways_m: Float64) -> Float64:
-    """(P, 4, 3) normals of the faces of boxes whose outer side the place is on: no ray that leaves it turns back.
+def _compute_facing_normals(corners_m: Float64) -> Float64:
+    """Compute the normals of the faces of boxes that the origin is in front of: no ray that leaves them comes back.
 
-    `ways_m` (P, 8, 3) lead from the place to the corners, in the order of `Box.corners_m`.
+    Args:
+        corners_m: (P, 8, 3) vectors from the origin to the corners, in the order of `BoundingBox.corners_m`.
+
+    Returns:
+        (P, 4, 3) normals; zeros for axes along which the origin is within the box.
     """
-    normals = np.zeros((len(ways_m), 4, 3))
-    for axis, across in enumerate((4, 2, 1)):
-        along = _unit(ways_m[:, across] - ways_m[:, 0])
-        behind = np.einsum("pc,pc->p", along, ways_m[:, 0]) > 0
-        beyond = np.einsum("pc,pc->p", along, ways_m[:, across]) < 0
-        normals[:, axis] = along * (beyond.astype(np.float64) - behind)[:, None]
+    normals = np.zeros((len(corners_m), 4, 3))
+    for axis, opposite_corner in enumerate((4, 2, 1)):
+        edge = _normalize(corners_m[:, opposite_corner] - corners_m[:, 0])
+        is_behind = np.einsum("pc,pc->p", edge, corners_m[:, 0]) > 0
+        is_beyond = np.einsum("pc,pc->p", edge, corners_m[:, opposite_corner]) < 0
+        normals[:, axis] = edge * (is_beyond.astype(np.float64) - is_behind)[:, None]
     return normals
 
 
-def find_boxes_in_cone(outlines: BoxOutlines, axis: Float64, half_angle_rad: float, range_m: float) -> NDArray[np.intp]:
-    """Numbers of the boxes that a ray of a cone, `half_angle_rad` radians about its axis, may meet before it ends.
+def find_boxes_in_cone(
+    outlines: BoxOutlines,
+    axis: Float64,
+    half_angle_rad: float,
+    range_m: float,
+    params: CullingParams = CullingParams(),
+) -> NDArray[np.intp]:
+    """Find the boxes that a ray of a cone may hit.
 
-    The boxes are seen from its tip, in whose frame the axis is.
+    Args:
+        outlines: Boxes as seen from the apex of the cone.
+        axis: (3,) axis of the cone, in the frame of the boxes.
+        half_angle_rad: Half the opening angle of the cone.
+        range_m: Largest range of the rays.
+        params: Tolerances.
+
+    Returns:
+        Indices of these boxes.
     """
-    wider = half_angle_rad + ROUNDING
-    # Beyond a right angle no plane has a cone on one side of it.
-    outside = (outlines.normals @ axis).max(axis=1) > (np.sin(wider) if wider < np.pi / 2 else np.inf)
-    return np.flatnonzero(~outside & (outlines.min_distance_m <= range_m))
+    wider_rad = half_angle_rad + params.angle_rounding_rad
+    # A cone wider than a half space is on no side of a plane.
+    limit = np.sin(wider_rad) if wider_rad < np.pi / 2 else np.inf
+    is_outside = (outlines.normals @ axis).max(axis=1) > limit
+    return np.flatnonzero(~is_outside & (outlines.min_distance_m <= range_m))
 
 
-def find_blocks_towards_boxes(outlines: BoxOutlines, tile: Tile, vehicle_R_sensor: Float64, range_m: Float32) -> Bools:
-    """(P, B) whether a ray of each block of a tile may meet each box, seen from the sensor, before its (n,) range."""
-    ends_m = range_m.take(tile.block_rays).max(axis=1)
+def find_blocks_towards_boxes(
+    outlines: BoxOutlines,
+    tile: Tile,
+    vehicle_R_sensor: Float64,
+    range_m: Float32,
+    params: CullingParams = CullingParams(),
+) -> Bools:
+    """Find the blocks of a tile that have a ray that may hit a box.
+
+    Args:
+        outlines: P boxes as seen from the sensor, in the vehicle frame.
+        tile: Rays with B blocks.
+        vehicle_R_sensor: (3, 3) orientation of the sensor.
+        range_m: (n,) largest range of each ray.
+        params: Tolerances.
+
+    Returns:
+        (P, B) False only where no ray of the block can hit the box.
+    """
+    block_range_m = range_m.take(tile.block_rays).max(axis=1)
     normals = (outlines.normals @ vehicle_R_sensor).reshape(-1, 3)
-    # No direction between the lower and the upper bounds of a block has a smaller product with a normal.
+    # No direction within the bounds of a block has a smaller product with a normal.
     bounds = np.vstack([tile.min_block_directions, tile.max_block_directions]).astype(np.float32)
-    towards = np.hstack([np.maximum(normals, 0.0), np.minimum(normals, 0.0)]).astype(np.float32)
-    least = (towards @ bounds).reshape(len(outlines.normals), 4, bounds.shape[1])
-    return np.asarray((least.max(axis=1) <= ROUNDING) & (outlines.min_distance_m[:, None] <= ends_m))
+    split_normals = np.hstack([np.maximum(normals, 0.0), np.minimum(normals, 0.0)]).astype(np.float32)
+    min_products = (split_normals @ bounds).reshape(len(outlines.normals), 4, bounds.shape[1])
+    is_inside = min_products.max(axis=1) <= params.angle_rounding_rad
+    return np.asarray(is_inside & (outlines.min_distance_m[:, None] <= block_range_m))
 
 
 def find_rays_towards_boxes(
-    outlines: BoxOutlines, box_indices: NDArray[np.intp], block_rays: Int64, directions: Float32, range_m: Float32
+    outlines: BoxOutlines,
+    box_indices: NDArray[np.intp],
+    block_rays: Int64,
+    directions: Float32,
+    range_m: Float32,
+    params: CullingParams = CullingParams(),
 ) -> tuple[NDArray[np.intp], Int64]:
-    """Which rays of some blocks may meet a box before they end: (L,) boxes and (L,) rays, in the order of the blocks.
+    """Find the rays of blocks that may hit the box of their block.
 
-    `box_indices` (K,) is the box of each block, `block_rays` (K, m) those in it; `directions` (3, n) of all are in the frame of the
-    boxes, and `range_m` (n,) is where they end.
+    Args:
+        outlines: Boxes as seen from the sensor.
+        box_indices: (K,) box of each block.
+        block_rays: (K, m) ray indices of each block.
+        directions: (3, n) float32 directions of all rays, in the frame of the boxes.
+        range_m: (n,) largest range of each ray.
+        params: Tolerances.
+
+    Returns:
+        (L,) box indices and (L,) ray indices of the pairs, in the order of the blocks.
     """
-    normals, nearest_m = outlines.normals.astype(np.float32), outlines.min_distance_m.astype(np.float32)
-    across = normals[box_indices] @ directions.take(block_rays, axis=1).swapaxes(0, 1)
-    within = (across.max(axis=1) <= ROUNDING) & (range_m.take(block_rays) >= nearest_m[box_indices][:, None])
-    return box_indices.repeat(within.sum(axis=1)), block_rays[within]
+    normals, min_distance_m = outlines.normals.astype(np.float32), outlines.min_distance_m.astype(np.float32)
+    products = normals[box_indices] @ directions.take(block_rays, axis=1).swapaxes(0, 1)
+    may_hit = products.max(axis=1) <= params.angle_rounding_rad
+    may_hit &= range_m.take(block_rays) >= min_distance_m[box_indices][:, None]
+    return box_indices.repeat(may_hit.sum(axis=1)), block_rays[may_hit]
 
 
-def _cross(a: Float64, b: Float64) -> Float64:
-    """(P, 3) cross products; NumPy's own takes several times as long for so few."""
+def _compute_cross_products(a: Float64, b: Float64) -> Float64:
+    """Compute (P, 3) cross products; `np.cross` takes several times as long for few vectors."""
     (ax, ay, az), (bx, by, bz) = a.T, b.T
     return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=1)
 
 
-def _unit(vectors: Float64) -> Float64:
-    # A vector of length 0 has no direction; it is left as it is.
+def _normalize(vectors: Float64) -> Float64:
+    """Normalize vectors along the last axis; vectors of length 0 stay 0."""
     length = np.sqrt((vectors * vectors).sum(axis=-1, keepdims=True))
     return np.asarray(vectors / np.maximum(length, np.finfo(np.float64).tiny))

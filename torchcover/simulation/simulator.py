@@ -1,4 +1,4 @@
-"""The simulator: what rigs and a reference sensor see of a scenario, step by step."""
+"""Simulator: sensor and reference points of rigs in a scenario, frame by frame."""
 
 import copy
 import math
@@ -26,15 +26,16 @@ from torchcover.simulation.world import ObjectLabel, compute_labels
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """The clouds of one step in the vehicle frame (x forward, y left, z up, metres), without points of the ego itself.
+    """Points of one frame in the vehicle frame (x forward, y left, z up, meters), without points on the ego vehicle.
 
     Args:
-        scans: Name of each rig -> what each of its sensors saw.
-        reference: (M, 3) float32 points of the reference sensor.
-        reference_weights: (M,) float32 square metres that each of them stands for; None if they count the same.
-        reference_heights_m: (M,) float32 heights of the reference points above the local ground, from `ReferenceScan`.
-        sampled_point_counts: (objects,) how many points the reference drew on each of `World.objects`, from `ReferenceScan`.
-        counts: How many rays there were, how many of them the ego took, and what was left out, by name.
+        scans: Rig name -> scan of each of its sensors.
+        reference: (M, 3) float32 reference points.
+        reference_weights: (M,) float32 area in m² that each reference point represents; None if all count equally.
+        reference_heights_m: (M,) float32 heights above the local ground, see `ReferenceScan`; None without heights.
+        sampled_point_counts: (objects,) number of points that the reference sampled on each of `Scene.objects`, see
+            `ReferenceScan`; None without object sampling.
+        counts: Numbers of rays, self hits, omitted work and others by name.
     """
 
     scans: Mapping[str, Sequence[SensorScan]]
@@ -46,36 +47,34 @@ class Observation:
 
     @cached_property
     def clouds(self) -> Mapping[str, Float32]:
-        """Name of each rig -> (N, 3) float32 points of all its sensors, in their order, where they truly are."""
+        """Rig name -> (N, 3) float32 ground-truth hit points of all its sensors, in the order of the sensors."""
         return {name: np.concatenate([scan.points for scan in scans]) for name, scans in self.scans.items()}
 
 
 class Simulator:
-    """What rigs and a reference sensor see of a scenario, at any step.
+    """Simulator of rigs and a reference sensor in a scenario.
 
-    A step depends on the scenario, the rigs, the seed and its index, and on nothing else: not on threads, processes or
-    the order of steps. The reference is cast once, and every rig sees the same instant: comparisons are paired. Rays
+    A frame depends only on the scenario, the rigs, the seed and its index, not on threads, processes or the order of
+    frames. All rigs observe the same scene and share the reference points, so that their differences are paired. Rays
     are cast on as many threads as torch uses (`torch.set_num_threads`).
 
     Args:
-        scenario: The world; `set_ego` gives it its ego. Beyond its end the same plays again, or another one; see
-            `Scenario.repeats`.
-        rigs: The sensors, by the name under which `Observation.clouds` has their points.
-        reference_sensor: The reference sensor.
-        seed: Seed of the traffic, of the reference sensor, and of noise and drop-out.
-        frame_interval_s: Time between one step and the next, a multiple of the scenario's time step; that step if not given.
-        max_cached_bytes: What the worlds that are kept, in case they are needed again, may take; a small share of the
-            machine's memory if not given.
-        search_radius_m: Only points of the rigs that lie so near to one of the reference are asked for, as detections up to
-            this threshold do: rays that hit nothing there are not cast. Those points are the same to the bit.
-        no_cache: Whether worlds that are drawn are built though they lie on disk from an earlier run, and are not kept
-            there either; frames are the same to the bit.
-        device: Of Warp (`torchcover[warp]`), such as `cuda:0`, where rays are cast at what never moves, in one process;
-            by Embree, which agrees but for the last bits, if not given.
+        scenario: Scenario; `set_ego` chooses its ego vehicle. Beyond its end it repeats, or continues in another scene,
+            see `Scenario.is_repeating`.
+        rigs: Rigs by the name that `Observation.clouds` uses.
+        reference_sensor: Reference sensor.
+        seed: Seed of traffic, reference sensor and sensor noise.
+        frame_interval_s: Time between two frames, a multiple of the time step of the scenario; None for one time step.
+        max_cached_bytes: Memory for scenes that are cached for later frames; None for a small share of the memory.
+        search_radius_m: Only sensor points within this distance of a reference point are needed, as for detection rates
+            up to this threshold; rays that cannot give such points are not cast. The needed points do not change.
+        no_cache: True to neither read nor write the scene cache on disk; frames do not change.
+        device: Warp device (`torchcover[warp]`), such as `cuda:0`, for static bodies in a single process; None for
+            Embree. Both agree up to the last bits.
 
     Raises:
-        ValueError: Rigs that name different vehicles, a negative seed, a time that is no multiple of the time step,
-            more rays than there is memory for.
+        ValueError: Rigs that name different vehicles, a negative seed, an interval that is no multiple of the time
+            step, or more rays than the memory can hold.
 
     Example:
         >>> from torchcover.simulation import PaperReference
@@ -106,100 +105,117 @@ class Simulator:
         self.reference_sensor = reference_sensor
         self.seed = seed
         self.search_radius_m = search_radius_m
-        self._every_steps = 1 if frame_interval_s is None else scenario.count_time_steps(frame_interval_s)
-        self._stages = MountedRigStore(
-            SceneStore(scenario, seed, max_cached_bytes, no_cache=no_cache, device=device), rigs
-        )
-        self._check_size()
+        self._time_steps_per_frame = 1 if frame_interval_s is None else scenario.count_time_steps(frame_interval_s)
+        scene_store = SceneStore(scenario, seed, max_cached_bytes, no_cache=no_cache, device=device)
+        self._rig_store = MountedRigStore(scene_store, rigs)
+        self._check_memory()
 
     @property
     def frame_interval_s(self) -> float:
-        """Time between one step and the next."""
-        return self._every_steps * self.scenario.effective_time_step_s
+        """Time between two frames."""
+        return self._time_steps_per_frame * self.scenario.effective_time_step_s
 
     @property
     def num_distinct_frames(self) -> int | None:
-        """How many steps show an instant for the first time; all later ones repeat them. None: no step ever does."""
-        instants = self.scenario.num_distinct_time_steps
-        return None if instants is None else instants // math.gcd(instants, self._every_steps)
+        """Number of frames before the scenario repeats; None if it never does."""
+        num_time_steps = self.scenario.num_distinct_time_steps
+        return (
+            None if num_time_steps is None else num_time_steps // math.gcd(num_time_steps, self._time_steps_per_frame)
+        )
 
     def get_block_index(self, index: int) -> int:
-        """The number by which standard errors tell a step from others; steps that share it are alike.
+        """Get the block of a frame for standard errors: frames with the same block are correlated.
 
-        Where each run has a world of its own, that is the number of the run: its steps share a city. In a scenario that
-        repeats it is the instant, be it seen for the first time or again. Where there is a single instant only the
-        reference sensor's draw differs, and every step has a number of its own.
+        It is the index of the run if each run has a scene of its own, such as a city. In a scenario that repeats it is
+        the time step, which is the same in all repetitions. In a scenario of a single time step each frame is a block,
+        since only the random reference sensor differs.
+
+        Args:
+            index: Index of the frame.
         """
         if self.scenario.num_distinct_time_steps == 1:
             return index
-        run, step = self.scenario.locate(index * self._every_steps)
-        return step if self.scenario.is_repeating else run
+        run_index, time_step_index = self.scenario.locate(index * self._time_steps_per_frame)
+        return time_step_index if self.scenario.is_repeating else run_index
 
     def replace_reference_sensor(self, reference_sensor: ReferenceSensor) -> Self:
-        """The same instants as another reference sensor sees them; the geometry is built once for both."""
-        other = copy.copy(self)
-        other.reference_sensor = reference_sensor
-        other._check_size()
-        return other
-
-    def replace_rigs(self, rigs: Mapping[str, Rig]) -> Self:
-        """The same instants as other rigs see them, on the same ego; the geometry is built once for both.
+        """Create a simulator of the same frames with another reference sensor; both share the geometry of the scenes.
 
         Args:
-            rigs: The sensors, by the name under which `scans` has what they see. What vehicle they name says nothing.
+            reference_sensor: Reference sensor.
+
+        Raises:
+            ValueError: More rays than the memory can hold.
         """
-        other = copy.copy(self)
-        other.rigs = rigs
-        other._stages = self._stages.replace_rigs(rigs)
-        other._check_size()
-        return other
+        simulator = copy.copy(self)
+        simulator.reference_sensor = reference_sensor
+        simulator._check_memory()
+        return simulator
+
+    def replace_rigs(self, rigs: Mapping[str, Rig]) -> Self:
+        """Create a simulator of the same frames with other rigs; both share the geometry of the scenes.
+
+        Args:
+            rigs: Rigs by name. The ego vehicle stays, whatever vehicle they name.
+
+        Raises:
+            ValueError: More rays than the memory can hold.
+        """
+        simulator = copy.copy(self)
+        simulator.rigs = rigs
+        simulator._rig_store = self._rig_store.replace_rigs(rigs)
+        simulator._check_memory()
+        return simulator
 
     def simulate_scans(
         self, index: int, search_spheres: SearchSpheres | None = None
     ) -> Mapping[str, Sequence[SensorScan]]:
-        """What the sensors see at one step, as in `step`, bit for bit; the reference is not cast.
+        """Simulate the sensors in one frame as `simulate_frame` does, without the reference sensor.
 
         Args:
-            index: Number of the step, from 0.
-            search_spheres: What is asked about, as in `MountedSensor.scan`; everything if not given.
+            index: Index of the frame, from 0.
+            search_spheres: Spheres outside of which no points are needed, see `MountedSensor.scan`; None for all.
 
         Returns:
-            Name of each rig -> what each of its sensors saw.
+            Rig name -> scan of each of its sensors.
 
         Raises:
             FileNotFoundError: A mesh, vehicle or trajectory file is missing.
-            ValueError: As for `step`.
+            ValueError: See `simulate_frame`.
 
         Example:
             >>> from torchcover.simulation import PaperReference
-            >>> empty = Simulator(Scenario.load("courtyard"), {}, PaperReference(rows=16, columns=16))
-            >>> [roof] = empty.replace_rigs({"rig": Rig.load("front_roof_128")}).simulate_scans(0)["rig"]
+            >>> simulator = Simulator(Scenario.load("courtyard"), {}, PaperReference(rows=16, columns=16))
+            >>> simulator = simulator.replace_rigs({"candidate": Rig.load("front_roof_128")})
+            >>> [roof] = simulator.simulate_scans(0)["candidate"]
             >>> roof.num_rays, roof.points.dtype
             (230400, dtype('float32'))
         """
-        stage, instant = self.prepare_frame(index)
-        return self._scans(stage, instant, index, search_spheres)
+        mounted_rigs, snapshot = self.prepare_frame(index)
+        return self._scan(mounted_rigs, snapshot, index, search_spheres)
 
     def simulate_frame(self, index: int) -> Observation:
-        """What is seen at one step.
+        """Simulate the reference sensor and all rigs in one frame.
 
         Args:
-            index: Number of the step, from 0.
+            index: Index of the frame, from 0.
 
         Raises:
             FileNotFoundError: A mesh, vehicle or trajectory file is missing.
-            ValueError: A negative index, a sensor inside a body or below the ground, an actor that overlaps the ego, an
-                ego below the ground.
+            ValueError: A negative index, a sensor inside a body or below the ground, an actor that overlaps the ego
+                vehicle, or an ego vehicle below the ground.
         """
-        stage, instant = self.prepare_frame(index)
-        generator, name = np.random.default_rng([self.seed, index]), f"{self.scenario.name} step {index}"
-        around = ReferenceContext(stage.scene_geometry, instant, generator, name, num_threads=torch.get_num_threads())
-        reference = self.reference_sensor.scan(around)
-        within = (
-            None if self.search_radius_m is None else SearchSpheres.from_points(reference.points, self.search_radius_m)
-        )
-        scans = self._scans(stage, instant, index, within)
-        of_all_rigs = [scan for of_rig in scans.values() for scan in of_rig]
+        mounted_rigs, snapshot = self.prepare_frame(index)
+        geometry = mounted_rigs.scene_geometry
+        rng = np.random.default_rng([self.seed, index])
+        frame_name = f"{self.scenario.name} step {index}"
+        context = ReferenceContext(geometry, snapshot, rng, frame_name, num_threads=torch.get_num_threads())
+        reference = self.reference_sensor.scan(context)
+        # Rays that cannot give points near a reference point are not cast.
+        search_spheres = None
+        if self.search_radius_m is not None:
+            search_spheres = SearchSpheres.from_points(reference.points, self.search_radius_m)
+        scans = self._scan(mounted_rigs, snapshot, index, search_spheres)
         return Observation(
             scans=scans,
             reference=reference.points,
@@ -207,38 +223,42 @@ class Simulator:
             reference_heights_m=reference.heights_m,
             sampled_point_counts=reference.sampled_point_counts,
             counts={
-                **_counts_of(stage.scene_geometry, instant, of_all_rigs, reference),
+                **_count_rays(geometry, snapshot, scans, reference),
                 "repeated_frames": int(self.num_distinct_frames is not None and index >= self.num_distinct_frames),
             },
         )
 
     def check_run(self, num_frames: int) -> None:
-        """Refuse before its first step what a run through a world that repeats would end with; others come as they are.
+        """Check a run before its first frame, for errors that would end it later.
+
+        Only a scenario that repeats is checked completely; other scenes are checked when they are built.
 
         Args:
-            num_frames: How many steps the run has.
+            num_frames: Number of frames of the run.
 
         Raises:
-            ValueError: A sensor that is where none can be at the first step, an actor that overlaps the ego at any.
-            ImportError: What makes the traffic is not installed.
+            ValueError: A sensor inside a body or below the ground in the first frame, or an actor that overlaps the ego
+                vehicle in any frame.
+            ImportError: A package that generates the traffic is not installed.
 
         Warns:
-            UserWarning: Those that move do not stand on the ground.
+            UserWarning: Moving bodies do not stand on the ground.
         """
         if self.scenario.traffic is not None:
             self.scenario.traffic.check()
         if self.scenario.is_repeating:
-            stage, _ = self._stage(0)
-            world_steps = stage.scene_geometry.scene.num_time_steps
-            indices = np.arange(min(num_frames, world_steps), dtype=np.int64)  # then they repeat themselves
-            seen = np.unique(indices * self._every_steps % world_steps)
-            stage.scene_geometry.check_overlaps(seen)
-            stage.check_mounts(stage.scene_geometry.get_snapshot(0))
-            warn_about_missing_ground(self.scenario.name, stage.scene_geometry, seen)
+            mounted_rigs, _ = self._get_mounted_rigs(0)
+            geometry = mounted_rigs.scene_geometry
+            num_time_steps = geometry.scene.num_time_steps
+            indices = np.arange(min(num_frames, num_time_steps), dtype=np.int64)  # later frames repeat
+            time_step_indices = np.unique(indices * self._time_steps_per_frame % num_time_steps)
+            geometry.check_overlaps(time_step_indices)
+            mounted_rigs.check_mounts(geometry.get_snapshot(0))
+            warn_about_missing_ground(self.scenario.name, geometry, time_step_indices)
 
     @property
     def ground_note(self) -> str:
-        """What is taken for the ground of a scenario that does not say it; no words if it does.
+        """Note on the ground of a scenario that does not mark its ground; empty if it does.
 
         Example:
             >>> from torchcover.simulation import PaperReference
@@ -247,114 +267,159 @@ class Simulator:
         """
         if self.scenario.has_ground:
             return ""
-        names = [body.name for body in self.scenario.bodies for _ in body.poses]
-        found = zip(names, self.get_scene_geometry(0)[0].ground_masks, strict=True)
-        taken = dict.fromkeys(repr(name) for name, is_ground in found if is_ground.any())
-        if not taken:
+        body_names = [body.name for body in self.scenario.bodies for _ in body.poses]
+        ground_names: list[str] = []
+        for name, mask in zip(body_names, self.get_scene_geometry(0)[0].ground_masks, strict=True):
+            if mask.any() and repr(name) not in ground_names:
+                ground_names.append(repr(name))
+        if not ground_names:
             return (
                 "Ground: none was found under the ego, so that no point has a height above it; mark bodies as ground."
             )
-        what = "level faces under the ego, and what is level and connected with them"
-        return f"Ground: {what}, of {', '.join(taken)}; bodies with `ground: true` say it otherwise."
+        return (
+            f"Ground: level faces under the ego and level faces that are connected with them, of "
+            f"{', '.join(ground_names)}; bodies with `ground: true` replace this choice."
+        )
 
     def compute_labels(self, index: int) -> list[ObjectLabel]:
-        """The objects within the reference sensor's range at one step; names are an object's own within a run."""
-        scene, step = self.get_scene_geometry(index)
-        return compute_labels(scene.scene, step, self.reference_sensor.max_range_m)
+        """Compute the labels of all objects in range of the reference sensor; names are unique within a run.
+
+        Args:
+            index: Index of the frame.
+        """
+        geometry, time_step_index = self.get_scene_geometry(index)
+        return compute_labels(geometry.scene, time_step_index, self.reference_sensor.max_range_m)
 
     def compute_bottom_heights_m(self, index: int, labels: Sequence[ObjectLabel]) -> Float32:
-        """(K,) height of the bottom of each label's box at a step above the highest ground below its centre."""
-        scene, step = self.get_scene_geometry(index)
-        world_T_vehicle = scene.scene.ego.trajectory.interpolate(step * scene.scene.time_step_s)
-        centres_m = np.array([label.center_m for label in labels]).reshape(-1, 3)
-        halves_m = np.array([label.size_m[2] / 2 for label in labels], dtype=np.float32)
-        return scene.ground.compute_heights_m(centres_m, world_T_vehicle) - halves_m
+        """Compute the heights of the bottoms of boxes above the highest ground below their centers.
+
+        Args:
+            index: Index of the frame.
+            labels: K labels of that frame.
+
+        Returns:
+            (K,) float32 heights in meters; NaN without ground.
+        """
+        geometry, time_step_index = self.get_scene_geometry(index)
+        world_T_vehicle = geometry.scene.ego.trajectory.interpolate(time_step_index * geometry.scene.time_step_s)
+        centers_m = np.array([label.center_m for label in labels]).reshape(-1, 3)
+        half_heights_m = np.array([label.size_m[2] / 2 for label in labels], dtype=np.float32)
+        return geometry.ground.compute_heights_m(centers_m, world_T_vehicle) - half_heights_m
 
     def get_scene_geometry(self, index: int) -> tuple[SceneGeometry, int]:
-        """The geometry of the world in which a step plays, and the time step in it.
+        """Get the geometry of the scene of a frame, and the time step in it.
 
-        It is built when first needed, once in each process for each run through the scenario.
+        Each process builds the geometry once per run through the scenario, on first use.
+
+        Args:
+            index: Index of the frame.
         """
-        stage, step = self._stage(index)
-        return stage.scene_geometry, step
+        mounted_rigs, time_step_index = self._get_mounted_rigs(index)
+        return mounted_rigs.scene_geometry, time_step_index
 
     def get_run_index(self, index: int) -> int:
-        """Which run through the scenario a step belongs to: each is a world of its own, unless it repeats."""
-        return self.scenario.locate(index * self._every_steps)[0]
+        """Get the index of the run through the scenario; each run has a scene of its own unless the scenario repeats.
 
-    def _check_size(self) -> None:
-        of_rigs = sum(sensor.num_rays for rig in self.rigs.values() for sensor in rig.sensors)
-        rays = of_rigs + self.reference_sensor.num_rays
+        Args:
+            index: Index of the frame.
+        """
+        return self.scenario.locate(index * self._time_steps_per_frame)[0]
+
+    def _check_memory(self) -> None:
+        """Raise ValueError if the rays of one frame do not fit into the memory."""
+        rig_rays = sum(sensor.num_rays for rig in self.rigs.values() for sensor in rig.sensors)
+        reference_rays = self.reference_sensor.num_rays
+        num_rays = rig_rays + reference_rays
         check_memory_fits(
-            f"{rays:,} rays a step ({of_rigs:,} of the rig's sensors, {self.reference_sensor.num_rays:,} of the reference)",
-            BYTES_PER_RAY * rays,
+            f"{num_rays:,} rays per frame ({rig_rays:,} of the rig's sensors, {reference_rays:,} of the reference)",
+            BYTES_PER_RAY * num_rays,
             "use fewer rays, rows or columns",
         )
 
-    def _stage(self, index: int) -> tuple[MountedRigs, int]:
+    def _get_mounted_rigs(self, index: int) -> tuple[MountedRigs, int]:
+        """Get the mounted rigs in the scene of a frame, and the time step in it."""
         if index < 0:
             raise ValueError(f"index: a number >= 0 is needed; got {index}")
-        run, step = self.scenario.locate(index * self._every_steps)
-        return self._stages.get_mounted_rigs(run), step
+        run_index, time_step_index = self.scenario.locate(index * self._time_steps_per_frame)
+        return self._rig_store.get_mounted_rigs(run_index), time_step_index
 
     def prepare_frame(self, index: int) -> tuple[MountedRigs, SceneSnapshot]:
-        """The stage of a step, and all of it at its time, with no sensor where none can be.
+        """Prepare the scene of a frame and check the mounting positions.
 
         Args:
-            index: Number of the step, from 0.
+            index: Index of the frame, from 0.
+
+        Returns:
+            Mounted rigs, and the scene at the time of the frame.
 
         Raises:
-            FileNotFoundError, ValueError: As for `step`.
+            FileNotFoundError: A mesh, vehicle or trajectory file is missing.
+            ValueError: See `simulate_frame`.
         """
-        stage, step = self._stage(index)
-        instant = stage.scene_geometry.get_snapshot(step, max_distance_m=self._reach_m(stage.scene_geometry.ego_box))
-        stage.check_mounts(instant)
-        return stage, instant
+        mounted_rigs, time_step_index = self._get_mounted_rigs(index)
+        geometry = mounted_rigs.scene_geometry
+        reach_m = self._compute_reach_m(geometry.ego_box)
+        snapshot = geometry.get_snapshot(time_step_index, max_distance_m=reach_m)
+        mounted_rigs.check_mounts(snapshot)
+        return mounted_rigs, snapshot
 
-    def _reach_m(self, ego: BoundingBox) -> float:
-        """How far from the origin of the vehicle frame a sensor can see: its range starts where it is mounted."""
-        farthest_m = np.abs(ego.corners_m).max(axis=0) + self.reference_sensor.shell_m
-        reaches = [
-            float(np.linalg.norm(sensor.mount.to_matrix()[:3, 3])) + self.scenario.compute_max_range_m(sensor)
-            for rig in self.rigs.values()
-            for sensor in rig.sensors
-        ]
-        return max([float(np.linalg.norm(farthest_m)) + self.reference_sensor.max_range_m, *reaches])
+    def _compute_reach_m(self, ego_box: BoundingBox) -> float:
+        """Compute the largest distance of a visible point from the origin of the vehicle frame."""
+        corner_m = np.abs(ego_box.corners_m).max(axis=0) + self.reference_sensor.shell_m
+        reach_m = float(np.linalg.norm(corner_m)) + self.reference_sensor.max_range_m
+        # The range of a sensor begins at its mounting position.
+        for rig in self.rigs.values():
+            for sensor in rig.sensors:
+                mount_distance_m = float(np.linalg.norm(sensor.mount.to_matrix()[:3, 3]))
+                reach_m = max(reach_m, mount_distance_m + self.scenario.compute_max_range_m(sensor))
+        return reach_m
 
-    def _scans(
-        self, stage: MountedRigs, instant: SceneSnapshot, index: int, within: SearchSpheres | None
+    def _scan(
+        self,
+        mounted_rigs: MountedRigs,
+        snapshot: SceneSnapshot,
+        index: int,
+        search_spheres: SearchSpheres | None,
     ) -> dict[str, list[SensorScan]]:
-        scans: dict[str, list[SensorScan]] = {name: [] for name in stage.sensors_by_rig}
-        for name, sensors in stage.sensors_by_rig.items():
-            for k, mounted in enumerate(sensors, 1):
-                draws = SensorNoise(
-                    np.random.default_rng([self.seed, index, k]), num_rays=len(mounted.ray_pixel_indices)
-                )
-                scans[name].append(
-                    mounted.scan(instant, draws, num_threads=torch.get_num_threads(), search_spheres=within)
-                )
+        """Simulate all sensors of all rigs; sensors at the same position of different rigs share random numbers."""
+        scans: dict[str, list[SensorScan]] = {}
+        for name, sensors in mounted_rigs.sensors_by_rig.items():
+            scans[name] = []
+            # The seed has the number of the sensor, so that noise does not depend on other sensors.
+            for sensor_number, mounted in enumerate(sensors, 1):
+                rng = np.random.default_rng([self.seed, index, sensor_number])
+                noise = SensorNoise(rng, num_rays=len(mounted.ray_pixel_indices))
+                num_threads = torch.get_num_threads()
+                scan = mounted.scan(snapshot, noise, num_threads=num_threads, search_spheres=search_spheres)
+                scans[name].append(scan)
         return scans
 
 
-def _counts_of(
-    scene: SceneGeometry, instant: SceneSnapshot, scans: Sequence[SensorScan], reference: ReferenceScan
+def _count_rays(
+    scene: SceneGeometry,
+    snapshot: SceneSnapshot,
+    scans: Mapping[str, Sequence[SensorScan]],
+    reference: ReferenceScan,
 ) -> dict[str, int]:
-    """What the rays of all sensors and of the reference met, and what was left out, next to all that there was."""
-    rays, self_hits = sum(scan.num_rays for scan in scans), sum(scan.self_hits for scan in scans)
-    pairs = (rays + reference.num_rays) * len(instant.moving_bodies)
+    """Count rays, self hits, and omitted casts of all rigs and of the reference sensor."""
+    all_scans = [scan for rig_scans in scans.values() for scan in rig_scans]
+    num_rays = sum(scan.num_rays for scan in all_scans)
+    self_hits = sum(scan.self_hits for scan in all_scans)
+    num_pairs = (num_rays + reference.num_rays) * len(snapshot.moving_bodies)
+    num_casts = reference.num_body_casts + sum(scan.num_body_casts for scan in all_scans)
     return {
-        "sensor_rays": rays,
+        "sensor_rays": num_rays,
         "sensor_self_hits": self_hits,
         "reference_rays": reference.num_rays,
         "reference_self_hits": reference.self_hits,
         "reference_poses": reference.num_poses + reference.num_resampled_poses,
         "reference_poses_resampled": reference.num_resampled_poses,
-        "moving_bodies": len(instant.moving_bodies) + instant.num_out_of_range,
-        "moving_bodies_out_of_range": instant.num_out_of_range,
+        "moving_bodies": len(snapshot.moving_bodies) + snapshot.num_out_of_range,
+        "moving_bodies_out_of_range": snapshot.num_out_of_range,
         "road_users_omitted": scene.scene.num_omitted_road_users,
-        "ray_body_pairs": pairs,
-        "ray_body_pairs_omitted": pairs - reference.num_body_casts - sum(scan.num_body_casts for scan in scans),
-        "sensor_rays_reused": 0 if scene.has_motion else rays,
-        "sensor_rays_omitted": sum(scan.num_omitted_rays for scan in scans),
+        "ray_body_pairs": num_pairs,
+        "ray_body_pairs_omitted": num_pairs - num_casts,
+        "sensor_rays_reused": 0 if scene.has_motion else num_rays,
+        "sensor_rays_omitted": sum(scan.num_omitted_rays for scan in all_scans),
         "sensor_self_hits_reused": self_hits if scene.has_constant_self_hits else 0,
     }

@@ -1,6 +1,5 @@
-"""Where a run through a scenario plays: its geometry, and the rigs' sensors in it."""
+"""Rigs mounted on the ego vehicle in the scenes of a scenario, and stores that build and cache them."""
 
-import copy
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,7 +9,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from torch.utils.data import get_worker_info
 
-from torchcover.geometry.arrays import Float64, Int64
+from torchcover.geometry.arrays import Bools, Float64, Int64
 from torchcover.simulation.bodies import describe_windows
 from torchcover.simulation.instant import SceneSnapshot
 from torchcover.simulation.local_ground import ROUNDING_M
@@ -23,24 +22,15 @@ from torchcover.simulation.scene_cache import SceneCache
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.sight import MountedSensor
 
-# Nearer than this is near enough, above or below.
-NEAR_M = 1.0
-# Instants that are looked at, and how far about the ego.
-LOOKS = 8
-WITHIN_M = 100.0
-# A sensor on the ground is asked about a place this far above it: whether it is inside of something else.
-LIFT_M = np.array([0.0, 0.0, 0.01])
-# Farther from the vehicle nobody mounts a sensor on it: such a place is in millimetres, or of another frame.
-FARTHEST_MOUNT_M = 20.0
-# What all scenes that are kept may take: in a process, four cities of a minute or more of anything smaller; and of the
-# machine's memory in all workers of a DataLoader together. One scene is kept anyway, however large.
-KEPT_BYTES = 160e6
-KEPT_SHARE = 1 / 16
-
 
 @dataclass(eq=False)
 class RigMounts:
-    """The sensors of each rig on the ego of a scene, and whether their places are known to be free for good."""
+    """Sensors of each rig on the ego vehicle of a scene.
+
+    Args:
+        sensors_by_rig: Mounted sensors by the name of the rig.
+        is_checked: True if the mounting positions were checked and need no further check.
+    """
 
     sensors_by_rig: Mapping[str, Sequence[MountedSensor]]
     is_checked: bool = False
@@ -48,48 +38,84 @@ class RigMounts:
 
 @dataclass(frozen=True, eq=False)
 class MountedRigs:
-    """One run's geometry, and the sensors of each rig on its ego."""
+    """Geometry of one scene, and the sensors of each rig on its ego vehicle.
+
+    Args:
+        scene_geometry: Geometry of the scene.
+        mounts: Sensors of the rigs.
+    """
 
     scene_geometry: SceneGeometry
     mounts: RigMounts
 
     @property
     def sensors_by_rig(self) -> Mapping[str, Sequence[MountedSensor]]:
-        """The sensors of each rig."""
+        """Mounted sensors by the name of the rig."""
         return self.mounts.sensors_by_rig
 
     def check_mounts(self, snapshot: SceneSnapshot) -> None:
-        """Refuse a sensor that is where none can be; where nothing moves, the first answer holds."""
+        """Check that no sensor is inside a body or below the ground; only once in a scene without motion.
+
+        Args:
+            snapshot: Scene at the time of the frame.
+
+        Raises:
+            ValueError: A sensor is inside a body or below the ground.
+        """
         if self.mounts.is_checked:
             return
-        for rig, sensors in self.sensors_by_rig.items():
+        for rig_name, sensors in self.sensors_by_rig.items():
             for mounted in sensors:
-                place_m = mounted.vehicle_T_sensor[:3, 3]
-                _check_place(f"rig {rig!r}: sensor {mounted.sensor.name!r}", place_m, snapshot)
+                position_m = mounted.vehicle_T_sensor[:3, 3]
+                _check_position(f"rig {rig_name!r}: sensor {mounted.sensor.name!r}", position_m, snapshot)
         self.mounts.is_checked = not self.scene_geometry.has_motion
 
 
-def _check_place(sensor: str, place_m: Float64, instant: SceneSnapshot) -> None:
-    where = f"{sensor} at {place_m.round(3).tolist()} m"
-    on_a_face = instant.is_on_surface(place_m)
-    if instant.is_occupied(place_m + LIFT_M if on_a_face else place_m):
+def _check_position(sensor_text: str, position_m: Float64, snapshot: SceneSnapshot) -> None:
+    """Raise ValueError for a sensor inside a body or below the ground; warn if it lies exactly on a surface."""
+    sensor_text = f"{sensor_text} at {position_m.round(3).tolist()} m"
+    is_on_surface = snapshot.is_on_surface(position_m)
+    # On a surface, a position slightly above decides whether the sensor is inside another body.
+    lift_m = np.array([0.0, 0.0, 0.01 if is_on_surface else 0.0])
+    if snapshot.is_occupied(position_m + lift_m):
         raise ValueError(
-            f"{where} lies below the ground, or inside a wall or another body, so that it sees what is none; "
+            f"{sensor_text} lies below the ground, or inside a wall or another body, so that its points are wrong; "
             "is the sign of z_m right, does the ego stand on the ground, and do faces point outwards?"
         )
-    if on_a_face:
+    if is_on_surface:
         warnings.warn(
-            f"{where} lies exactly on the ground or on a wall, and sees nothing of it; move its mount away from it",
+            f"{sensor_text} lies exactly on the ground or on a wall, and sees nothing of it; move its mount away "
+            "from it",
             stacklevel=2,
         )
 
 
-class SceneStore:
-    """The geometry of a scenario's runs: each is built when first needed, and a few are kept, in case they are again.
+@dataclass(frozen=True)
+class SceneStoreParams:
+    """Limits of the memory for cached scenes. One scene is cached in any case, however large.
 
-    In each process, that is: Embree's scenes cannot be pickled, so that a DataLoader worker builds its own. The bodies
-    of each kind, which runs have in common, are made once. All that are kept may take `max_cached_bytes`; a small share of
-    the machine's memory if not given. `device` is that of `RayCaster`, for what never moves.
+    Args:
+        max_bytes: Limit per process: four cities of a minute each, or more of anything smaller.
+        max_memory_share: Limit of all workers of a DataLoader together, as a share of the memory of the machine.
+    """
+
+    max_bytes: float = 160e6
+    max_memory_share: float = 1 / 16
+
+
+class SceneStore:
+    """Geometry of the scenes of a scenario: built on first use, with the last ones cached.
+
+    Each process has a store of its own, since Embree scenes cannot be pickled. All scenes share the geometry of each
+    kind of moving body.
+
+    Args:
+        scenario: Scenario.
+        seed: Seed of traffic.
+        max_cached_bytes: Memory for cached scenes; None for the limits of `params`.
+        no_cache: True to disable the scene cache on disk.
+        device: Warp device for static bodies, see `RayCaster`.
+        params: Limits of the memory.
     """
 
     def __init__(
@@ -100,143 +126,206 @@ class SceneStore:
         *,
         no_cache: bool = False,
         device: str | None = None,
+        params: SceneStoreParams = SceneStoreParams(),
     ) -> None:
         self.scenario = scenario
         self._device = device
-        self._cache = SceneCache(scenario, seed, no_cache=no_cache)
-        self._kept_bytes = max_cached_bytes
-        self._kept: dict[int, SceneGeometry] = {}
-        self._solids = BodyGeometryCache()
-        self._ego: Mesh | None = None
+        self._disk_cache = SceneCache(scenario, seed, no_cache=no_cache)
+        self._max_cached_bytes = max_cached_bytes
+        self._params = params
+        self._scenes: dict[int, SceneGeometry] = {}  # the least recently used first
+        self._geometry_cache = BodyGeometryCache()
+        self._ego_mesh: Mesh | None = None
 
     def get_scene(self, run_index: int) -> SceneGeometry:
-        """That of one run; see `Scenario.locate`."""
-        if run_index in self._kept:
-            scene = self._kept.pop(run_index)
+        """Get the geometry of the scene of one run through the scenario, see `Scenario.locate`."""
+        # A scene that is used moves to the end, so that the first one is dropped first.
+        if run_index in self._scenes:
+            geometry = self._scenes.pop(run_index)
         else:
-            self._make_room()
-            if self._ego is None and self.scenario.traffic is not None:
-                self._ego = self.scenario.build_ego_mesh()
-            scene = SceneGeometry(self._cache.build(run_index, self._ego), self._solids, self._device)
-        self._kept[run_index] = scene  # at the end: the first is the one that was asked for longest ago
-        return scene
+            self._free_memory()
+            if self._ego_mesh is None and self.scenario.traffic is not None:
+                self._ego_mesh = self.scenario.build_ego_mesh()
+            scene = self._disk_cache.build(run_index, self._ego_mesh)
+            geometry = SceneGeometry(scene, self._geometry_cache, self._device)
+        self._scenes[run_index] = geometry
+        return geometry
 
-    def _make_room(self) -> None:
-        """Before a scene is built, about as large as the others: there is not always memory for one more."""
-        most_bytes = self._kept_bytes
-        if most_bytes is None:
-            workers = get_worker_info()
-            most_bytes = min(
-                KEPT_BYTES, KEPT_SHARE * find_memory_limit_bytes() / (workers.num_workers if workers else 1)
-            )
-        sizes = [scene.num_bytes for scene in self._kept.values()]
-        while sizes and sum(sizes) + max(sizes) > most_bytes:
-            self._kept.pop(next(iter(self._kept))).clear_snapshots()
+    def _free_memory(self) -> None:
+        """Drop scenes until another one of the largest size fits."""
+        max_bytes = self._max_cached_bytes
+        if max_bytes is None:
+            worker = get_worker_info()
+            num_workers = worker.num_workers if worker else 1
+            memory_share_bytes = self._params.max_memory_share * find_memory_limit_bytes()
+            max_bytes = min(self._params.max_bytes, memory_share_bytes / num_workers)
+        sizes = [geometry.num_bytes for geometry in self._scenes.values()]
+        while sizes and sum(sizes) + max(sizes) > max_bytes:
+            self._scenes.pop(next(iter(self._scenes))).clear_snapshots()
             del sizes[0]
 
     def __getstate__(self) -> dict[str, Any]:
-        return {**self.__dict__, "_kept": {}, "_solids": BodyGeometryCache(), "_ego": None}
+        return {**self.__dict__, "_scenes": {}, "_geometry_cache": BodyGeometryCache(), "_ego_mesh": None}
 
 
 class MountedRigStore:
-    """The stages of a scenario's runs: rigs in its scenes. In traffic the sensors on the ego are the same in all."""
+    """Rigs in the scenes of a scenario; in generated traffic all scenes share the sensors on the ego vehicle.
+
+    Args:
+        scene_store: Scenes.
+        rigs: Rigs by name.
+    """
 
     def __init__(self, scene_store: SceneStore, rigs: Mapping[str, Rig]) -> None:
-        self._put(scene_store, rigs)
-
-    def _put(self, scenes: SceneStore, rigs: Mapping[str, Rig]) -> None:
-        self._scenes = scenes
+        self._scene_store = scene_store
         self._rigs = rigs
-        # None of them outlives its scene, which may be dropped to make room.
+        # The weak keys drop the sensors of a scene together with the scene.
         self._mounts: WeakKeyDictionary[SceneGeometry, RigMounts] = WeakKeyDictionary()
-        self._on_moving_ego: Mapping[str, Sequence[MountedSensor]] | None = None
+        self._sensors_on_moving_ego: Mapping[str, Sequence[MountedSensor]] | None = None
 
     def replace_rigs(self, rigs: Mapping[str, Rig]) -> "MountedRigStore":
-        """Other rigs in the same scenes, none of which is built again."""
-        other = copy.copy(self)
-        other._put(self._scenes, rigs)
-        return other
+        """Create a store for other rigs that shares the scenes."""
+        return MountedRigStore(self._scene_store, rigs)
 
     def get_mounted_rigs(self, run_index: int) -> MountedRigs:
-        """The stage of one run; see `Scenario.locate`."""
-        scene = self._scenes.get_scene(run_index)
-        if scene not in self._mounts:
-            self._mounts[scene] = RigMounts(self._sensors(scene))
-        return MountedRigs(scene, self._mounts[scene])
+        """Get the rigs in the scene of one run through the scenario, see `Scenario.locate`.
 
-    def _sensors(self, scene: SceneGeometry) -> Mapping[str, Sequence[MountedSensor]]:
-        if self._scenes.scenario.traffic is None or not scene.scene.ego.trajectory.is_moving:
-            return self._on(scene)
-        # What a sensor on an ego that moves sees of it is the same in all runs.
-        self._on_moving_ego = self._on_moving_ego or self._on(scene)
-        return self._on_moving_ego
+        Raises:
+            ValueError: A sensor is inside the body of the ego vehicle, or far from it.
+        """
+        geometry = self._scene_store.get_scene(run_index)
+        if geometry not in self._mounts:
+            self._mounts[geometry] = RigMounts(self._get_sensors(geometry))
+        return MountedRigs(geometry, self._mounts[geometry])
 
-    def _on(self, scene: SceneGeometry) -> Mapping[str, Sequence[MountedSensor]]:
-        return {name: mount_sensors(scene, self._scenes.scenario, name, rig) for name, rig in self._rigs.items()}
+    def _get_sensors(self, geometry: SceneGeometry) -> Mapping[str, Sequence[MountedSensor]]:
+        """Get the sensors of all rigs; their hits on a moving ego vehicle are the same in all scenes of traffic."""
+        if self._scene_store.scenario.traffic is None or not geometry.scene.ego.trajectory.is_moving:
+            return self._mount_rigs(geometry)
+        self._sensors_on_moving_ego = self._sensors_on_moving_ego or self._mount_rigs(geometry)
+        return self._sensors_on_moving_ego
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {"_scenes": self._scenes, "_rigs": self._rigs}
+    def _mount_rigs(self, geometry: SceneGeometry) -> Mapping[str, Sequence[MountedSensor]]:
+        """Mount the sensors of all rigs."""
+        scenario = self._scene_store.scenario
+        return {name: mount_sensors(geometry, scenario, name, rig) for name, rig in self._rigs.items()}
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self._put(state["_scenes"], state["_rigs"])
+    def __reduce__(self) -> tuple[type, tuple[SceneStore, Mapping[str, Rig]]]:
+        # Mounted sensors belong to scenes, which are not pickled.
+        return MountedRigStore, (self._scene_store, self._rigs)
 
 
 def mount_sensors(scene: SceneGeometry, scenario: Scenario, rig_name: str, rig: Rig) -> list[MountedSensor]:
-    """The sensors of a rig on the ego of a scene. ValueError: one is inside the ego's body."""
+    """Mount the sensors of a rig on the ego vehicle of a scene.
+
+    Args:
+        scene: Geometry of the scene.
+        scenario: Scenario of the scene, for weather and names.
+        rig_name: Name of the rig in messages.
+        rig: Rig.
+
+    Raises:
+        ValueError: A sensor is inside the body of the ego vehicle, or more than 20 m away from it.
+    """
+    max_distance_m = 20.0  # positions farther away are in millimeters, or in another frame
+    mounted_sensors = []
     for sensor in rig.sensors:
-        place = sensor.mount.to_matrix()[:3, 3]
-        where = f"rig {rig_name!r}: sensor {sensor.name!r} at {place.round(3).tolist()} m lies"
-        off_m = np.linalg.norm(place - place.clip(scene.ego_box.lower_m, scene.ego_box.upper_m))
-        if off_m > FARTHEST_MOUNT_M:
+        position_m = sensor.mount.to_matrix()[:3, 3]
+        sensor_text = f"rig {rig_name!r}: sensor {sensor.name!r} at {position_m.round(3).tolist()} m lies"
+        ego_box = scene.ego_box
+        distance_m = np.linalg.norm(position_m - position_m.clip(ego_box.lower_m, ego_box.upper_m))
+        if distance_m > max_distance_m:
             raise ValueError(
-                f"{where} {off_m:.0f} m away from the ego of {scenario.name!r}, {scenario.ego_name}; mounts are in "
-                "metres, from the ground under the ego's middle: are these millimetres?"
+                f"{sensor_text} {distance_m:.0f} m away from the ego of {scenario.name!r}, {scenario.ego_name}; mounts "
+                "are in meters, from the ground under the center of the ego: are these millimeters?"
             )
-        if scene.is_inside_ego(place):
-            carried = rig.vehicle in (None, getattr(scenario.ego and scenario.ego.shape, "vehicle", None))
-            other = "" if carried else f", or use its own vehicle (--vehicle {rig.vehicle})"
-            windows = describe_windows(scenario.ego.shape if scenario.ego else None)
+        if scene.is_inside_ego(position_m):
             raise ValueError(
-                f"{where} inside the ego of {scenario.name!r}, {scenario.ego_name}, so that all its rays start "
-                f"blocked; move its mount{other}{windows and f'. {windows}'}"
+                f"{sensor_text} inside the ego of {scenario.name!r}, {scenario.ego_name}, so that all its rays start "
+                f"blocked; move its mount{_describe_alternatives(scenario, rig)}"
             )
-    return [
-        MountedSensor(
-            one,
-            scene,
-            scenario.compute_max_range_m(one, rig.weather),
-            rig.weather or scenario.weather,
-            [other for other in rig.sensors if other is not one],
-            rig.bodies,
+        mounted_sensors.append(
+            MountedSensor(
+                sensor,
+                scene,
+                scenario.compute_max_range_m(sensor, rig.weather),
+                rig.weather or scenario.weather,
+                [other_sensor for other_sensor in rig.sensors if other_sensor is not sensor],
+                rig.bodies,
+            )
         )
-        for one in rig.sensors
-    ]
+    return mounted_sensors
 
 
-def warn_about_missing_ground(scenario_name: str, scene: SceneGeometry, time_step_indices: Int64) -> None:
-    """Warn if the ego, or more than half of the others that move, have no ground near the bottoms of their bodies."""
-    found = np.concatenate(
-        [_grounded(scene, step) for step in time_step_indices[:: -(-len(time_step_indices) // LOOKS)].tolist()]
-    )
-    of_ego, of_others = found[found[:, 0] > 0, 1], found[found[:, 0] == 0, 1]
-    for who, grounded, share in (("the ego", of_ego, 0.0), ("others that move", of_others, 0.5)):
-        missing = int((grounded == 0).sum())
-        if missing > share * len(grounded):
+def _describe_alternatives(scenario: Scenario, rig: Rig) -> str:
+    """Describe other remedies for a sensor inside the ego vehicle: the vehicle of the rig, transparent windows."""
+    ego_shape = scenario.ego.shape if scenario.ego else None
+    is_on_own_vehicle = rig.vehicle in (None, getattr(ego_shape, "vehicle", None))
+    vehicle_text = "" if is_on_own_vehicle else f", or use its own vehicle (--vehicle {rig.vehicle})"
+    windows_text = describe_windows(ego_shape)
+    return f"{vehicle_text}. {windows_text}" if windows_text else vehicle_text
+
+
+@dataclass(frozen=True)
+class GroundCheckParams:
+    """Parameters of the check that bodies stand on the ground.
+
+    Args:
+        max_frames: Largest number of frames that are checked.
+        max_distance_m: Actors within this distance of the ego vehicle are checked.
+        max_height_m: Largest distance of the ground above or below the bottom of a body.
+        max_missing_share: Share of checked poses of actors that may have no ground; none is allowed for the ego.
+    """
+
+    max_frames: int = 8
+    max_distance_m: float = 100.0
+    max_height_m: float = 1.0
+    max_missing_share: float = 0.5
+
+
+def warn_about_missing_ground(
+    scenario_name: str,
+    scene: SceneGeometry,
+    time_step_indices: Int64,
+    params: GroundCheckParams = GroundCheckParams(),
+) -> None:
+    """Warn if the ego vehicle, or more than half of the moving actors, have no ground near the bottom of their body.
+
+    Args:
+        scenario_name: Name of the scenario in the message.
+        scene: Geometry of the scene.
+        time_step_indices: Time steps of the run; a few of them are checked.
+        params: Limits.
+
+    Warns:
+        UserWarning: Ground is missing.
+    """
+    stride = -(-len(time_step_indices) // params.max_frames)
+    masks = [_find_grounded_bodies(scene, index, params) for index in time_step_indices[::stride].tolist()]
+    is_ego_grounded = np.array([mask[0] for mask in masks])
+    is_actor_grounded = np.concatenate([mask[1:] for mask in masks])
+    for name, is_grounded, max_share in (
+        ("the ego", is_ego_grounded, 0.0),
+        ("other moving actors", is_actor_grounded, params.max_missing_share),
+    ):
+        missing_count = int((~is_grounded).sum())
+        if missing_count > max_share * len(is_grounded):
             warnings.warn(
-                f"{scenario_name}: {missing} of {len(grounded)} times that were looked at, {who} had no ground within "
-                f"{NEAR_M:g} m below or above the wheels, so that little of it will be known; is the ground a mesh in "
-                "the same frame, and z that of the bottom? Traffic of type 'tracks' without `ground` makes ground that "
-                "follows the tracks",
+                f"{scenario_name}: {missing_count} of {len(is_grounded)} times that were checked, {name} had no ground "
+                f"within {params.max_height_m:g} m below or above the wheels, so that little of it will be observed; "
+                "is the ground a mesh in the same frame, and z that of the bottom? Traffic of type 'tracks' without "
+                "`ground` makes ground that follows the tracks",
                 stacklevel=4,
             )
 
 
-def _grounded(scene: SceneGeometry, step: int) -> Int64:
-    """(bodies, 2) whether each that is there at a step is the ego, and whether it has ground."""
-    instant = scene.get_snapshot(step, max_distance_m=WITHIN_M)
-    up = scene.scene.ego.trajectory.interpolate(step * scene.scene.time_step_s)[2, :3]
-    others = instant.moving_bodies.vehicle_T_part[instant.moving_bodies.body_indices != instant.ego_index, :3, 3]
-    places_m = np.concatenate([np.zeros((1, 3)), others])
-    is_ego = np.arange(len(places_m)) == 0
-    heights_m = instant.compute_heights_m((places_m + NEAR_M * up).astype(np.float32))
-    return np.column_stack([is_ego, heights_m <= 2 * NEAR_M + ROUNDING_M]).astype(np.int64)
+def _find_grounded_bodies(scene: SceneGeometry, time_step_index: int, params: GroundCheckParams) -> Bools:
+    """Find which bodies have ground near their bottom: the ego vehicle, then moving actors in range."""
+    snapshot = scene.get_snapshot(time_step_index, max_distance_m=params.max_distance_m)
+    bodies = snapshot.moving_bodies
+    actor_positions_m = bodies.vehicle_T_part[bodies.body_indices != snapshot.ego_index, :3, 3]
+    positions_m = np.concatenate([np.zeros((1, 3)), actor_positions_m])
+    time_s = time_step_index * scene.scene.time_step_s
+    up = scene.scene.ego.trajectory.interpolate(time_s)[2, :3]
+    heights_m = snapshot.compute_heights_m((positions_m + params.max_height_m * up).astype(np.float32))
+    return np.asarray(heights_m <= 2 * params.max_height_m + ROUNDING_M)

@@ -1,4 +1,4 @@
-"""What a scenario builds: bodies that rest, bodies that move, and the ego; and a box around each object."""
+"""Scenes: static meshes, ego vehicle and actors with their trajectories, and labels of objects."""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -11,16 +11,17 @@ from torchcover.geometry.rigid import Matrix
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation.shapes import Mesh
 
-# A day at ten to a second.
-MAX_STEPS = 1_000_000
-
 
 @dataclass(frozen=True, eq=False)
 class Actor:
-    """A body with a place for every time, and a name of its own.
+    """Body with a trajectory.
 
-    Its mesh is in its own frame: origin on the ground under the centre of the bounding box, x forward, z up; actors of
-    one kind share it. The trajectory is `world_T_actor`.
+    Args:
+        name: Unique name.
+        category: Class name, such as `car`.
+        mesh: Mesh in the frame of the actor: origin on the ground under the center of the bounding box, x forward, z
+            up. Actors of one kind share it.
+        trajectory: `world_T_actor` over time.
     """
 
     name: str
@@ -31,20 +32,21 @@ class Actor:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Everything there is, over time.
+    """Geometry and motion of everything in a scenario.
 
     Args:
-        static_meshes: Meshes in the world frame that never move.
-        ego: The vehicle that carries the rig.
-        actors: The others.
-        time_step_s: Time between two frames.
-        duration_s: Time after which the trajectories end.
-        static_actors: Objects that never move, of which there may be many.
-        ground_mesh_indices: Numbers of the static meshes that one drives or walks on: their level faces are the ground. None if
-            that is not known: then `Scene.ground` finds it.
-        coincident_masks: For each static mesh (F,) which of its faces lie within 1 mm of others, of which one counts; empty
-            if none do.
-        num_omitted_road_users: How many more road users the source of the traffic had near the ego, where bodies cannot be.
+        static_meshes: Static meshes in the world frame.
+        ego: Ego vehicle, which carries the rig.
+        actors: Other moving objects.
+        time_step_s: Time step.
+        duration_s: Time at which the trajectories end.
+        static_actors: Objects that never move, such as parked cars.
+        ground_mesh_indices: Static meshes whose level faces are the ground; None if unspecified, then
+            `SceneGeometry.ground_masks` finds it.
+        coincident_masks: For each static mesh (F,) True for faces within 1 mm of others, one of which counts; empty if
+            there are none.
+        num_omitted_road_users: Number of road users near the ego vehicle in the traffic source that were omitted,
+            since their bodies would overlap others.
     """
 
     static_meshes: tuple[Mesh, ...]
@@ -59,30 +61,46 @@ class Scene:
 
     @property
     def objects(self) -> tuple[Actor, ...]:
-        """What may be recognised: the actors, then the parked. An object's number is its place in this order."""
+        """Actors, then static actors; the index of an object is its position in this order."""
         return self.actors + self.static_actors
 
     @property
     def num_time_steps(self) -> int:
-        """Number of instants: at 0, one time step, two time steps, ... up to the duration."""
+        """Number of time steps from 0 to the duration, both included."""
         return count_time_steps(self.duration_s, self.time_step_s)
 
 
 def count_time_steps(duration_s: float, time_step_s: float) -> int:
-    """Number of instants from 0 to a duration, both included."""
-    steps = duration_s / time_step_s
-    if not steps < MAX_STEPS:
+    """Count the time steps from 0 to a duration, both included.
+
+    Args:
+        duration_s: Duration.
+        time_step_s: Time step.
+
+    Raises:
+        ValueError: More than a million time steps, which is a day at ten per second.
+    """
+    max_time_steps = 1_000_000
+    num_time_steps = duration_s / time_step_s
+    if not num_time_steps < max_time_steps:
         raise ValueError(
-            f"a duration of {duration_s:g} s has {steps:.6g} time steps of {time_step_s:g} s, over {MAX_STEPS:,}; "
-            "shorten it, or make the steps longer"
+            f"a duration of {duration_s:g} s has {num_time_steps:.6g} time steps of {time_step_s:g} s, over "
+            f"{max_time_steps:,}; shorten it, or make the steps longer"
         )
-    return int(steps + 1e-9) + 1
+    return int(num_time_steps + 1e-9) + 1
 
 
 class ObjectLabel(NamedTuple):
-    """An object in the vehicle frame: the box of its body, its yaw, and its velocity over ground along x and y.
+    """Ground-truth box of an object in the vehicle frame.
 
-    `object_index` is its place in `World.objects`.
+    Args:
+        object_index: Index in `Scene.objects`.
+        name: Name of the object.
+        category: Class name, such as `car`.
+        center_m: (3,) center of the box.
+        size_m: Length, width and height.
+        yaw_rad: Yaw of the box.
+        velocity_mps: (2,) velocity over ground along x and y of the vehicle frame.
     """
 
     object_index: int
@@ -95,33 +113,45 @@ class ObjectLabel(NamedTuple):
 
 
 def compute_labels(scene: Scene, time_step_index: int, max_distance_m: float) -> list[ObjectLabel]:
-    """All objects near the ego at one step, in the order of the world; the ego itself is left out.
+    """Compute the labels of all objects near the ego vehicle at a time step.
 
-    An object is near if the origin of its frame is, over ground. Boxes stand upright in the vehicle frame: a body that
-    tilts against the ego by a degree leaves its box by a few centimetres.
+    Boxes are upright in the vehicle frame: the body of an object that is tilted against the ego vehicle by a degree
+    exceeds its box by a few centimeters.
+
+    Args:
+        scene: Scene.
+        time_step_index: Index of the time step.
+        max_distance_m: Largest horizontal distance between the origins of object and ego vehicle.
+
+    Returns:
+        Labels in the order of `Scene.objects`, without the ego vehicle.
     """
     time_s = time_step_index * scene.time_step_s
     world_T_vehicle = scene.ego.trajectory.interpolate(time_s)
     vehicle_T_world = invert(world_T_vehicle)
-    found, box_of = [], dict[int, BoundingBox]()  # actors of one kind share a mesh
-    for number, actor in enumerate(scene.objects):
+    labels: list[ObjectLabel] = []
+    boxes: dict[int, BoundingBox] = {}  # by mesh, which actors of one kind share
+    for object_index, actor in enumerate(scene.objects):
         position_m = actor.trajectory.interpolate_positions_m(np.array([time_s]))[0]
-        # Not near, too, if absent: NaN.
+        # The position of an absent object is NaN, hence not near.
         if np.hypot(*(position_m - world_T_vehicle[:3, 3])[:2]) <= max_distance_m:
-            if id(actor.mesh) not in box_of:
-                box_of[id(actor.mesh)] = BoundingBox.from_points(actor.mesh.vertices_m)
-            found.append(_label(number, actor, box_of[id(actor.mesh)], vehicle_T_world, time_s))
-    return found
+            if id(actor.mesh) not in boxes:
+                boxes[id(actor.mesh)] = BoundingBox.from_points(actor.mesh.vertices_m)
+            labels.append(_create_label(object_index, actor, boxes[id(actor.mesh)], vehicle_T_world, time_s))
+    return labels
 
 
-def _label(number: int, actor: Actor, box: BoundingBox, vehicle_T_world: Matrix, time_s: float) -> ObjectLabel:
+def _create_label(
+    object_index: int, actor: Actor, box: BoundingBox, vehicle_T_world: Matrix, time_s: float
+) -> ObjectLabel:
+    """Create the label of an object from its pose at a time."""
     vehicle_T_actor = vehicle_T_world @ actor.trajectory.interpolate(time_s)
-    middle_m = (np.array(box.lower_m) + np.array(box.upper_m)) / 2
+    center_m = (np.array(box.lower_m) + np.array(box.upper_m)) / 2
     return ObjectLabel(
-        number,
+        object_index,
         actor.name,
         actor.category,
-        center_m=transform_points(vehicle_T_actor, middle_m[None])[0],
+        center_m=transform_points(vehicle_T_actor, center_m[None])[0],
         size_m=box.size_m,
         yaw_rad=float(np.deg2rad(convert_rotation_to_euler(vehicle_T_actor[:3, :3])[0])),
         velocity_mps=(vehicle_T_world[:3, :3] @ actor.trajectory.compute_velocity_mps(time_s))[:2],

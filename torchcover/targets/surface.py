@@ -14,7 +14,7 @@ from torchcover.simulation.instant import ALL_AROUND_RAYS, SceneSnapshot
 from torchcover.simulation.moving import BodyGeometry
 from torchcover.simulation.patches import find_outward_faces
 from torchcover.simulation.shapes import Mesh
-from torchcover.simulation.sight import SHORTER, compute_visibility
+from torchcover.simulation.sight import RANGE_ROUNDING, compute_visibility
 from torchcover.simulation.surface_reference import ABOVE_M
 from torchcover.simulation.surface_strata import PLANE_STEPS
 
@@ -155,7 +155,7 @@ class TargetSurface(NamedTuple):
         hits = target.solid.caster.cast_from_each(
             viewpoints_m[position].astype(np.float32),
             (rays_m / length_m[:, None]).T.astype(np.float32),
-            (length_m * (1 - SHORTER)).astype(np.float32),
+            (length_m * (1 - RANGE_ROUNDING)).astype(np.float32),
         )
         unoccluded = np.flatnonzero(hits.body_indices < 0)
         position, sample = position[unoccluded], sample[unoccluded]

@@ -290,10 +290,10 @@ def test_ground_that_is_far_from_the_tracks_gets_a_hint(tmp_path, table):
         if hinted:
             with pytest.warns(UserWarning, match="ground within 1 m below or above the wheels") as told:
                 simulator.check_run(8)
-            assert {"the ego had", "others that move had"} <= {
+            assert {"the ego had", "other moving actors had"} <= {
                 part
                 for warning in told
-                for part in ("the ego had", "others that move had")
+                for part in ("the ego had", "other moving actors had")
                 if part in str(warning.message)
             }
     Simulator(scenario(path, **keys), {"rig": RIG}, FEW).check_run(8)
