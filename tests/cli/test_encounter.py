@@ -35,7 +35,7 @@ def test_rigs_side_by_side_in_words_and_files(torchcover, worlds, monkeypatch):
         "too late",
         "Highest tested speed with timely",
         "most critical",
-        "1 points of LiDARs",
+        "1 LiDAR points",
     ):
         assert words in printed
     out = worlds / "out" / "encounters"
@@ -54,7 +54,7 @@ def test_rigs_side_by_side_in_words_and_files(torchcover, worlds, monkeypatch):
     [
         (SET.replace("child_120cm", "chidl"), [], "encounters.0: road_user.body: "),
         (SET.replace("approach_distance_m: 2.0", "form_m: 2.0"), [], "encounters.0: road_user.form_m"),
-        (SET.replace("yaw_deg: [90, -90]", "yaw_deg: 0, impact_location: 4"), [], "the two never touch"),
+        (SET.replace("yaw_deg: [90, -90]", "yaw_deg: 0, impact_location: 4"), [], "the outlines never touch"),
         (SET.replace("name: two", "name: [two]"), [], "name: "),
         (SET, ["--points", "0"], "points: a number >= 1"),
         (SET, ["--deceleration-mps2", "0"], "deceleration_mps2: m/s2 above 0"),

@@ -11,7 +11,7 @@ from matplotlib.text import Text
 
 from tests.targets.worlds import EGO, FLOOR, lidar, on_target
 from torchcover.encounters import Criterion, Encounter, EncounterSet, StagedEncounter, detect_encounter
-from torchcover.encounters.sighting import (
+from torchcover.encounters.detection import (
     NEVER,
     EncounterPointCounter,
     MountedRig,
@@ -115,7 +115,12 @@ def test_outlines_touch_when_the_front_has_come_to_the_side():
 def grazing(overlap_m, **ego):
     """The end of the other passes the ego's corner, which goes straight, so far inside."""
     box = {"type": "box", "size_m": [2.0, 1.009, 0.5]}
-    other = {"body": box, "speed_kmh": 36, "approach_distance_m": 15, "impact_location": (1 - overlap_m + 0.5045 + 1 + 1) / 2}
+    other = {
+        "body": box,
+        "speed_kmh": 36,
+        "approach_distance_m": 15,
+        "impact_location": (1 - overlap_m + 0.5045 + 1 + 1) / 2,
+    }
     return Encounter.model_validate({"name": "g", "ego": {"speed_kmh": 36} | ego, "road_user": other})
 
 
@@ -137,7 +142,14 @@ def test_a_touch_of_less_than_a_millisecond_is_one():
 @pytest.mark.parametrize("speed_kmh", [36.0, -36.0])
 def test_rows_of_obstacles_lie_where_the_ego_comes_from_or_beyond(speed_kmh):
     rows = [{"body": BOX, "longitudinal_gap_m": 0.5}, {"body": WALL, "lateral_gap_m": 2.0, "longitudinal_gap_m": 0.4}]
-    beyond = {"body": BOX, "side": "left", "position": "beyond", "yaw_deg": 90, "longitudinal_gap_m": 0.3, "lateral_gap_m": 0.7}
+    beyond = {
+        "body": BOX,
+        "side": "left",
+        "position": "beyond",
+        "yaw_deg": 90,
+        "longitudinal_gap_m": 0.3,
+        "lateral_gap_m": 0.7,
+    }
     staged = StagedEncounter(crossing(speed_kmh, {"body": BOX}, obstacles=[*rows, beyond]), SOLID)
     back = -math.copysign(1.0, speed_kmh)
     placed = {
@@ -152,7 +164,10 @@ def test_rows_of_obstacles_lie_where_the_ego_comes_from_or_beyond(speed_kmh):
 @pytest.mark.parametrize("speed_kmh", [36.0, -31.7])
 @pytest.mark.parametrize("yaw_deg", [0.0, 17.0])
 def test_bodies_may_touch(speed_kmh, yaw_deg):
-    row = [{"body": body, "longitudinal_gap_m": 0.0, "lateral_gap_m": 0.0, "yaw_deg": yaw_deg} for body in ("van", "suv", WALL, BOX)]
+    row = [
+        {"body": body, "longitudinal_gap_m": 0.0, "lateral_gap_m": 0.0, "yaw_deg": yaw_deg}
+        for body in ("van", "suv", WALL, BOX)
+    ]
     assert len(StagedEncounter(crossing(speed_kmh, {"approach_distance_m": 0.7}, obstacles=row), SOLID).obstacles) == 4
 
 
@@ -201,7 +216,10 @@ RADAR = {
     "type": "radar", "name": "radar", "mount": {"x_m": 2.05, "z_m": 0.5}, "horizontal_fov_deg": 90,
     "vertical_fov_deg": [-8, 8], "azimuth_cell_deg": 6, "range_cell_m": 0.4, "max_range_m": 40,
 }  # fmt: skip
-HIDDEN = [{"body": WALL, "lateral_gap_m": 0.4, "longitudinal_gap_m": 0.5}, {"body": BOX, "side": "left", "position": "beyond"}]
+HIDDEN = [
+    {"body": WALL, "lateral_gap_m": 0.4, "longitudinal_gap_m": 0.5},
+    {"body": BOX, "side": "left", "position": "beyond"},
+]
 
 
 def test_points_are_those_of_a_simulation_with_the_other_in_the_world():
@@ -267,18 +285,21 @@ def test_lidars_count_together_at_the_looks_of_the_slower_and_a_loss_is_never_a_
     assert (found.ttc_s > found.sensor_ttc_s[0]).any()
     for rate_hz in (10.001, 13, 20):
         faster = sighted(
-            mounted(few, few | {"name": "fast", "rate_hz": rate_hz}), crossing(), Criterion(points=6), num_start_offsets=3
+            mounted(few, few | {"name": "fast", "rate_hz": rate_hz}),
+            crossing(),
+            Criterion(points=6),
+            num_start_offsets=3,
         )
         assert (faster.ttc_s >= found.ttc_s).all()
 
 
 def test_a_sensor_that_is_slower_than_the_encounter_is_too_late():
-    with pytest.warns(UserWarning, match=r"3 looks of sensor 'top' take 3 s, .* ends after 0.98"):
+    with pytest.warns(UserWarning, match=r"3 scans of sensor 'top' take 3 s, .* ends after 0.98"):
         found = sighted(mounted(lidar(rate_hz=1)), crossing(), Criterion(), num_start_offsets=2)
     assert not found.ttc_s.any()
     assert found.ttc_s.max() < found.censoring_ttc_s
     unseen = crossing(20.0, {"approach_distance_m": None, "speed_kmh": 0}, max_lead_time_s=2)
-    with pytest.warns(UserWarning, match="too late, whatever it sees"):
+    with pytest.warns(UserWarning, match="always too late"):
         found = sighted(mounted(lidar(rate_hz=1)), unseen, Criterion(), num_start_offsets=2)
     assert not found.ttc_s.any()
     assert found.ttc_s.max() < found.censoring_ttc_s
@@ -395,7 +416,7 @@ def test_a_film_shows_where_everybody_is_and_what_is_on_the_other():
 
 
 MISTAKES = [
-    ({"ego": {"speed_kmh": 0}, "road_user": {"body": "child_120cm", "speed_kmh": 0}}, "nobody moves"),
+    ({"ego": {"speed_kmh": 0}, "road_user": {"body": "child_120cm", "speed_kmh": 0}}, "neither vehicle moves"),
     ({"road_user": {"body": "child_12cm", "speed_kmh": 5}}, "is 'child_120cm' or 'child_110cm' meant"),
     ({"road_user": {"body": "child_120cm", "speed_kmh": 5, "approach_distance_m": -1}}, "approach_distance_m"),
     ({"ego": {"speed_kmh": []}}, "encounters.0: ego.speed_kmh: a list of values is empty"),
@@ -404,7 +425,7 @@ MISTAKES = [
     ({"ego": {"speed_kmh": [10, 20], "radius_m": 0.1}}, "radius_m: at least 1 m"),
     ({"weather": "fog"}, "is 'fog_50m' meant|fog_100m"),
     ({"ego": {"speed_kmh": list(range(1, 201))}, "max_lead_time_s": list(range(1, 60))},
-     "encounters.0: 11,800 encounters of a family, of at most 10,000"),
+     "encounters.0: 11,800 encounters of a family exceed the limit of 10,000"),
     ({"obstacle": []}, "obstacle"),
     (
         {"name": None, "ego": {"speed_kmh": 10, "radius_m": [8, 9]}},
@@ -428,9 +449,10 @@ def test_a_family_that_makes_no_sense_is_told_once(keys, told, tmp_path):
 
 def test_families_of_one_name_are_told():
     families = [
-        {"name": "f", "ego": {"speed_kmh": kmh}, "road_user": {"body": "child_120cm", "speed_kmh": 5}} for kmh in (10, 20)
+        {"name": "f", "ego": {"speed_kmh": kmh}, "road_user": {"body": "child_120cm", "speed_kmh": 5}}
+        for kmh in (10, 20)
     ]
-    with pytest.raises(ValueError, match=r"encounters.1: encounters.0 is called 'f', too"):
+    with pytest.raises(ValueError, match=r"encounters.1: the name 'f' is already used by encounters.0"):
         EncounterSet.model_validate({"name": "s", "encounters": families})
 
 
@@ -440,8 +462,11 @@ def test_families_of_one_name_are_told():
         (crossing(36, {"impact_location": 3.0, "yaw_deg": 0, "approach_distance_m": 4}), "never touch"),
         (crossing(5.4, {"yaw_deg": 0}), "overlap from the beginning|never touch"),
         (crossing(36, {"body": BOX, "yaw_deg": 0, "speed_kmh": 36}), "overlap from the beginning"),
-        (crossing(36, obstacles=[{"body": WALL, "lateral_gap_m": -1.0}]), "'box' is in the way of the ego"),
-        (crossing(36, {"approach_distance_m": 3}, obstacles=[{"body": WALL, "longitudinal_gap_m": -1.0}]), "'box' is in the way of the other"),
+        (crossing(36, obstacles=[{"body": WALL, "lateral_gap_m": -1.0}]), "'box' is in the path of the ego"),
+        (
+            crossing(36, {"approach_distance_m": 3}, obstacles=[{"body": WALL, "longitudinal_gap_m": -1.0}]),
+            "'box' is in the path of the road user",
+        ),
         (
             crossing(36, obstacles=[{"body": WALL}, {"body": "van", "longitudinal_gap_m": -0.1}]),
             "'box' and 'van' are inside one anot",

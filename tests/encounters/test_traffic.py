@@ -13,15 +13,9 @@ from tests.targets.worlds import FLOOR, drive, lidar, rig, world
 from torchcover.data import SimulatedFrames
 from torchcover.detection import Boxes
 from torchcover.encounters import Criterion, EncounterResults
-from torchcover.encounters.sighting import NEVER
-from torchcover.encounters.traffic import (
-    Approach,
-    ApproachPointCounter,
-    Drive,
-    DriveSensors,
-    detect_approach,
-    find_approaches,
-)
+from torchcover.encounters.detection import NEVER
+from torchcover.encounters.traffic import Approach, Drive, find_approaches
+from torchcover.encounters.traffic_detection import ApproachPointCounter, DriveSensors, detect_approach
 from torchcover.evaluation import evaluate_recorded_encounters, evaluate_traffic_encounters
 from torchcover.geometry import BoundingBox, build_transform
 from torchcover.geometry.trajectory import Trajectory
@@ -119,7 +113,8 @@ def test_lidars_count_together_by_steps_and_who_looks_more_often_loses_nothing(d
     assert (eyes.scan_periods, eyes.frame_strides) == ([1, 2, None], [1, 2, 1])
     child, _ = find_approaches(there, Criterion())
     middle_m = [
-        there.tracks[0].trajectory.interpolate(STEP_S * step)[:3, 3] - [10 * STEP_S * step, 0, -0.5] for step in range(31)
+        there.tracks[0].trajectory.interpolate(STEP_S * step)[:3, 3] - [10 * STEP_S * step, 0, -0.5]
+        for step in range(31)
     ]
 
     def detected_s(*steps):
@@ -184,7 +179,7 @@ def test_who_is_in_time_is_open_where_braking_was_never_needed(driven):
     assert {one["name"]: one["in_time"] for one in found.to_record()["encounters"]} == {"child": False, "faster": None}
     table, *_ = found.build_tables()
     assert "1 of 1 too late" in table.rows[-1][3].text
-    assert "Braking was needed for 1 of them" in table.notes[1]
+    assert "Braking was needed in 1 encounters" in table.notes[1]
 
 
 def test_who_looks_rarely_has_seen_him_before():
@@ -209,7 +204,7 @@ def test_a_lorry_and_its_trailer_are_one_road_user():
     there = Drive("w", times_s, ego, BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5)), parts)
     for tracks in (parts, parts[::-1]):
         (one,) = find_approaches(there._replace(tracks=tracks), Criterion())
-        assert (one.track, one.name) == (parts[1], "lorries and buses")
+        assert (one.track, one.name) == (parts[1], "trucks and buses")
         assert 3.88 < one.ttc_s[0] <= 4.0
 
 
@@ -344,7 +339,7 @@ def test_what_cannot_be_asked_is_told(tmp_path):
         evaluate_traffic_encounters([rig()], world())
     with pytest.raises(ValueError, match="worlds: a number >= 1"):
         evaluate_traffic_encounters([rig()], num_scenes=0)
-    with pytest.raises(ValueError, match="how large its vehicle is"):
+    with pytest.raises(ValueError, match="the size of the vehicle is unknown"):
         evaluate_recorded_encounters(Closing(steps=5))
     with pytest.raises(ValueError, match="none of its 1 objects is a road user, by their categories"):
         evaluate_recorded_encounters(open_recording(LAYOUTS["folder"](Closing(steps=5), tmp_path)))
@@ -354,4 +349,4 @@ def test_what_cannot_be_asked_is_told(tmp_path):
     assert [(row.encounter, row.sample_count, row.max_ttc_s) for row in far.rows] == [("all", 0, 0.0)]
     (table,) = far.build_tables()
     assert table.rows[0][3].text == "-"
-    assert "Nobody was met" in table.notes[-1]
+    assert "No encounters" in table.notes[-1]

@@ -8,8 +8,8 @@ import numpy as np
 from tests.targets.worlds import EGO, FLOOR, lidar
 from torchcover.encounters import Criterion, Encounter, StagedEncounter, detect_encounter
 from torchcover.encounters.encounter import EncounterPath
-from torchcover.encounters.sighting import MountedRig
-from torchcover.encounters.staging import _along
+from torchcover.encounters.detection import MountedRig
+from torchcover.encounters.staging import compute_path_poses
 from torchcover.simulation import Rig, Scenario
 from torchcover.simulation.moving import BodyGeometry
 from torchcover.simulation.shapes import Box
@@ -102,7 +102,7 @@ def of_bends(places):
 
 def along_bend(radius_m):
     way = EncounterPath(speed_kmh=3.6, radius_m=radius_m, turn_deg=180.0)
-    return _along(way, np.array([100.0]), (0.0, 0.0), 0.0)[0, :2, 3]
+    return compute_path_poses(way, np.array([100.0]), (0.0, 0.0), 0.0)[0, :2, 3]
 
 
 def by_cosine(radius_m):

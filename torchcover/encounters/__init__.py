@@ -1,4 +1,4 @@
-"""In time or too late: when a rig detects what the vehicle is about to collide with."""
+"""Encounters: the time to collision at which a rig detects a road user on a collision course with the vehicle."""
 
 import lazy_loader
 

@@ -1,11 +1,11 @@
 from .criterion import Criterion as Criterion
+from .detection import EncounterDetection as EncounterDetection
+from .detection import detect_encounter as detect_encounter
 from .encounter import Encounter as Encounter
 from .encounter import EncounteredRoadUser as EncounteredRoadUser
 from .encounter import EncounterPath as EncounterPath
 from .encounter import EncounterSet as EncounterSet
 from .encounter import Obstacle as Obstacle
 from .result import EncounterResults as EncounterResults
-from .result import EncounterRow as EncounterRow
-from .sighting import EncounterDetection as EncounterDetection
-from .sighting import detect_encounter as detect_encounter
+from .rows import EncounterRow as EncounterRow
 from .staging import StagedEncounter as StagedEncounter

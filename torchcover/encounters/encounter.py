@@ -1,4 +1,4 @@
-"""Encounters as documents: a few numbers each, of which some are swept or drawn."""
+"""Encounters as documents: a few numbers each, some of which are swept or sampled."""
 
 import math
 from collections.abc import Iterator
@@ -23,44 +23,56 @@ from torchcover.simulation.document_errors import format_validation_error
 from torchcover.simulation.documents import BuiltInDocument, Document, build_name_validator
 from torchcover.simulation.returns import CLEAR, Weather
 
-# Of a family: ten times what anybody would wait for.
-MOST = 10_000
-FASTEST_KMH = 500.0
-# The key that tables have a column for; values of others become part of the name.
-SPEED = ("ego", "speed_kmh")
-
 KeyPath = tuple[str | int, ...]
-SpeedKmh = Annotated[float, Field(ge=-FASTEST_KMH, le=FASTEST_KMH)]
+
+# Limit of a family; its evaluation takes hours.
+MAX_ENCOUNTERS = 10_000
+# Speed of the ego vehicle, which has its own column in tables; values of other keys become part of the name.
+EGO_SPEED_KEY = ("ego", "speed_kmh")
 
 
-def _body(content: Any) -> Any:  # noqa: ANN401  (whatever stood in the file)
-    """The name or file of a vehicle is its shape."""
+def convert_vehicle_name(content: Any) -> Any:  # noqa: ANN401  (any content of a file)
+    """Convert the name or file of a vehicle to a shape; return other content unchanged."""
     return {"type": "vehicle", "vehicle": content} if isinstance(content, str) else content
 
 
-# At the door, and once: a set has few bodies.
-_vehicle = lru_cache(maxsize=64)(Vehicle.load)
+@lru_cache(maxsize=64)
+def load_vehicle(name: str) -> Vehicle:
+    """Load a vehicle once; a set of encounters has few different ones."""
+    return Vehicle.load(name)
 
 
-def _known(shape: Shape) -> Shape:
+def check_body_exists(shape: Shape) -> Shape:
+    """Check that the vehicle of a shape exists.
+
+    Args:
+        shape: Shape of a road user or an obstacle.
+
+    Returns:
+        The shape.
+
+    Raises:
+        ValueError: There is no such vehicle or file.
+    """
     try:
         if isinstance(shape, VehicleShape):
-            _vehicle(shape.vehicle)
+            load_vehicle(shape.vehicle)
     except FileNotFoundError as error:
         raise ValueError(str(error)) from error
     return shape
 
 
-BodyShape = Annotated[Shape, BeforeValidator(_body), AfterValidator(_known)]
+SpeedKmh = Annotated[float, Field(ge=-500.0, le=500.0)]
+BodyShape = Annotated[Shape, BeforeValidator(convert_vehicle_name), AfterValidator(check_body_exists)]
 
 
 class EncounterPath(Document):
-    """How somebody comes to the place of the meeting: straight, or around a bend and then straight.
+    """Path to the meeting point at constant speed: straight, or through a bend.
 
     Args:
-        speed_kmh: Constant; negative is in reverse.
-        radius_m: Of the bend, positive to the left; straight if not given.
-        turn_deg: How much of the bend lies before the meeting, and as much behind it; beyond it the way is straight.
+        speed_kmh: Speed; negative in reverse.
+        radius_m: Radius of the bend, positive to the left; default: straight.
+        turn_deg: Angle of the bend before the meeting point, and again behind it; the path is straight beyond.
     """
 
     speed_kmh: SpeedKmh
@@ -75,18 +87,23 @@ class EncounterPath(Document):
 
     @property
     def speed_mps(self) -> float:
-        """Signed, in metres a second."""
+        """Signed speed in meters per second."""
         return self.speed_kmh / 3.6
 
 
 class EncounteredRoadUser(EncounterPath):
-    """Who is met.
+    """Road user on a collision course with the ego vehicle.
 
     Args:
-        body: A built-in vehicle, the YAML file of one, or a shape; people are built-in vehicles, too.
-        yaw_deg: Where it heads at the meeting, from the ego's heading to the left: 90 crosses from the right.
-        approach_distance_m: How long its way to the meeting is; before, it is not there. From the beginning if not given.
-        impact_location: Where its middle is at the meeting, as a share of the ego's width, from its right side.
+        speed_kmh: Speed; negative in reverse.
+        radius_m: Radius of the bend, positive to the left; default: straight.
+        turn_deg: Angle of the bend before the meeting point, and again behind it.
+        body: A built-in vehicle (people, too), the YAML file of a vehicle, or a shape.
+        yaw_deg: Heading at the meeting point relative to the ego vehicle, counterclockwise: 90 crosses from the right.
+        approach_distance_m: Length of its path to the meeting point; it appears there. Default: as long as the
+            encounter lasts.
+        impact_location: Lateral position of its center at the meeting point: 0 at the right side of the ego vehicle,
+            1 at its left side.
     """
 
     body: BodyShape
@@ -96,15 +113,16 @@ class EncounteredRoadUser(EncounterPath):
 
 
 class Obstacle(Document):
-    """What stands in the way of the sight, beside the ego's way; rows are nearest first.
+    """Static occluder next to the path of the ego vehicle; the obstacles of one side form rows, the nearest first.
 
     Args:
-        body: As of `Other`.
-        side: Of the ego's way, straight on from the meeting.
-        position: Before the meeting, or beyond it.
-        lateral_gap_m: Between its side and that of the ego.
-        longitudinal_gap_m: Between its end and the outline of the other at the meeting, or the end of the one before on that side.
-        yaw_deg: Where it heads, from the ego's heading to the left.
+        body: As for `EncounteredRoadUser`.
+        side: Side of the path of the ego vehicle, extended straight through the meeting point.
+        position: Before or beyond the meeting point.
+        lateral_gap_m: Gap between its side and the side of the ego vehicle.
+        longitudinal_gap_m: Gap to the outline of the road user at the meeting point, or to the previous obstacle of the
+            row.
+        yaw_deg: Heading relative to the ego vehicle, counterclockwise.
     """
 
     body: BodyShape
@@ -116,16 +134,16 @@ class Obstacle(Document):
 
 
 class Encounter(Document):
-    """Two ways that meet: the middle of the ego's front, of its rear in reverse, reaches the way of the other.
+    """Two paths that meet: the center of the ego vehicle's front (rear in reverse) reaches the path of the road user.
 
     Args:
-        name: What tables call it.
-        ego: The vehicle that carries the rig.
-        road_user: Who is met.
-        obstacles: What hides it.
-        weather: Built in, or a YAML file; clear if not given.
-        max_lead_time_s: How long before the meeting it begins, unless the other comes later.
-        is_speed_swept: Whether tables have a row for this speed of the ego; else it was drawn, among others.
+        name: Name in tables.
+        ego: Path of the vehicle that carries the rig.
+        road_user: The other road user.
+        obstacles: Occluders.
+        weather: Built-in weather or a YAML file; default: clear.
+        max_lead_time_s: Time from the begin to the meeting point; shorter if the road user appears later.
+        is_speed_swept: True if tables have a row for this speed of the ego vehicle, False for a sampled speed.
     """
 
     name: str
@@ -139,53 +157,53 @@ class Encounter(Document):
     @model_validator(mode="after")
     def _check_speeds(self) -> Self:
         if self.ego.speed_kmh == 0 and self.road_user.speed_kmh == 0:
-            raise ValueError("nobody moves: ego.speed_kmh and other.speed_kmh are 0")
+            raise ValueError("neither vehicle moves: ego.speed_kmh and road_user.speed_kmh are 0")
         return self
 
     @property
     def speed_kmh(self) -> float:
-        """Of the ego."""
+        """Speed of the ego vehicle."""
         return self.ego.speed_kmh
 
     @property
     def description(self) -> str:
-        """Which one of its set."""
+        """Name and speed, for messages."""
         return f"encounter {self.name!r} at {self.speed_kmh:g} km/h"
 
     @property
     def approach_speed_mps(self) -> float:
-        """How fast the other comes towards the ego, along the ego's way; negative if it drives ahead.
+        """Speed of the road user towards the ego vehicle along its path; negative if it drives ahead.
 
         Example:
-            >>> car = {"body": "hatchback", "speed_kmh": 54, "yaw_deg": 180}
-        >>> oncoming = {"name": "oncoming", "ego": {"speed_kmh": 90}, "road_user": car}
-            >>> round(Encounter.model_validate(oncoming).approach_speed_mps, 9)
+            >>> road_user = {"body": "hatchback", "speed_kmh": 54, "yaw_deg": 180}
+            >>> content = {"name": "oncoming", "ego": {"speed_kmh": 90}, "road_user": road_user}
+            >>> round(Encounter.model_validate(content).approach_speed_mps, 9)
             15.0
         """
-        along_mps = self.road_user.speed_mps * math.cos(math.radians(self.road_user.yaw_deg))
-        return -math.copysign(1.0, self.ego.speed_mps) * along_mps
+        along_path_mps = self.road_user.speed_mps * math.cos(math.radians(self.road_user.yaw_deg))
+        return -math.copysign(1.0, self.ego.speed_mps) * along_path_mps
 
     @property
     def lead_time_s(self) -> float:
-        """How long before the meeting it begins."""
-        speed_mps, from_m = abs(self.road_user.speed_mps), self.road_user.approach_distance_m
-        return (
-            self.max_lead_time_s if from_m is None or speed_mps == 0 else min(self.max_lead_time_s, from_m / speed_mps)
-        )
+        """Time from the begin of the encounter to the meeting point."""
+        speed_mps, distance_m = abs(self.road_user.speed_mps), self.road_user.approach_distance_m
+        if distance_m is None or speed_mps == 0:
+            return self.max_lead_time_s
+        return min(self.max_lead_time_s, distance_m / speed_mps)
 
 
 class EncounterSet(BuiltInDocument):
-    """Encounters of some families. In a family any value may be swept, as a list, or drawn, as `{from: 1.0, to: 1.4}`.
+    """Families of encounters. Any value of a family may be swept, as a list, or sampled, as `{from: 1.0, to: 1.4}`.
 
-    All lists are combined with each other, and each combination with the same `num_samples` of what is drawn: evenly from
-    each range (a Latin hypercube).
+    All lists are combined with each other, and each combination with the same `num_samples` sampled values, which
+    cover each range evenly (a Latin hypercube).
 
     Args:
-        name: What tables call it.
-        description: What it is, and where its numbers come from.
-        num_samples: How many are drawn.
-        seed: Of what is drawn.
-        encounters: The families; in Python all of their encounters.
+        name: Name in tables.
+        description: Contents and source of the numbers.
+        num_samples: Number of samples.
+        seed: Seed of the samples.
+        encounters: The families in a file; in Python all their encounters.
 
     Example:
         >>> crossings = EncounterSet.load("crossing_like").encounters
@@ -204,103 +222,172 @@ class EncounterSet(BuiltInDocument):
 
     @model_validator(mode="before")
     @classmethod
-    def _expand(cls, content: Any, info: ValidationInfo) -> Any:  # noqa: ANN401  (whatever stood in the file)
+    def _expand_families(cls, content: Any, info: ValidationInfo) -> Any:  # noqa: ANN401  (any content of a file)
         families = content.get("encounters") if isinstance(content, dict) else None
-        draws, seed = (
-            (content.get(key, usual) for key, usual in (("num_samples", 16), ("seed", 0))) if families else (16, 0)
-        )
-        sound = isinstance(draws, int) and isinstance(seed, int) and 1 <= draws <= MOST and seed >= 0
-        if not isinstance(families, list | tuple) or not sound:
-            return content  # which is told field by field
-        found, first = list[Any](), dict[str, int]()
-        for number, family in enumerate(families):
+        if not isinstance(families, list | tuple):
+            return content  # refused field by field
+        num_samples, seed = content.get("num_samples", 16), content.get("seed", 0)
+        are_integers = isinstance(num_samples, int) and isinstance(seed, int)
+        if not (are_integers and 1 <= num_samples <= MAX_ENCOUNTERS and seed >= 0):
+            return content
+        encounters = list[Any]()
+        family_of_name = dict[str, int]()
+        for family_index, family in enumerate(families):
             if not isinstance(family, dict):
-                found.append(family)
+                encounters.append(family)
                 continue
             try:
-                for one in expand_family(family, draws, np.random.default_rng([seed, number])):
-                    found.append(Encounter.model_validate(one, context=info.context))
-                    name = found[-1].name
-                    if first.setdefault(name, number) < number:
-                        raise ValueError(f"encounters.{first[name]} is called {name!r}, too")
+                for values in expand_family(family, num_samples, np.random.default_rng([seed, family_index])):
+                    encounter = Encounter.model_validate(values, context=info.context)
+                    encounters.append(encounter)
+                    first_index = family_of_name.setdefault(encounter.name, family_index)
+                    if first_index < family_index:
+                        raise ValueError(f"the name {encounter.name!r} is already used by encounters.{first_index}")
             except ValueError as error:
-                words = format_validation_error(error) if isinstance(error, ValidationError) else error
-                raise ValueError(f"encounters.{number}: {words}") from error
-        return {**content, "encounters": tuple(found)}
+                message = format_validation_error(error) if isinstance(error, ValidationError) else error
+                raise ValueError(f"encounters.{family_index}: {message}") from error
+        return {**content, "encounters": tuple(encounters)}
 
     @model_validator(mode="after")
     def _check_directions(self) -> Self:
-        forward = {one.name for one in self.encounters if one.speed_kmh > 0}
-        if both := next((one.name for one in self.encounters if one.speed_kmh < 0 and one.name in forward), None):
-            raise ValueError(f"encounters: {both!r} has speeds forward and in reverse; make an encounter of each")
+        forward_names = {encounter.name for encounter in self.encounters if encounter.speed_kmh > 0}
+        for encounter in self.encounters:
+            if encounter.speed_kmh < 0 and encounter.name in forward_names:
+                raise ValueError(
+                    f"encounters: {encounter.name!r} has speeds forward and in reverse; make an encounter of each"
+                )
         return self
 
 
 def expand_family(family: dict[str, Any], num_samples: int, generator: np.random.Generator) -> Iterator[dict[str, Any]]:
-    """The encounters of a family, each with one value where the family has a list or a range.
+    """Iterate over the encounters of a family, each with one value where the family has a list or a range.
 
-    ValueError: a list of none, a range that is none, or too many.
+    Args:
+        family: Content of the file.
+        num_samples: Number of samples of each range.
+        generator: Source of the random numbers.
+
+    Yields:
+        Content of each encounter.
+
+    Raises:
+        ValueError: An empty list, an invalid range, or too many encounters.
     """
-    swept, drawn = dict[KeyPath, Any](), dict[KeyPath, Any]()
-    for place, value in _leaves(family, ()):
+    swept_values, sampled_values = dict[KeyPath, Any](), dict[KeyPath, Any]()
+    for key_path, value in iterate_varied_values(family, ()):
         if isinstance(value, dict):
-            drawn[place] = _between(place, value, num_samples, generator)
+            sampled_values[key_path] = sample_range(key_path, value, num_samples, generator)
+        elif len(value) == 0:
+            raise ValueError(f"{format_key_path(key_path)}: a list of values is empty")
         else:
-            if len(value) == 0:
-                raise ValueError(f"{'.'.join(map(str, place))}: a list of values is empty")
-            swept[place] = value
-    count = math.prod(map(len, swept.values())) * (num_samples if drawn else 1)
-    if count > MOST:
-        raise ValueError(f"{count:,} encounters of a family, of at most {MOST:,}; sweep or draw less")
-    for combination in product(*swept.values()):
-        of_swept = dict(zip(swept, combination, strict=True))
-        words = [
-            value if isinstance(value, str) else f"{place[-1]} {value}"
-            for place, value in of_swept.items()
-            if place != SPEED
-        ]
-        for draw in range(num_samples if drawn else 1):
-            values = of_swept | {place: each[draw] for place, each in drawn.items()}
-            one = _with(family, values, ())
-            if words and isinstance(family.get("name"), str):
-                one["name"] = f"{family['name']}: {', '.join(words)}"
-            if SPEED in drawn:
-                one["is_speed_swept"] = False
-            yield one
+            swept_values[key_path] = value
+    samples_per_combination = num_samples if sampled_values else 1
+    num_encounters = samples_per_combination * math.prod([len(values) for values in swept_values.values()])
+    if num_encounters > MAX_ENCOUNTERS:
+        raise ValueError(
+            f"{num_encounters:,} encounters of a family exceed the limit of {MAX_ENCOUNTERS:,}; sweep or sample fewer "
+            "values"
+        )
+    for combination in product(*swept_values.values()):
+        values = dict(zip(swept_values, combination, strict=True))
+        labels = format_swept_values(values)
+        for sample in range(samples_per_combination):
+            values |= {key_path: samples[sample] for key_path, samples in sampled_values.items()}
+            encounter = replace_values(family, values, ())
+            if labels and isinstance(family.get("name"), str):
+                encounter["name"] = f"{family['name']}: {labels}"
+            if EGO_SPEED_KEY in sampled_values:
+                encounter["is_speed_swept"] = False
+            yield encounter
 
 
-def _leaves(value: Any, place: KeyPath) -> Iterator[tuple[KeyPath, Any]]:  # noqa: ANN401
-    """What is swept or drawn; a shape has lists of its own."""
+def format_swept_values(values: dict[KeyPath, Any]) -> str:
+    """Format the swept values of an encounter for its name, except for the speed of the ego vehicle.
+
+    Args:
+        values: Values by their path.
+
+    Returns:
+        Texts such as `van, yaw_deg 90`.
+    """
+    labels = []
+    for key_path, value in values.items():
+        if key_path != EGO_SPEED_KEY:
+            labels.append(value if isinstance(value, str) else f"{key_path[-1]} {value}")
+    return ", ".join(labels)
+
+
+def format_key_path(key_path: KeyPath) -> str:
+    """Format the path of a key in a document, such as `ego.speed_kmh`."""
+    return ".".join(str(key) for key in key_path)
+
+
+def iterate_varied_values(value: Any, key_path: KeyPath) -> Iterator[tuple[KeyPath, Any]]:  # noqa: ANN401
+    """Iterate over the lists and ranges of a family.
+
+    Args:
+        value: The family, or a part of it.
+        key_path: Path of the part.
+
+    Yields:
+        Path and value of each list or range. Shapes are skipped, as their lists are no sweeps.
+    """
     if isinstance(value, dict):
         if set(value) == {"from", "to"}:
-            yield place, value
-        elif place[-1:] != ("body",):
+            yield key_path, value
+        elif key_path[-1:] != ("body",):
             for key, inner in value.items():
-                yield from _leaves(inner, (*place, key))
+                yield from iterate_varied_values(inner, (*key_path, key))
     elif isinstance(value, list | tuple):
-        if any(isinstance(each, dict) for each in value):
-            for number, inner in enumerate(value):
-                yield from _leaves(inner, (*place, number))
-        elif place not in (("obstacles",), ("name",)):
-            yield place, value
+        if any(isinstance(inner, dict) for inner in value):
+            for index, inner in enumerate(value):
+                yield from iterate_varied_values(inner, (*key_path, index))
+        elif key_path not in (("obstacles",), ("name",)):
+            yield key_path, value
 
 
-def _between(place: KeyPath, ends: dict[str, Any], draws: int, generator: np.random.Generator) -> list[float]:
-    low, high = ends["from"], ends["to"]
-    for end in (low, high):
-        if isinstance(end, bool) or not isinstance(end, int | float) or not math.isfinite(end):
-            raise ValueError(f"{'.'.join(map(str, place))}: two numbers from and to are needed; got {end!r}")
+def sample_range(
+    key_path: KeyPath, bounds: dict[str, Any], num_samples: int, generator: np.random.Generator
+) -> list[float]:
+    """Sample a range so that each of `num_samples` equal parts has one value, in random order.
+
+    Args:
+        key_path: Path of the range, for messages.
+        bounds: Content with the keys `from` and `to`.
+        num_samples: Number of values.
+        generator: Source of the random numbers.
+
+    Returns:
+        The values.
+
+    Raises:
+        ValueError: The bounds are no finite numbers in ascending order.
+    """
+    low, high = bounds["from"], bounds["to"]
+    for bound in (low, high):
+        if isinstance(bound, bool) or not isinstance(bound, int | float) or not math.isfinite(bound):
+            raise ValueError(f"{format_key_path(key_path)}: two numbers from and to are needed; got {bound!r}")
     if low >= high:
-        raise ValueError(f"{'.'.join(map(str, place))}: from {low:g} must be below to {high:g}")
-    evenly = (generator.permutation(draws) + generator.random(draws)) / draws
-    return [float(value) for value in low + evenly * (high - low)]
+        raise ValueError(f"{format_key_path(key_path)}: from {low:g} must be below to {high:g}")
+    shares = (generator.permutation(num_samples) + generator.random(num_samples)) / num_samples
+    return [float(value) for value in low + shares * (high - low)]
 
 
-def _with(value: Any, values: dict[KeyPath, Any], place: KeyPath) -> Any:  # noqa: ANN401
-    if place in values:
-        return values[place]
+def replace_values(value: Any, values: dict[KeyPath, Any], key_path: KeyPath) -> Any:  # noqa: ANN401
+    """Replace the values at some paths of a document.
+
+    Args:
+        value: The document, or a part of it.
+        values: New values by their path.
+        key_path: Path of the part.
+
+    Returns:
+        Copy with the new values.
+    """
+    if key_path in values:
+        return values[key_path]
     if isinstance(value, dict):
-        return {key: _with(inner, values, (*place, key)) for key, inner in value.items()}
+        return {key: replace_values(inner, values, (*key_path, key)) for key, inner in value.items()}
     if isinstance(value, list | tuple):
-        return [_with(inner, values, (*place, number)) for number, inner in enumerate(value)]
+        return [replace_values(inner, values, (*key_path, index)) for index, inner in enumerate(value)]
     return value

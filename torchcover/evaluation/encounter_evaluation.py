@@ -18,10 +18,11 @@ from torchcover.encounters import (
     StagedEncounter,
     detect_encounter,
 )
-from torchcover.encounters.result import ALL
-from torchcover.encounters.sighting import EncounterPointCounter, MountedRig
-from torchcover.encounters.staging import STEP_S, get_solid
-from torchcover.encounters.traffic import Drive, DriveSensors, detect_approach, find_approaches
+from torchcover.encounters.detection import EncounterPointCounter, MountedRig
+from torchcover.encounters.result import TOTAL_ROW
+from torchcover.encounters.staging import FRAME_INTERVAL_S, get_solid
+from torchcover.encounters.traffic import Drive, find_approaches
+from torchcover.encounters.traffic_detection import DriveSensors, detect_approach
 from torchcover.evaluation.progress import Progress, defer_signals
 from torchcover.evaluation.result_page import format_facts
 from torchcover.evaluation.settings import FILES, parse_file_kinds
@@ -212,9 +213,9 @@ def plot_encounter_animation(
         kmh = encounter_results.find_max_speeds_kmh()[case.name, name]
         told += "; in time at none of the speeds" if math.isnan(kmh) else f"; in time up to {kmh:g} km/h"
     steps = np.arange(
-        max(int((staged.contact_time_s - FILM_S) / STEP_S), 0), int(staged.contact_time_s / STEP_S), FILM_STEPS
+        max(int((staged.contact_time_s - FILM_S) / FRAME_INTERVAL_S), 0), int(staged.contact_time_s / FRAME_INTERVAL_S), FILM_STEPS
     )
-    times_s = STEP_S * steps.astype(np.float64)
+    times_s = FRAME_INTERVAL_S * steps.astype(np.float64)
     vehicle_T_world = invert(staged.compute_world_T_ego(times_s))
     bodies = [(one.body, vehicle_T_world @ pose) for one, pose in staged.obstacles]
     bodies.append((case.road_user.body, staged.compute_vehicle_T_road_user(times_s)))
@@ -234,7 +235,7 @@ def plot_encounter_animation(
             ego_outline_m=ego_m,
             actors=[ActorMark(get_shape_name(body), there) for (body, _), there in zip(bodies, now_m, strict=True)],
             sensor_points=np.concatenate([scan.points for scan in scans]),
-            title=f"{staged.contact_time_s - STEP_S * step:.2f} s to the collision; points on it: {seen}",
+            title=f"{staged.contact_time_s - FRAME_INTERVAL_S * step:.2f} s to the collision; points on it: {seen}",
             subtitle=told,
         )
 
@@ -266,7 +267,7 @@ def save_encounters(
 
 def summarize_encounters(encounter_results: EncounterResults) -> tuple[str, ...]:
     """In how many of the encounters each rig is in time, in a sentence; of traffic, who was met when too late."""
-    rows = [row for row in encounter_results.rows if row.encounter != ALL and row.braking_count]
+    rows = [row for row in encounter_results.rows if row.encounter != TOTAL_ROW and row.braking_count]
     of_rigs = {rig: [row for row in rows if row.rig == rig] for rig in encounter_results.sensor_names}
     if not rows:
         return ("Nobody was met for whom the vehicle had to brake.",)

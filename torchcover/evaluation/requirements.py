@@ -30,7 +30,7 @@ from torchcover.coverage.quantities import (
     make_sensor_count_quantity,
 )
 from torchcover.encounters import Criterion, EncounterSet
-from torchcover.encounters.criterion import MOST_LATENCY_S
+from torchcover.encounters.criterion import MAX_LATENCY_S
 from torchcover.estimation import Quantity
 from torchcover.evaluation.verdicts import Bound, Float64
 from torchcover.geometry import BoundingBox
@@ -394,7 +394,7 @@ class BrakingModel(Document):
     """
 
     deceleration_mps2: PositiveFloat = 9.0
-    latency_s: Annotated[float, Field(ge=0, le=MOST_LATENCY_S)] = 0.5
+    latency_s: Annotated[float, Field(ge=0, le=MAX_LATENCY_S)] = 0.5
 
 
 class EncounterRequirement(_Requirement):
