@@ -208,6 +208,18 @@ def test_make_targets_formats_and_smoke_imports_exist():
         exec(line, {})
 
 
+def test_contributing_names_existing_files_and_definitions():
+    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8").partition("## Extend the package")[2]
+    source = "\n".join(path.read_text(encoding="utf-8") for path in (ROOT / "torchcover").rglob("*.py"))
+    source += (ROOT / "tests" / "metrics" / "cases.py").read_text(encoding="utf-8")
+    source += (ROOT / "tests" / "simulation" / "test_protocols.py").read_text(encoding="utf-8")
+    for name in re.findall(r"`([\w/]+\.(?:py|pyi))`", text):
+        folders = (ROOT, ROOT / "torchcover", ROOT / "tests")
+        assert "NAME" in name or "/" not in name or any((folder / name).exists() for folder in folders), name
+    for name in re.findall(r"`([A-Z]\w+)`", text):
+        assert name == "XxxParams" or re.search(rf"(?m)^ *(class )?{name}\b ?[:=(\[]", source), name
+
+
 def test_links_lead_to_existing_headings():
     for page in PAGES:
         text = re.sub(r"```.*?```|`[^`\n]*`", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
@@ -216,6 +228,12 @@ def test_links_lead_to_existing_headings():
             assert path.exists(), f"{page.name}: {target}"
             if anchor:
                 assert anchor in list_anchors(path), f"{page.name}: {target}#{anchor}"
+
+
+def test_documentation_is_short_enough():
+    pages = [page for page in PAGES if page.name not in ("renamed.md", "glossary.md")]
+    words = "".join(page.read_text(encoding="utf-8") for page in pages).replace("|", "").split()
+    assert len(words) <= 14_000
 
 
 def list_anchors(path):
