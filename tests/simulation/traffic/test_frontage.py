@@ -27,7 +27,7 @@ def slope(places_m):
 
 
 def stood(times, zone="built", compute_heights_m=slope, sidewalk_areas=(), seed=0):
-    sides = [StreetSide("kerb", shifted(3.3)), StreetSide(zone, shifted(5.3))]
+    sides = [StreetSide("curb", shifted(3.3)), StreetSide(zone, shifted(5.3))]
     return place_scenery(
         sides, [STREET], [STREET.buffer(1.9)], sidewalk_areas, compute_heights_m, times, np.random.default_rng(seed)
     )
@@ -89,7 +89,7 @@ def test_nothing_stands_where_there_are_no_sides():
 
 
 def test_lines_may_be_short_and_their_corners_coincide():
-    short = StreetSide("kerb", np.array([[0.0, 0.0], [0.3, 0.0]]))
+    short = StreetSide("curb", np.array([[0.0, 0.0], [0.3, 0.0]]))
     twice = StreetSide("open", np.repeat(shifted(5.3), 2, axis=0))
     _, others = place_scenery([short, twice], [STREET], [], [], slope, 1.0, np.random.default_rng(0))
     assert others

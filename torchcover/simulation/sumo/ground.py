@@ -25,7 +25,7 @@ from torchcover.simulation.sumo.motion import Motion, compute_rectangle_corners_
 from torchcover.simulation.sumo.network import Vicinity
 from torchcover.simulation.traffic.alignment import Polyline
 from torchcover.simulation.traffic.assemble import compute_attitude_deg
-from torchcover.simulation.traffic.city import FREE_AT_CORNERS_M, PARKED, PARKED_GAP_M
+from torchcover.simulation.traffic.city import CITY, PARKED_KINDS
 from torchcover.simulation.traffic.fleet import CATEGORIES, EGO, REAR_OF, Fleet, get_part_kinds
 from torchcover.simulation.traffic.scenery import PAVEMENT_M, build_sidewalk
 from torchcover.simulation.world import Actor
@@ -215,10 +215,10 @@ def place_parked_vehicles(
         if lane.use != "bay":
             continue
         line = Polyline(lane.line_m[:, :2])
-        way_m, end_m = FREE_AT_CORNERS_M, line.length_m - FREE_AT_CORNERS_M
+        way_m, end_m = CITY.corner_clearance_m, line.length_m - CITY.corner_clearance_m
         while way_m < end_m:
-            kind = fleet.sample_kind(PARKED)
-            length_m = fleet.get_length_m(kind) + PARKED_GAP_M + float(generator.uniform(0.0, 0.5))
+            kind = fleet.sample_kind(PARKED_KINDS)
+            length_m = fleet.get_length_m(kind) + CITY.parking_gap_m + float(generator.uniform(0.0, 0.5))
             taken = generator.random() < parked_share and way_m + length_m < end_m
             if taken and fleet.get_width_m(kind) < lane.width_m:
                 poses[kind].append(line.compute_poses(way_m + length_m / 2))

@@ -1,6 +1,7 @@
-"""What stands along the streets of a city: blocks 0.15 m up, what stands on and beside them, parked cars."""
+"""Builder of a city along a street plan: blocks with raised sidewalks, houses, roadside objects and parked cars."""
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -16,29 +17,61 @@ from torchcover.simulation.traffic.hills import BlockParams, Bounds, BuildingSit
 from torchcover.simulation.traffic.scenery import Scenery, build_ground_plane, build_sidewalk, merge_by_kind
 from torchcover.simulation.traffic.streets import STREETS, StreetPlan
 
-BLOCK_DEPTH_M = 95.0
-# Crossings and the sight of those who wait there stay free: of parked cars, and of furniture.
-FREE_AT_CORNERS_M, FREE_AT_ENDS_M = 9.0, 5.0
-PARKED_GAP_M = 0.9
-LANE_SIDE_M = 2.2
-PARKED = {"suv": 3.0, "sedan": 3.0, "hatchback": 3.0, "pickup": 0.8, "van": 1.0}
-# The block between two streets that meet the main street where it turns.
-CORNER_M, CORNER_DEPTH_M, LANES_M = 100.0, 70.0, 130.0
-# Half of the width that a gap between pavements has at most.
-WEDGE_M = 10.0
-APART_M, SNAPPED_M = 1e-3, 1e-4
-# Streets in plan: corners so far apart, and a little narrower than they are, for those are on their curves' chords.
-STREET_EVERY_M, WITHIN_M = 4.0, 0.2
-# Beyond a sensor's range the ground goes on a little.
-GROUND_M = 320.0
-WAY_EVERY_M = 40.0
+# Weights of the kinds of parked cars.
+PARKED_KINDS = {"suv": 3.0, "sedan": 3.0, "hatchback": 3.0, "pickup": 0.8, "van": 1.0}
+
+
+@dataclass(frozen=True)
+class CityParams:
+    """Dimensions of blocks and parking.
+
+    Args:
+        block_depth_m: Depth of a block behind the curb.
+        corner_m: Length along each of the two streets of a block where the main street turns.
+        corner_depth_m: Depth of such a block.
+        cross_street_m: Length of these streets in the ground plane, from the junction.
+        corner_clearance_m: Distance from junctions in which no car is parked, for the view of pedestrians.
+        furniture_clearance_m: Distance from junctions in which no street furniture stands.
+        parking_gap_m: Smallest gap between parked cars.
+        parking_width_m: Width of parking on the lanes of streets without bays.
+        max_gap_m: Half of the largest width of a gap between sidewalks that is filled.
+        shrink_m: Reduction of outlines so that they do not touch themselves.
+        grid_m: Precision of outlines.
+        street_spacing_m: Distance of the vertices of streets in the ground plane.
+        tolerance_m: Reduction of streets in the ground plane, since their vertices lie on chords of curves.
+        ground_margin_m: Distance from the main street up to which hilly ground is built, beyond the range of sensors.
+        ground_spacing_m: Distance of the stations from which this distance is measured.
+    """
+
+    block_depth_m: float = 95.0
+    corner_m: float = 100.0
+    corner_depth_m: float = 70.0
+    cross_street_m: float = 130.0
+    corner_clearance_m: float = 9.0
+    furniture_clearance_m: float = 5.0
+    parking_gap_m: float = 0.9
+    parking_width_m: float = 2.2
+    max_gap_m: float = 10.0
+    shrink_m: float = 1e-3
+    grid_m: float = 1e-4
+    street_spacing_m: float = 4.0
+    tolerance_m: float = 0.2
+    ground_margin_m: float = 320.0
+    ground_spacing_m: float = 40.0
+
+
+CITY = CityParams()
 
 
 class Frontage(NamedTuple):
     """One side of a street between two stations, behind the curb.
 
-    `side` is 1 on the left and -1 on the right. The street turns towards this side within `turn_spans_m`.
-    `junction_indices` are the junctions at both ends; empty for a block between two streets that meet in a turn.
+    Args:
+        span_m: First and last station.
+        side: 1 on the left, -1 on the right.
+        curb_offset_m: Distance of the curb from the centerline.
+        turn_spans_m: Stations between which the street turns towards this side.
+        junction_indices: Junctions at both ends; empty for a block between two streets that meet in a turn.
     """
 
     span_m: Bounds
@@ -48,8 +81,36 @@ class Frontage(NamedTuple):
     junction_indices: tuple[int, ...] = ()
 
 
+class ParkedCar(NamedTuple):
+    """Parked car along a street.
+
+    Args:
+        kind: Body.
+        station_m: Station of its center.
+        left_m: Offset of its center to the left of the centerline.
+        yaw_deg: Heading relative to the street.
+    """
+
+    kind: str
+    station_m: float
+    left_m: float
+    yaw_deg: float
+
+
 class CityBuilder(NamedTuple):
-    """Builder of the part of a city around the path of the ego vehicle, with parked cars."""
+    """Builder of the part of a city around the path of the ego vehicle.
+
+    Args:
+        streets: Street plan.
+        corridor: Area around the main street.
+        hills: Ground heights.
+        fleet: Bodies; receives the parked cars.
+        parked_share: Share of the parking bays that are occupied.
+        built_share: Share of the block sides that have houses.
+        roadside_density: Factors on the density of roadside objects.
+        generator: Random generator of objects and parked cars.
+        layout_generator: Random generator of blocks.
+    """
 
     streets: StreetPlan
     corridor: StreetCorridor
@@ -62,245 +123,256 @@ class CityBuilder(NamedTuple):
     layout_generator: np.random.Generator
 
     def build_static_scenery(self, visible_span_m: Bounds) -> Scenery:
-        """The ground, the blocks, buildings and furniture; cars are parked among them."""
-        main = BuildingSite(
-            self.streets.main_alignment,
-            self.corridor,
-            self.hills,
-            self.streets.cross_section.curb_offset_m + BLOCK_DEPTH_M + 10.0,
-        )
-        fronts = [(main, front) for front in self._frontages(visible_span_m)]
-        turns = ~self.streets.has_lights & (
-            np.abs(self.streets.junction_stations_m - np.mean(visible_span_m)) < np.ptp(visible_span_m) / 2
-        )
-        fronts += [self._corner(index) for index in np.flatnonzero(turns).tolist()]
-        blocks, outlines, aprons, sides = [], [], list[shapely.Geometry](), list[StreetSide]()
-        for site, front in fronts:
+        """Build ground, blocks, houses and roadside objects, and park the cars.
+
+        Args:
+            visible_span_m: First and last visible station of the main street.
+        """
+        sidewalk_m = self.streets.cross_section.sidewalk_width_m
+        blocks, outlines = [], []
+        aprons: list[shapely.Geometry] = []
+        sides: list[StreetSide] = []
+        frontages = self._list_frontages(visible_span_m)
+        for site, frontage in frontages:
             is_built = self.built_share == 1.0 or self.layout_generator.random() < self.built_share
-            depth_m = BLOCK_DEPTH_M if front.junction_indices else CORNER_DEPTH_M
-            depth_m = depth_m if is_built else self.streets.cross_section.sidewalk_width_m
-            block, outline = site.build_block(front.span_m, front.side, front.curb_offset_m, depth_m)
+            depth_m = CITY.block_depth_m if frontage.junction_indices else CITY.corner_depth_m
+            depth_m = depth_m if is_built else sidewalk_m
+            block, outline = site.build_block(frontage.span_m, frontage.side, frontage.curb_offset_m, depth_m)
             blocks.append(block)
             outlines.append(outline)
             zone: Zone = "built" if is_built else "open"
-            sides += self._sides(site.street, front, zone)
-            for end in range(len(front.junction_indices)):
-                edge_m, apron = self._end(site, front, end, is_built)
-                aprons += apron
-                sides += _across(
-                    edge_m if front.side == 1 - 2 * end else edge_m[::-1],
-                    self.streets.cross_section.sidewalk_width_m,
-                    zone,
-                )
-        driven, walked = self._in_plan()
-        nets, whole = shapely.union_all(outlines), shapely.union_all([*outlines, *aprons], grid_size=SNAPPED_M)
+            sides += self._iterate_street_sides(site.street, frontage, zone)
+            for end in range(len(frontage.junction_indices)):
+                curb_m, end_aprons = self._build_end(site, frontage, end, is_built)
+                aprons += end_aprons
+                curb_m = curb_m if frontage.side == 1 - 2 * end else curb_m[::-1]
+                sides += build_cross_street_sides(curb_m, sidewalk_m, zone)
+        streets, streets_with_sidewalks = self._build_street_areas()
+        blocks_area = shapely.union_all(outlines)
+        sidewalks = shapely.union_all([*outlines, *aprons], grid_size=CITY.grid_m)
         if not self.streets.main_alignment.is_straight:
-            aprons.append(self._between(whole, shapely.union_all(driven)))
-            whole = shapely.union_all([whole, aprons[-1]], grid_size=SNAPPED_M)
-        # A little apart, so that no outline meets itself.
-        rest = shapely.union_all(aprons, grid_size=SNAPPED_M).difference(nets).buffer(-APART_M, join_style="bevel")
-        rest = shapely.get_parts(shapely.set_precision(rest, SNAPPED_M))
-        blocks.append(build_sidewalk(shapely.segmentize(rest, BlockParams().segment_m), self.hills.compute_heights_m))
-        self._park([(site, self._parked(front)) for site, front in fronts])
-        stood = place_scenery(
+            aprons.append(find_narrow_gaps(sidewalks, shapely.union_all(streets)))
+            sidewalks = shapely.union_all([sidewalks, aprons[-1]], grid_size=CITY.grid_m)
+        apron_area = shapely.union_all(aprons, grid_size=CITY.grid_m).difference(blocks_area)
+        apron_area = apron_area.buffer(-CITY.shrink_m, join_style="bevel")
+        apron_areas = shapely.get_parts(shapely.set_precision(apron_area, CITY.grid_m))
+        apron_outlines = shapely.segmentize(apron_areas, BlockParams().segment_m)
+        blocks.append(build_sidewalk(apron_outlines, self.hills.compute_heights_m))
+        self._park_cars(frontages)
+        roadside = place_scenery(
             sides,
-            driven,
-            walked,
-            shapely.get_parts(whole),
+            streets,
+            streets_with_sidewalks,
+            shapely.get_parts(sidewalks),
             self.hills.compute_heights_m,
             self.roadside_density,
             self.generator,
         )
-        pavements = merge_by_kind(blocks)
-        return Scenery(
-            (self._ground(visible_span_m), *pavements, *merge_by_kind(*stood)), tuple(range(1 + len(pavements)))
-        )
+        ground_meshes = (self._build_ground(visible_span_m), *merge_by_kind(blocks))
+        return Scenery((*ground_meshes, *merge_by_kind(*roadside)), tuple(range(len(ground_meshes))))
 
-    def _in_plan(self) -> tuple[list[shapely.Geometry], list[shapely.Geometry]]:
-        """All streets, without and with the sidewalks along them."""
-        stations_m = [self.corridor.sample_stations_m(STREET_EVERY_M)]
-        bodies_m = self.streets.cross_street_spans_m + np.array([-STREETS.half_vehicle_m, STREETS.half_vehicle_m])
-        for street, ends_m in zip(self.streets.cross_streets, bodies_m, strict=True):
-            stations_m.append(ends_m if street.is_straight else np.arange(-LANES_M, LANES_M, STREET_EVERY_M))
-        streets = zip([self.streets.main_alignment, *self.streets.cross_streets], stations_m, strict=True)
-        lines = [shapely.LineString(street.compute_poses(along_m, 0.0)[:, :2]) for street, along_m in streets]
-        lines = shapely.simplify(lines, WITHIN_M / 4)
-        half_m = [self.streets.cross_section.curb_offset_m, *self.streets.cross_curb_offsets_m.tolist()]
-        driven, walked = (
-            shapely.buffer(lines, np.array(half_m) - WITHIN_M + wider_m, cap_style="flat").tolist()
-            for wider_m in (0.0, self.streets.cross_section.sidewalk_width_m)
-        )
-        return driven, walked
-
-    def _sides(self, street: Alignment, front: Frontage, zone: Zone) -> Iterator[StreetSide]:
-        """Along its street: at the kerb, and behind the sidewalk."""
-        (first, last), sidewalk_m = front.span_m, self.streets.cross_section.sidewalk_width_m
-        yield StreetSide(
-            "kerb", _beside(street, (first + FREE_AT_ENDS_M, last - FREE_AT_ENDS_M), front.side * front.curb_offset_m)
-        )
-        edges = [first + sidewalk_m, *(edge for turn_m in front.turn_spans_m for edge in turn_m), last - sidewalk_m]
-        for number, x_m in enumerate(pairwise(edges)):
-            if x_m[1] > x_m[0] and not (number % 2 and front.junction_indices):
-                # In a turn there is no room for houses.
-                yield StreetSide(
-                    "open" if number % 2 else zone,
-                    _beside(street, x_m, front.side * (front.curb_offset_m + sidewalk_m)),
-                )
-
-    def _end(
-        self, site: BuildingSite, front: Frontage, end: int, is_built: bool
-    ) -> tuple[Float64, list[shapely.Geometry]]:
-        """(2, 2) the kerb of the cross street at the beginning (0) or the end (1) of a block, and pavement along it.
-
-        Where the main street turns away, its sidewalk goes on around the turn, and the block as far as the street that
-        goes straight on.
-        """
-        index, corner_m, inwards = front.junction_indices[end], front.span_m[end], 1 - 2 * end
-        deep_m = float(site.compute_depths_m(np.array([corner_m]), front.side, front.curb_offset_m, BLOCK_DEPTH_M)[0])
-        y_m = front.side * (
-            front.curb_offset_m + np.array([0.0, FREE_AT_CORNERS_M, max(deep_m, 2 * FREE_AT_CORNERS_M)])
-        )
-        face_m, sidewalk_m = (
-            site.street.compute_poses(corner_m, y_m)[:, :2],
-            self.streets.cross_section.sidewalk_width_m,
-        )
-        inside_m = -inwards * front.side * sidewalk_m
-        if not self.streets.main_street.turn_directions[index]:
-            return face_m[1:], [] if is_built else [_strip(face_m, inside_m)]
-        middle_m, half_m = (
-            float(self.streets.junction_stations_m[index]),
-            float(self.streets.main_street.junction_half_lengths_m[index]),
-        )
-        around_m = site.street.compute_poses(np.linspace(corner_m, middle_m, 17), front.side * front.curb_offset_m)[
-            :, :2
-        ]
-        way_m, kerb_m = np.linspace(-half_m, half_m + CORNER_M, 97), float(self.streets.cross_curb_offsets_m[index])
-        line_m = self.streets.cross_streets[index].compute_poses(-inwards * way_m, 0.0)[:, :2]
-        ahead = (line_m[-1] - line_m[-2]) / np.linalg.norm(line_m[-1] - line_m[-2])
-        onto_m = line_m[-1] + ((face_m[1:] - line_m[-1]) @ ahead)[:, None] * ahead
-        opposite_m = line_m[(way_m >= 0.0) & ((line_m - onto_m[-1]) @ ahead < 0.0)]
-        area = shapely.Polygon(np.concatenate([face_m[::-1], around_m, opposite_m, onto_m[1:]])).buffer(0)
-        street = shapely.LineString(line_m)
-        area = area.difference(street.buffer(kerb_m, cap_style="flat"))
-        if not is_built:
-            area = area.intersection(street.buffer(kerb_m + sidewalk_m))
-        left_m = inwards * int(self.streets.main_street.turn_directions[index]) * kerb_m
-        return onto_m + left_m * np.array([-ahead[1], ahead[0]]), [area, _strip(around_m, inside_m)]
-
-    def _between(self, whole: shapely.Geometry, streets: shapely.Geometry) -> shapely.Geometry:
-        """In plan, what is narrow between pavements but no street: wedges, and where the main street comes back."""
-        with np.errstate(all="ignore"):  # of what GEOS divides by zero in passing, nothing remains
-            closed = whole.buffer(WEDGE_M, join_style="mitre").buffer(-WEDGE_M, join_style="mitre")
-        between = closed.difference(streets.buffer(2 * WITHIN_M, join_style="bevel")).difference(whole)
-        return between.buffer(-WITHIN_M, join_style="bevel").buffer(WITHIN_M, join_style="bevel")
-
-    def _ground(self, seen_m: Bounds) -> Mesh:
-        """Under everything: as far as lanes go, or as far as it can be seen."""
-        if self.hills.is_flat:
-            reach = self.streets.half_length_m + 200.0
-            return build_ground_plane((-reach, -reach), (reach, reach))
-        way_m = self.streets.main_alignment.compute_poses(np.arange(*seen_m, WAY_EVERY_M), 0.0)[:, :2]
-        return self.hills.build_mesh(way_m, GROUND_M)
-
-    def _frontages(self, seen_m: Bounds) -> Iterator[Frontage]:
-        """Both sides of the main street from kerb to kerb."""
-        turns, middles, halves = (
-            self.streets.main_street.turn_directions,
-            self.streets.junction_stations_m,
-            self.streets.main_street.junction_half_lengths_m,
-        )
-        starts, ends = (middles - halves).tolist(), (middles + halves).tolist()
+    def _list_frontages(self, visible_span_m: Bounds) -> list[tuple[BuildingSite, Frontage]]:
+        """List both sides of the main street from curb to curb, and the blocks opposite of its turns."""
+        curb_offset_m = self.streets.cross_section.curb_offset_m
+        max_depth_m = curb_offset_m + CITY.block_depth_m + 10.0
+        main_site = BuildingSite(self.streets.main_alignment, self.corridor, self.hills, max_depth_m)
+        turns, stations_m = self.streets.main_street.turn_directions, self.streets.junction_stations_m
+        half_lengths_m = self.streets.main_street.junction_half_lengths_m
+        starts_m, ends_m = (stations_m - half_lengths_m).tolist(), (stations_m + half_lengths_m).tolist()
+        frontages = []
         for west in range(len(turns) - 1):
             for side in (1, -1):
-                # No street comes from the inside of a turn: the block goes on.
+                # On the inside of a turn no street joins: the block continues.
                 east = west + 1
                 while turns[east] == side:
                     east += 1
-                if turns[west] != side and starts[east] > seen_m[0] and ends[west] < seen_m[1]:
-                    turns_m = tuple((starts[k], ends[k]) for k in range(west + 1, east))
-                    yield Frontage(
-                        (ends[west], starts[east]),
-                        side,
-                        self.streets.cross_section.curb_offset_m,
-                        turns_m,
-                        (west, east),
-                    )
+                if turns[west] != side and starts_m[east] > visible_span_m[0] and ends_m[west] < visible_span_m[1]:
+                    turn_spans_m = tuple((starts_m[index], ends_m[index]) for index in range(west + 1, east))
+                    span_m = (ends_m[west], starts_m[east])
+                    frontages.append((main_site, Frontage(span_m, side, curb_offset_m, turn_spans_m, (west, east))))
+        is_visible = np.abs(stations_m - np.mean(visible_span_m)) < np.ptp(visible_span_m) / 2
+        for index in np.flatnonzero(~self.streets.has_lights & is_visible).tolist():
+            frontages.append(self._build_corner(index))
+        return frontages
 
-    def _corner(self, index: int) -> tuple[BuildingSite, Frontage]:
-        """The block between the two streets that meet the main street in a turn."""
-        street, half_m = (
-            self.streets.cross_streets[index],
-            float(self.streets.main_street.junction_half_lengths_m[index]),
-        )
-        kerb_m = float(self.streets.cross_curb_offsets_m[index])
-        side, middle_m = (
-            int(self.streets.main_street.turn_directions[index]),
-            float(self.streets.junction_stations_m[index]),
-        )
-        span_m = (-half_m - CORNER_M, half_m + CORNER_M)
-        site = BuildingSite(street, StreetCorridor(street, span_m), self.hills, kerb_m + CORNER_DEPTH_M + 10.0)
-        # As far as it is opposite of the turn, and not of another one.
-        x = np.arange(*span_m, 5.0)
-        foreign = np.zeros(len(x), dtype=bool)
-        for y in (kerb_m, kerb_m + CORNER_DEPTH_M):
-            nearest_m = self.corridor.find_nearest_stations_m(street.compute_poses(x, side * y)[:, :2])
-            foreign |= np.abs(nearest_m - middle_m) > half_m + self.corridor.sample_spacing_m
-        foreign &= np.abs(x) > half_m
-        before, behind = x[foreign & (x < 0.0)], x[foreign & (x > 0.0)]
-        x_m = max([span_m[0], *before.tolist()]) + 5.0, min([span_m[1], *behind.tolist()]) - 5.0
-        return site, Frontage(x_m, side, kerb_m, ((-half_m, half_m),))
+    def _build_corner(self, index: int) -> tuple[BuildingSite, Frontage]:
+        """Build the frontage of the block between the two streets that meet the main street in a turn."""
+        street = self.streets.cross_streets[index]
+        half_m = float(self.streets.main_street.junction_half_lengths_m[index])
+        curb_m = float(self.streets.cross_curb_offsets_m[index])
+        side = int(self.streets.main_street.turn_directions[index])
+        station_m = float(self.streets.junction_stations_m[index])
+        first_m, last_m = -half_m - CITY.corner_m, half_m + CITY.corner_m
+        corridor = StreetCorridor(street, (first_m, last_m))
+        site = BuildingSite(street, corridor, self.hills, curb_m + CITY.corner_depth_m + 10.0)
+        # The block ends where another stretch of the main street is nearer than this turn.
+        x_m = np.arange(first_m, last_m, 5.0)
+        is_elsewhere = np.zeros(len(x_m), dtype=bool)
+        for y_m in (curb_m, curb_m + CITY.corner_depth_m):
+            nearest_m = self.corridor.find_nearest_stations_m(street.compute_poses(x_m, side * y_m)[:, :2])
+            is_elsewhere |= np.abs(nearest_m - station_m) > half_m + self.corridor.sample_spacing_m
+        is_elsewhere &= np.abs(x_m) > half_m
+        first_m = max([first_m, *x_m[is_elsewhere & (x_m < 0.0)].tolist()])
+        last_m = min([last_m, *x_m[is_elsewhere & (x_m > 0.0)].tolist()])
+        return site, Frontage((first_m + 5.0, last_m - 5.0), side, curb_m, ((-half_m, half_m),))
 
-    def _parked(self, front: Frontage) -> list[tuple[str, float, float, float]]:
-        """Cars at the kerb, in the direction of the traffic beside them: kind, x, y, and yaw in degrees.
+    def _build_street_areas(self) -> tuple[list[shapely.Geometry], list[shapely.Geometry]]:
+        """Build the outlines of all streets, without and with their sidewalks."""
+        spacing_m, length_m = CITY.street_spacing_m, CITY.cross_street_m
+        main_stations_m = self.corridor.sample_stations_m(spacing_m)
+        centerlines_m = [self.streets.main_alignment.compute_poses(main_stations_m, 0.0)[:, :2]]
+        spans_m = self.streets.cross_street_spans_m + np.array([-STREETS.half_vehicle_m, STREETS.half_vehicle_m])
+        for street, span_m in zip(self.streets.cross_streets, spans_m, strict=True):
+            stations_m = span_m if street.is_straight else np.arange(-length_m, length_m, spacing_m)
+            centerlines_m.append(street.compute_poses(stations_m, 0.0)[:, :2])
+        lines = [shapely.LineString(line_m) for line_m in centerlines_m]
+        lines = shapely.simplify(lines, CITY.tolerance_m / 4)
+        curb_offsets_m = [self.streets.cross_section.curb_offset_m, *self.streets.cross_curb_offsets_m.tolist()]
+        half_widths_m = np.array(curb_offsets_m) - CITY.tolerance_m
+        sidewalk_m = self.streets.cross_section.sidewalk_width_m
+        streets = shapely.buffer(lines, half_widths_m, cap_style="flat")
+        return streets.tolist(), shapely.buffer(lines, half_widths_m + sidewalk_m, cap_style="flat").tolist()
 
-        Nobody drives along the streets that meet the main street in a turn: there they are parked on the lanes.
+    def _iterate_street_sides(self, street: Alignment, frontage: Frontage, zone: Zone) -> Iterator[StreetSide]:
+        """Iterate over the lines at the curb and behind the sidewalk of a frontage."""
+        (first_m, last_m), sidewalk_m = frontage.span_m, self.streets.cross_section.sidewalk_width_m
+        clearance_m = CITY.furniture_clearance_m
+        curb_m = frontage.side * frontage.curb_offset_m
+        yield StreetSide("curb", sample_street_side_m(street, (first_m + clearance_m, last_m - clearance_m), curb_m))
+        edges_m = [first_m + sidewalk_m]
+        for turn_span_m in frontage.turn_spans_m:
+            edges_m += turn_span_m
+        edges_m.append(last_m - sidewalk_m)
+        facade_m = frontage.side * (frontage.curb_offset_m + sidewalk_m)
+        for index, (start_m, end_m) in enumerate(pairwise(edges_m)):
+            is_in_turn = index % 2 == 1
+            # The main street has nothing behind the sidewalk in a turn, other streets have no room for houses there.
+            if end_m > start_m and not (is_in_turn and frontage.junction_indices):
+                line_m = sample_street_side_m(street, (start_m, end_m), facade_m)
+                yield StreetSide("open" if is_in_turn else zone, line_m)
+
+    def _build_end(
+        self, site: BuildingSite, frontage: Frontage, end: int, is_built: bool
+    ) -> tuple[Float64, list[shapely.Geometry]]:
+        """Build the end of a block at a cross street.
+
+        Where the main street turns away, its sidewalk continues around the turn, and the block continues up to the
+        street that goes straight on.
+
+        Args:
+            site: Land along the street.
+            frontage: The block.
+            end: 0 for the beginning, 1 for the end.
+            is_built: False if the block is a sidewalk only.
+
+        Returns:
+            (2, 2) curb of the cross street, and areas of sidewalk along it.
         """
-        cars: list[tuple[str, float, float, float]] = []
-        uniform, free_m = self.generator.uniform, FREE_AT_CORNERS_M
-        bay_m = self.streets.cross_section.bay_width_m if front.junction_indices else LANE_SIDE_M
-        x, end = front.span_m[0] + FREE_AT_CORNERS_M, front.span_m[1] - FREE_AT_CORNERS_M
-        while x < end and bay_m:
-            kind = self.fleet.sample_kind(PARKED)
-            length = self.fleet.get_length_m(kind) + PARKED_GAP_M + uniform(0.0, 0.5)
-            if self.generator.random() < self.parked_share and x + length < end:
-                slack = max((bay_m - self.fleet.get_width_m(kind)) / 2 - 0.08, 0.0)
-                y = front.side * (front.curb_offset_m - bay_m / 2 + uniform(0.0, slack))
-                yaw = (0.0 if front.side == -1 else 180.0) + uniform(-0.4, 0.4)
-                if all(x >= last + free_m or x + length <= first - free_m for first, last in front.turn_spans_m):
-                    cars.append((kind, x + length / 2, y, yaw))
-            x += length
+        index, corner_m, inwards = frontage.junction_indices[end], frontage.span_m[end], 1 - 2 * end
+        sidewalk_m = self.streets.cross_section.sidewalk_width_m
+        clearance_m, curb_offset_m = CITY.corner_clearance_m, frontage.curb_offset_m
+        (depth_m,) = site.compute_depths_m(np.array([corner_m]), frontage.side, curb_offset_m, CITY.block_depth_m)
+        depths_m = np.array([0.0, clearance_m, max(float(depth_m), 2 * clearance_m)])
+        face_m = site.street.compute_poses(corner_m, frontage.side * (curb_offset_m + depths_m))[:, :2]
+        inside_m = -inwards * frontage.side * sidewalk_m
+        turn_direction = int(self.streets.main_street.turn_directions[index])
+        if not turn_direction:
+            return face_m[1:], [] if is_built else [build_strip(face_m, inside_m)]
+        middle_m = float(self.streets.junction_stations_m[index])
+        half_m = float(self.streets.main_street.junction_half_lengths_m[index])
+        turn_stations_m = np.linspace(corner_m, middle_m, 17)
+        turn_curb_m = site.street.compute_poses(turn_stations_m, frontage.side * curb_offset_m)[:, :2]
+        stations_m = np.linspace(-half_m, half_m + CITY.corner_m, 97)
+        street_curb_m = float(self.streets.cross_curb_offsets_m[index])
+        line_m = self.streets.cross_streets[index].compute_poses(-inwards * stations_m, 0.0)[:, :2]
+        direction = (line_m[-1] - line_m[-2]) / np.linalg.norm(line_m[-1] - line_m[-2])
+        projected_m = line_m[-1] + ((face_m[1:] - line_m[-1]) @ direction)[:, None] * direction
+        opposite_m = line_m[(stations_m >= 0.0) & ((line_m - projected_m[-1]) @ direction < 0.0)]
+        corners_m = np.concatenate([face_m[::-1], turn_curb_m, opposite_m, projected_m[1:]])
+        street = shapely.LineString(line_m)
+        area = shapely.Polygon(corners_m).buffer(0).difference(street.buffer(street_curb_m, cap_style="flat"))
+        if not is_built:
+            area = area.intersection(street.buffer(street_curb_m + sidewalk_m))
+        left_m = inwards * turn_direction * street_curb_m
+        curb_m = projected_m + left_m * np.array([-direction[1], direction[0]])
+        return curb_m, [area, build_strip(turn_curb_m, inside_m)]
+
+    def _build_ground(self, visible_span_m: Bounds) -> Mesh:
+        """Build the ground as far as lanes go on a plane, or as far as it is visible on hills."""
+        if self.hills.is_flat:
+            half_m = self.streets.half_length_m + 200.0
+            return build_ground_plane((-half_m, -half_m), (half_m, half_m))
+        stations_m = np.arange(*visible_span_m, CITY.ground_spacing_m)
+        path_m = self.streets.main_alignment.compute_poses(stations_m, 0.0)[:, :2]
+        return self.hills.build_mesh(path_m, CITY.ground_margin_m)
+
+    def _sample_parked_cars(self, frontage: Frontage) -> list[ParkedCar]:
+        """Sample cars at the curb, in the direction of traffic.
+
+        Streets that meet the main street in a turn have no traffic: there, cars are parked on the lanes.
+        """
+        cars: list[ParkedCar] = []
+        uniform, clearance_m = self.generator.uniform, CITY.corner_clearance_m
+        bay_m = self.streets.cross_section.bay_width_m if frontage.junction_indices else CITY.parking_width_m
+        start_m, last_m = frontage.span_m[0] + clearance_m, frontage.span_m[1] - clearance_m
+        while start_m < last_m and bay_m:
+            kind = self.fleet.sample_kind(PARKED_KINDS)
+            length_m = self.fleet.get_length_m(kind) + CITY.parking_gap_m + uniform(0.0, 0.5)
+            end_m = start_m + length_m
+            if self.generator.random() < self.parked_share and end_m < last_m:
+                slack_m = max((bay_m - self.fleet.get_width_m(kind)) / 2 - 0.08, 0.0)
+                left_m = frontage.side * (frontage.curb_offset_m - bay_m / 2 + uniform(0.0, slack_m))
+                yaw_deg = (0.0 if frontage.side == -1 else 180.0) + uniform(-0.4, 0.4)
+                is_off_turns = [
+                    start_m >= turn_end_m + clearance_m or end_m <= turn_start_m - clearance_m
+                    for turn_start_m, turn_end_m in frontage.turn_spans_m
+                ]
+                if all(is_off_turns):
+                    cars.append(ParkedCar(kind, start_m + length_m / 2, left_m, yaw_deg))
+            start_m = end_m
         return cars
 
-    def _park(self, cars: list[tuple[BuildingSite, list[tuple[str, float, float, float]]]]) -> None:
+    def _park_cars(self, frontages: list[tuple[BuildingSite, Frontage]]) -> None:
+        """Park cars along all frontages."""
         kinds: list[str] = []
-        found: list[Float64] = []
-        for site, of_front in cars:
-            if of_front:
-                names, x_m, y_m, yaw_deg = zip(*of_front, strict=True)
-                kinds += names
-                found.append(site.street.compute_poses(x_m, np.array(y_m)) + np.outer(yaw_deg, (0.0, 0.0, 1.0)))
+        poses: list[Float64] = []
+        for site, frontage in frontages:
+            for car in self._sample_parked_cars(frontage):
+                kinds.append(car.kind)
+                street_pose = site.street.compute_poses(car.station_m, car.left_m)
+                poses.append(street_pose + np.array([0.0, 0.0, car.yaw_deg]))
         if not kinds:
             return
-        poses = np.concatenate(found)
-        stances = self.hills.compute_heights_and_tilts(poses[:, :2], poses[:, 2])
-        for kind, (x, y, yaw), (height_m, *tilt_deg) in zip(kinds, poses.tolist(), stances.tolist(), strict=True):
-            self.fleet.add_parked_vehicle(kind, (x, y, yaw), height_m, (tilt_deg[0], tilt_deg[1]))
+        street_poses = np.array(poses)
+        heights_and_tilts = self.hills.compute_heights_and_tilts(street_poses[:, :2], street_poses[:, 2])
+        for kind, (x_m, y_m, yaw_deg), (height_m, pitch_deg, roll_deg) in zip(
+            kinds, street_poses.tolist(), heights_and_tilts.tolist(), strict=True
+        ):
+            self.fleet.add_parked_vehicle(kind, (x_m, y_m, yaw_deg), height_m, (pitch_deg, roll_deg))
 
 
-def _strip(line_m: Float64, left_m: float) -> shapely.Geometry:
-    """What lies on the left of a line, up to so far."""
+def find_narrow_gaps(sidewalks: shapely.Geometry, streets: shapely.Geometry) -> shapely.Geometry:
+    """Find narrow gaps between sidewalks that are not streets: wedges, and where the main street comes near itself."""
+    with np.errstate(all="ignore"):  # divisions by zero inside GEOS leave no trace in the result
+        closed = sidewalks.buffer(CITY.max_gap_m, join_style="mitre").buffer(-CITY.max_gap_m, join_style="mitre")
+    gaps = closed.difference(streets.buffer(2 * CITY.tolerance_m, join_style="bevel")).difference(sidewalks)
+    return gaps.buffer(-CITY.tolerance_m, join_style="bevel").buffer(CITY.tolerance_m, join_style="bevel")
+
+
+def build_strip(line_m: Float64, left_m: float) -> shapely.Geometry:
+    """Build the area between a line (K, 2) and its parallel at an offset to the left."""
     return shapely.buffer(shapely.LineString(line_m), left_m, single_sided=True, join_style="mitre")
 
 
-def _across(kerb_m: Float64, sidewalk_m: float, zone: Zone) -> Iterator[StreetSide]:
-    """Along a cross street, whose kerb has the street on its left: at the kerb, and behind the sidewalk."""
-    ahead = (kerb_m[1] - kerb_m[0]) / np.linalg.norm(kerb_m[1] - kerb_m[0])
-    yield StreetSide("kerb", kerb_m)
-    yield StreetSide(zone, kerb_m + sidewalk_m * np.array([ahead[1], -ahead[0]]))
+def build_cross_street_sides(curb_m: Float64, sidewalk_width_m: float, zone: Zone) -> list[StreetSide]:
+    """Build the lines at the curb and behind the sidewalk of a cross street, given its curb (2, 2)."""
+    ahead = (curb_m[1] - curb_m[0]) / np.linalg.norm(curb_m[1] - curb_m[0])
+    facade_m = curb_m + sidewalk_width_m * np.array([ahead[1], -ahead[0]])
+    return [StreetSide("curb", curb_m), StreetSide(zone, facade_m)]
 
 
-def _beside(street: Alignment, x_m: Bounds, left_m: float) -> Float64:
-    """(K, 2) places beside a street, with the street on their left."""
-    pieces = 1 if street.is_straight else int(np.ceil((x_m[1] - x_m[0]) / STREET_EVERY_M))
-    points_m: Float64 = street.compute_poses(np.linspace(*x_m, pieces + 1), left_m)[:, :2]
-    return points_m if left_m < 0 else points_m[::-1]
+def sample_street_side_m(street: Alignment, span_m: Bounds, left_m: float) -> Float64:
+    """Sample positions (K, 2) parallel to a street, in the direction that has the street on the left."""
+    num_segments = 1 if street.is_straight else int(np.ceil((span_m[1] - span_m[0]) / CITY.street_spacing_m))
+    line_m: Float64 = street.compute_poses(np.linspace(*span_m, num_segments + 1), left_m)[:, :2]
+    return line_m if left_m < 0 else line_m[::-1]

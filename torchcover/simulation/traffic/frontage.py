@@ -1,11 +1,10 @@
-"""What stands beside streets: one list of kinds with their places, sizes and densities, for all worlds.
+"""Roadside objects: one list of kinds with their offsets, sizes and densities, for all generated scenes.
 
-A side of a street is a line that has the street on its left. Along all sides runs of every kind are drawn; what would
-stand on a street, across the edge of a pavement, or in what comes before it in the list is left out.
+A side of a street is a line with the street on its left. Runs of every kind are sampled along all sides; objects on a
+street, across the edge of a sidewalk, or overlapping an object of an earlier kind are removed.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import cache
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
@@ -13,89 +12,106 @@ import shapely
 from pydantic import AfterValidator
 
 from torchcover.geometry.arrays import Bools, Float64, Int64
-from torchcover.simulation.bodies import merge_meshes
-from torchcover.simulation.shapes import Mesh, compute_circle_points
-from torchcover.simulation.traffic.scenery import PAVEMENT_M, build_box_from_bounds, build_prism
+from torchcover.simulation.shapes import Mesh
+from torchcover.simulation.traffic.scenery import PAVEMENT_M, TRUNK_SHARE, build_unit_shape, copy_shape
 
 Bounds = tuple[float, float]
-Zone = Literal["kerb", "built", "open"]
+# Curb before the sidewalk, or ground behind the sidewalk of a side with houses ("built") or without ("open").
+Zone = Literal["curb", "built", "open"]
 
-# What stands on a slope goes on below it.
-SUNK_M = 1.0
-# Walls and hedges are straight for so long at most.
-WALL_M = 10.0
-# A side is built up or open for so long, and has corners so often; what is shorter is around no block.
-SIDE_M, CORNER_EVERY_M, SMOOTH_M, SHORTEST_M = 60.0, 4.0, 0.3, 30.0
-# Corners of a line may coincide.
-TINY_M = 1e-9
-TAPERED = 0.6
-# In the middle of a tree's width, which hangs over the street otherwise.
-TRUNK = 0.1
+TINY_M = 1e-9  # avoids divisions by zero where corners of a line coincide
+WALL_SEGMENT_M = 10.0  # largest length of the straight segments of walls and hedges
 
 
-class _Kind(NamedTuple):
-    """What stands beside streets, in runs of pieces; lengths are along the street, depths away from it.
+class RoadsideKind(NamedTuple):
+    """Kind of roadside objects, in runs of pieces along a street; lengths are along it, depths away from it.
 
-    It is at the `kerb`, before the sidewalk, or behind it, along sides that are `built` or `open`, a share of which has
-    it: `at_m` from the line, where what is negative hangs over, with gaps from run to run at the usual density. Without
-    `piece_m` a piece is as long as its run; walls and hedges consist of pieces without gaps, others have `air_m` in
-    between. Of its size the share `foot` must keep off streets. `form` is a key of `FORMS`.
+    Args:
+        shape: Name of the shape, see `build_unit_shape`.
+        zones: Zones with this kind.
+        side_share: Share of the sides of these zones with this kind.
+        offset_m: Smallest and largest distance from the line; negative over the street.
+        run_m: Smallest and largest length of a run.
+        gap_m: Smallest and largest gap between runs, at the usual density.
+        depth_m: Smallest and largest depth.
+        height_m: Smallest and largest height.
+        piece_m: Length of a piece, or `WALL_SEGMENT_M` for walls without gaps; None if a run is one piece.
+        piece_gap_m: Gap between the pieces of a run.
+        footprint_share: Share of the size that must keep off streets.
     """
 
-    form: str
+    shape: str
     zones: tuple[Zone, ...]
-    share: float
-    at_m: Bounds
+    side_share: float
+    offset_m: Bounds
     run_m: Bounds
     gap_m: Bounds
-    deep_m: Bounds
-    high_m: Bounds
+    depth_m: Bounds
+    height_m: Bounds
     piece_m: float | None = None
-    air_m: float = 0.0
-    foot: float = 1.0
+    piece_gap_m: float = 0.0
+    footprint_share: float = 1.0
 
 
 BEHIND: tuple[Zone, ...] = ("built", "open")
-# Sizes of the small are those of usual products; densities agree with real sweeps in what closes the view
-# (docs/measured/streets.md).
-KINDS: Mapping[str, _Kind] = {
-    "house": _Kind("house", ("built",), 1.0, (0.0, 5.0), (9.0, 24.0), (0.1, 4.0), (9.0, 15.0), (5.0, 24.0)),
-    "back_house": _Kind("house", ("built",), 1.0, (24.0, 44.0), (9.0, 22.0), (4.0, 22.0), (9.0, 14.0), (5.0, 22.0)),
-    "hedge": _Kind("hedge", ("built",), 0.95, (0.2, 0.8), (8.0, 40.0), (1.0, 5.0), (0.5, 1.1), (0.9, 2.2), WALL_M),
-    "hedgerow": _Kind("hedge", ("open",), 1.0, (0.3, 2.0), (20.0, 70.0), (2.0, 6.0), (0.8, 1.6), (1.2, 2.6), WALL_M),
-    "fence": _Kind("fence", BEHIND, 0.7, (0.2, 1.2), (8.0, 40.0), (1.0, 9.0), (0.08, 0.08), (0.9, 1.8), WALL_M),
-    "lamp": _Kind("lamp", ("kerb",), 0.9, (0.35, 0.45), (0.2, 0.2), (22.0, 34.0), (0.2, 0.2), (6.0, 8.0)),
-    "tree": _Kind("tree", ("kerb",), 0.7, (-0.9, -0.6), (2.0, 3.0), (4.0, 11.0), (2.0, 3.0), (6.5, 9.0), foot=TRUNK),
-    "sign": _Kind("sign", ("kerb",), 0.9, (0.25, 0.35), (0.06, 0.06), (12.0, 32.0), (0.5, 0.6), (2.4, 3.0)),
-    "bin": _Kind("bin", ("kerb",), 0.8, (0.3, 0.4), (0.5, 0.8), (12.0, 40.0), (0.4, 0.5), (0.8, 1.3)),
-    "bicycle": _Kind(
-        "bicycle", ("kerb",), 0.4, (0.3, 0.4), (1.8, 9.0), (15.0, 60.0), (0.5, 0.5), (1.0, 1.1), 1.75, 0.3
+# Sizes of small objects are those of usual products; densities agree with recorded sweeps in the share of directions
+# in which the view ends (docs/measured/streets.md).
+KINDS: Mapping[str, RoadsideKind] = {
+    "house": RoadsideKind("house", ("built",), 1.0, (0.0, 5.0), (9.0, 24.0), (0.1, 4.0), (9.0, 15.0), (5.0, 24.0)),
+    "back_house": RoadsideKind(
+        "house", ("built",), 1.0, (24.0, 44.0), (9.0, 22.0), (4.0, 22.0), (9.0, 14.0), (5.0, 22.0)
     ),
-    "bollard": _Kind(
-        "bollard", ("kerb",), 0.35, (0.3, 0.4), (4.0, 16.0), (8.0, 30.0), (0.12, 0.12), (0.8, 1.0), 0.12, 1.5
+    "hedge": RoadsideKind(
+        "hedge", ("built",), 0.95, (0.2, 0.8), (8.0, 40.0), (1.0, 5.0), (0.5, 1.1), (0.9, 2.2), WALL_SEGMENT_M
     ),
-    "garden_tree": _Kind("tree", BEHIND, 0.8, (1.5, 20.0), (2.0, 4.0), (4.0, 22.0), (2.0, 4.0), (5.0, 11.0)),
-    "bush": _Kind("bush", BEHIND, 0.8, (0.5, 12.0), (1.0, 2.5), (3.0, 16.0), (1.0, 2.5), (0.7, 2.5)),
-}
+    "hedgerow": RoadsideKind(
+        "hedge", ("open",), 1.0, (0.3, 2.0), (20.0, 70.0), (2.0, 6.0), (0.8, 1.6), (1.2, 2.6), WALL_SEGMENT_M
+    ),
+    "fence": RoadsideKind(
+        "fence", BEHIND, 0.7, (0.2, 1.2), (8.0, 40.0), (1.0, 9.0), (0.08, 0.08), (0.9, 1.8), WALL_SEGMENT_M
+    ),
+    "lamp": RoadsideKind("lamp", ("curb",), 0.9, (0.35, 0.45), (0.2, 0.2), (22.0, 34.0), (0.2, 0.2), (6.0, 8.0)),
+    "tree": RoadsideKind(
+        "tree", ("curb",), 0.7, (-0.9, -0.6), (2.0, 3.0), (4.0, 11.0), (2.0, 3.0), (6.5, 9.0),
+        footprint_share=TRUNK_SHARE,
+    ),
+    "sign": RoadsideKind("sign", ("curb",), 0.9, (0.25, 0.35), (0.06, 0.06), (12.0, 32.0), (0.5, 0.6), (2.4, 3.0)),
+    "bin": RoadsideKind("bin", ("curb",), 0.8, (0.3, 0.4), (0.5, 0.8), (12.0, 40.0), (0.4, 0.5), (0.8, 1.3)),
+    "bicycle": RoadsideKind(
+        "bicycle", ("curb",), 0.4, (0.3, 0.4), (1.8, 9.0), (15.0, 60.0), (0.5, 0.5), (1.0, 1.1), 1.75, 0.3
+    ),
+    "bollard": RoadsideKind(
+        "bollard", ("curb",), 0.35, (0.3, 0.4), (4.0, 16.0), (8.0, 30.0), (0.12, 0.12), (0.8, 1.0), 0.12, 1.5
+    ),
+    "garden_tree": RoadsideKind("tree", BEHIND, 0.8, (1.5, 20.0), (2.0, 4.0), (4.0, 22.0), (2.0, 4.0), (5.0, 11.0)),
+    "bush": RoadsideKind("bush", BEHIND, 0.8, (0.5, 12.0), (1.0, 2.5), (3.0, 16.0), (1.0, 2.5), (0.7, 2.5)),
+}  # fmt: skip
 HOUSES = ("house", "back_house")
-MOST_TIMES = 4.0
 
 
-def _known(times: float | Mapping[str, float]) -> float | Mapping[str, float]:
-    some = times if isinstance(times, Mapping) else {"tree": times}
-    if unknown := sorted(some.keys() - (KINDS.keys() - set(HOUSES))):
-        raise ValueError(f"{', '.join(unknown)}: there are {', '.join(kind for kind in KINDS if kind not in HOUSES)}")
-    if not all(0.0 <= factor <= MOST_TIMES for factor in some.values()):
-        raise ValueError(f"0 to {MOST_TIMES:g} times as much as usually is needed; got {times}")
-    return times
+def _check_density_factors(factors: float | Mapping[str, float]) -> float | Mapping[str, float]:
+    max_factor = 4.0
+    by_kind = factors if isinstance(factors, Mapping) else {"tree": factors}
+    available = [kind for kind in KINDS if kind not in HOUSES]
+    unknown = sorted(by_kind.keys() - set(available))
+    if unknown:
+        raise ValueError(f"unknown kinds of roadside objects: {', '.join(unknown)}; available: {', '.join(available)}")
+    if not all(0.0 <= factor <= max_factor for factor in by_kind.values()):
+        raise ValueError(f"density factors must be between 0 and {max_factor:g}; got {factors}")
+    return factors
 
 
-# How many times as much there is as usually of all kinds but houses, or of some of them.
-RoadsideDensity = Annotated[float | dict[str, float], AfterValidator(_known)]
+# Factor on the usual density of all kinds but houses, or factors for some kinds.
+RoadsideDensity = Annotated[float | dict[str, float], AfterValidator(_check_density_factors)]
 
 
 class StreetSide(NamedTuple):
-    """A side of a street in a zone: a line of (K, 2) places that has the street on its left."""
+    """Side of a street.
+
+    Args:
+        zone: Zone of the objects along the line.
+        line_m: (K, 2) positions of a line with the street on its left.
+    """
 
     zone: Zone
     line_m: Float64
@@ -108,23 +124,43 @@ def find_street_sides(
     built_share: float,
     generator: np.random.Generator,
 ) -> list[StreetSide]:
-    """The sides of all streets that are known in plan only, a drawn share of them built up.
+    """Find the sides of all streets from their outline.
 
-    `offsets_m` is how far beyond its edge kerb furniture begins, and what stands behind it; `is_visible` which (N, 2) places
-    matter.
+    Args:
+        street_area: Area of all streets in the ground plane.
+        offsets_m: Distance from its edge at which objects at the curb begin, and objects behind the sidewalk.
+        is_visible: Function that tests which positions (N, 2) are needed.
+        built_share: Share of the sides with houses.
+        generator: Random generator.
     """
+    side_length_m, vertex_spacing_m, tolerance_m = 60.0, 4.0, 0.3
+    min_ring_m = 30.0  # shorter edges surround no block
     sides: list[StreetSide] = []
-    for number, away_m in enumerate(offsets_m):
-        area = shapely.orient_polygons(shapely.buffer(street_area, away_m, quad_segs=4))
+    for is_behind, offset_m in zip((False, True), offsets_m, strict=True):
+        area = shapely.orient_polygons(shapely.buffer(street_area, offset_m, quad_segs=4))
         for ring in shapely.get_parts(shapely.boundary(area)):
-            line_m = shapely.get_coordinates(shapely.segmentize(ring.simplify(SMOOTH_M), CORNER_EVERY_M))
-            for side_m in (
-                np.array_split(line_m, max(round(ring.length / SIDE_M), 1)) if ring.length > SHORTEST_M else ()
-            ):
+            if ring.length <= min_ring_m:
+                continue
+            line_m = shapely.get_coordinates(shapely.segmentize(ring.simplify(tolerance_m), vertex_spacing_m))
+            for side_m in np.array_split(line_m, max(round(ring.length / side_length_m), 1)):
                 zone: Zone = "built" if generator.random() < built_share else "open"
                 if len(side_m) > 1 and is_visible(side_m).all():
-                    sides.append(StreetSide(zone if number else "kerb", side_m))
+                    sides.append(StreetSide(zone if is_behind else "curb", side_m))
     return sides
+
+
+class RoadsidePieces(NamedTuple):
+    """N pieces of roadside objects.
+
+    Args:
+        outlines_m: (N, 4, 2) outlines in the ground plane, counterclockwise from the far side on.
+        heights_m: (N,) heights.
+        runs: (N,) index of the run of each piece.
+    """
+
+    outlines_m: Float64
+    heights_m: Float64
+    runs: Int64
 
 
 def place_scenery(
@@ -136,214 +172,199 @@ def place_scenery(
     density_factors: float | Mapping[str, float],
     generator: np.random.Generator,
 ) -> tuple[list[Mesh], list[Mesh]]:
-    """Draw what stands along the sides of streets: houses and all else, each kind in one mesh; see `Times`.
+    """Place objects along the sides of streets.
 
-    In plan, nothing at kerbs may stand on what is `drivable_areas`, nor anything behind sidewalks on what is `walkable_areas`;
-    `sidewalk_areas` are a kerb higher than the ground, whose heights `compute_ground_heights_m` gives at (N, 2) places.
+    Args:
+        sides: Sides of streets.
+        drivable_areas: Areas on which no object at a curb may stand.
+        walkable_areas: Areas on which no object behind a sidewalk may stand.
+        sidewalk_areas: Areas that are higher than the ground by a curb.
+        compute_ground_heights_m: Function that returns ground heights (N,) at positions (N, 2).
+        density_factors: Factors on the usual densities, see `RoadsideDensity`.
+        generator: Random generator.
+
+    Returns:
+        Meshes of houses, and of all other objects; each kind is one mesh.
     """
     if not sides:
         return [], []
-    lines = _Lines(sides)
-    drawn = []
+    lines = SideLines(sides)
+    pieces_by_kind = []
     for name, kind in KINDS.items():
-        factor = (
-            density_factors.get(name, 1.0)
-            if isinstance(density_factors, Mapping)
-            else 1.0
-            if name in HOUSES
-            else density_factors
-        )
-        drawn.append(_drawn(kind, lines, factor, generator))
-    kinds = np.repeat(np.arange(len(KINDS)), [len(run) for _, _, run in drawn])
-    outlines_m, high_m, run = (np.concatenate(column) for column in zip(*drawn, strict=True))
-    kept, raised_m = _free(outlines_m, kinds, run, drivable_areas, walkable_areas, sidewalk_areas)
-    outlines_m, high_m, kinds, raised_m = outlines_m[kept], high_m[kept], kinds[kept], raised_m[kept]
+        if isinstance(density_factors, Mapping):
+            factor = density_factors.get(name, 1.0)
+        else:
+            factor = 1.0 if name in HOUSES else density_factors
+        pieces_by_kind.append(sample_pieces(kind, lines, factor, generator))
+    kind_indices = np.repeat(np.arange(len(KINDS)), [len(pieces.runs) for pieces in pieces_by_kind])
+    pieces = RoadsidePieces(*(np.concatenate(column) for column in zip(*pieces_by_kind, strict=True)))
+    is_free, raised_m = find_free_pieces(pieces, kind_indices, drivable_areas, walkable_areas, sidewalk_areas)
+    outlines_m, heights_m = pieces.outlines_m[is_free], pieces.heights_m[is_free]
+    kind_indices, raised_m = kind_indices[is_free], raised_m[is_free]
     corners_m = compute_ground_heights_m(outlines_m.reshape(-1, 2)).reshape(-1, 4)
-    low_m, base_m = corners_m.min(axis=1) + raised_m, corners_m.max(axis=1) + raised_m
-    bottom_m = np.where(base_m > low_m, low_m - SUNK_M, low_m)
+    lowest_m, base_m = corners_m.min(axis=1) + raised_m, corners_m.max(axis=1) + raised_m
+    # On a slope, objects continue 1 m below their lowest corner.
+    bottom_m = np.where(base_m > lowest_m, lowest_m - 1.0, lowest_m)
     houses: list[Mesh] = []
-    others: list[Mesh] = []
-    for number, (name, kind) in enumerate(KINDS.items()):
-        own = kinds == number
-        if own.any():
-            into = houses if name in HOUSES else others
-            into.append(_copies(_form(kind.form), outlines_m[own], bottom_m[own], base_m[own], high_m[own]))
-    return houses, others
+    objects: list[Mesh] = []
+    for index, (name, kind) in enumerate(KINDS.items()):
+        is_kind = kind_indices == index
+        if is_kind.any():
+            shape = build_unit_shape(kind.shape)
+            mesh = copy_shape(shape, outlines_m[is_kind], bottom_m[is_kind], base_m[is_kind], heights_m[is_kind])
+            (houses if name in HOUSES else objects).append(mesh)
+    return houses, objects
 
 
-class _Lines:
-    """The lines of sides on one axis: each begins where the last one ended."""
+class SideLines:
+    """Lines of street sides, joined in one table.
+
+    Args:
+        sides: Sides of streets.
+
+    Attributes:
+        zones: Zone of each line.
+        length_m: Length of each line.
+    """
 
     def __init__(self, sides: Sequence[StreetSide]) -> None:
         self.zones = [side.zone for side in sides]
-        count = np.array([len(side.line_m) for side in sides])
-        self._first = np.cumsum(count) - count
-        self._last = self._first + count - 1
-        self._places_m = np.concatenate([np.empty((0, 2)), *(side.line_m for side in sides)])
-        steps_m = np.diff(self._places_m, axis=0, append=0.0)
-        steps_m[self._last] = steps_m[self._last - 1]
-        ways_m = np.linalg.norm(steps_m, axis=1)
-        steps_m /= np.maximum(ways_m, TINY_M)[:, None]
-        ways_m[self._last] = 0.0
-        self._arc_m = np.cumsum(ways_m) - ways_m
-        # Halfway between the pieces that meet in a corner.
-        ahead = steps_m + np.where(
-            np.isin(np.arange(len(steps_m)), self._first)[:, None], steps_m, np.roll(steps_m, 1, 0)
-        )
-        ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), TINY_M)
-        self._right = np.stack([ahead[:, 1], -ahead[:, 0]], axis=1)
-        self.length_m = self._arc_m[self._last] - self._arc_m[self._first]
+        counts = np.array([len(side.line_m) for side in sides])
+        self._first = np.cumsum(counts) - counts
+        self._last = self._first + counts - 1
+        self._positions_m = np.concatenate([np.empty((0, 2)), *(side.line_m for side in sides)])
+        directions = np.diff(self._positions_m, axis=0, append=0.0)
+        directions[self._last] = directions[self._last - 1]
+        lengths_m = np.linalg.norm(directions, axis=1)
+        directions /= np.maximum(lengths_m, TINY_M)[:, None]
+        lengths_m[self._last] = 0.0
+        self._arc_lengths_m = np.cumsum(lengths_m) - lengths_m
+        # At a corner, the normal is halfway between those of both segments.
+        is_first = np.isin(np.arange(len(directions)), self._first)[:, None]
+        forward = directions + np.where(is_first, directions, np.roll(directions, 1, 0))
+        forward /= np.maximum(np.linalg.norm(forward, axis=1, keepdims=True), TINY_M)
+        self._right = np.stack([forward[:, 1], -forward[:, 0]], axis=1)
+        self.length_m = self._arc_lengths_m[self._last] - self._arc_lengths_m[self._first]
 
-    def along(self, number: Int64, ways_m: Float64) -> tuple[Float64, Float64]:
-        """(N, 2, 2) places, and the way to the right there, after (N, 2) ways along lines of some numbers."""
-        way_m = self._arc_m[self._first[number]][:, None] + ways_m
-        piece = np.searchsorted(self._arc_m, way_m, side="right") - 1
-        piece = np.clip(piece, self._first[number][:, None], self._last[number][:, None] - 1)
-        long_m = np.maximum(self._arc_m[piece + 1] - self._arc_m[piece], TINY_M)
-        share = ((way_m - self._arc_m[piece]) / long_m)[..., None]
-        places_m, right = (
-            (1 - share) * each[piece] + share * each[piece + 1] for each in (self._places_m, self._right)
-        )
-        return places_m, right
+    def interpolate(self, line_indices: Int64, distances_m: Float64) -> tuple[Float64, Float64]:
+        """Interpolate positions (N, 2, 2) and normals to the right (N, 2, 2).
+
+        Args:
+            line_indices: (N,) indices of lines.
+            distances_m: (N, 2) distances from the starts of the lines.
+        """
+        first, last = self._first[line_indices][:, None], self._last[line_indices][:, None]
+        arc_lengths_m = self._arc_lengths_m[first[:, 0]][:, None] + distances_m
+        segment = np.clip(np.searchsorted(self._arc_lengths_m, arc_lengths_m, side="right") - 1, first, last - 1)
+        segment_m = np.maximum(self._arc_lengths_m[segment + 1] - self._arc_lengths_m[segment], TINY_M)
+        fraction = ((arc_lengths_m - self._arc_lengths_m[segment]) / segment_m)[..., None]
+        positions_m = (1 - fraction) * self._positions_m[segment] + fraction * self._positions_m[segment + 1]
+        return positions_m, (1 - fraction) * self._right[segment] + fraction * self._right[segment + 1]
 
 
-def _drawn(kind: _Kind, lines: _Lines, times: float, generator: np.random.Generator) -> tuple[Float64, Float64, Int64]:
-    """Runs of a kind along the sides that have it, in N pieces.
-
-    Returns (N, 4, 2) outlines in plan, counter-clockwise from the far side on; (N,) heights, and which pieces are one.
-    """
-    has = np.array([zone in kind.zones for zone in lines.zones], dtype=bool)
-    has[has] = generator.random(np.count_nonzero(has)) < kind.share
-    numbers = np.flatnonzero(has)
-    if not len(numbers) or times == 0:
-        return np.empty((0, 4, 2)), np.empty(0), np.empty(0, dtype=np.int64)
-    length_m, gap_m = lines.length_m[numbers], (kind.gap_m[0] / times, kind.gap_m[1] / times)
-    shape = len(numbers), int(length_m.max() / (kind.run_m[0] + gap_m[0])) + 1
-    run_m, between_m = generator.uniform(*kind.run_m, shape), generator.uniform(*gap_m, shape)
-    # The first begins anywhere in a gap.
-    between_m[:, 0] *= generator.random(len(numbers))
-    start_m = np.cumsum(run_m + between_m, axis=1) - run_m
-    fits = start_m + kind.run_m[0] <= length_m[:, None]
-    on = np.nonzero(fits)[0]
-    run_m = np.minimum(run_m[fits], length_m[on] - start_m[fits])
-    at_m, deep_m, high_m = (generator.uniform(*bounds, len(on)) for bounds in (kind.at_m, kind.deep_m, kind.high_m))
-    first_m, piece_m, run = start_m[fits], run_m, np.arange(len(on))
+def sample_pieces(
+    kind: RoadsideKind, lines: SideLines, density_factor: float, generator: np.random.Generator
+) -> RoadsidePieces:
+    """Sample the pieces of a kind along the sides of its zones."""
+    has_kind = np.array([zone in kind.zones for zone in lines.zones], dtype=bool)
+    has_kind[has_kind] = generator.random(np.count_nonzero(has_kind)) < kind.side_share
+    line_indices = np.flatnonzero(has_kind)
+    if not len(line_indices) or density_factor == 0:
+        return RoadsidePieces(np.empty((0, 4, 2)), np.empty(0), np.empty(0, dtype=np.int64))
+    line_m = lines.length_m[line_indices]
+    gap_bounds_m = (kind.gap_m[0] / density_factor, kind.gap_m[1] / density_factor)
+    shape = len(line_indices), int(line_m.max() / (kind.run_m[0] + gap_bounds_m[0])) + 1
+    run_m, gap_m = generator.uniform(*kind.run_m, shape), generator.uniform(*gap_bounds_m, shape)
+    # The start of a line is anywhere in a gap.
+    gap_m[:, 0] *= generator.random(len(line_indices))
+    start_m = np.cumsum(run_m + gap_m, axis=1) - run_m
+    fits = start_m + kind.run_m[0] <= line_m[:, None]
+    rows = np.nonzero(fits)[0]
+    run_m = np.minimum(run_m[fits], line_m[rows] - start_m[fits])
+    offset_m = generator.uniform(*kind.offset_m, len(rows))
+    depth_m = generator.uniform(*kind.depth_m, len(rows))
+    height_m = generator.uniform(*kind.height_m, len(rows))
+    start_m, piece_m, runs = start_m[fits], run_m, np.arange(len(rows))
     if kind.piece_m is not None:
-        is_wall = kind.piece_m == WALL_M
-        count = np.maximum((run_m / (kind.piece_m + kind.air_m)).astype(np.int64) + is_wall, 1)
-        every_m = run_m / count if is_wall else np.full(len(run), kind.piece_m + kind.air_m)
-        run = np.repeat(run, count)
-        number = np.arange(len(run)) - np.repeat(np.cumsum(count) - count, count)
-        first_m, piece_m = first_m[run] + number * every_m[run], (every_m if is_wall else every_m - kind.air_m)[run]
-    places_m, right = lines.along(numbers[on[run]], np.stack([first_m, first_m + piece_m], axis=1))
-    near_m, far_m = (places_m + right * out_m[run, None, None] for out_m in (at_m, at_m + deep_m))
-    # Around a corner what is far out would be stretched, and on its inside squeezed.
-    stretched = [np.linalg.norm(side[:, 1] - side[:, 0], axis=1) / piece_m for side in (near_m, far_m)]
-    like = (np.abs(np.log(np.maximum(stretched, TINY_M))) < -np.log(TAPERED)).all(axis=0)
-    return np.concatenate([far_m, near_m[:, ::-1]], axis=1)[like], high_m[run][like], run[like]
+        is_wall = kind.piece_m == WALL_SEGMENT_M
+        counts = np.maximum((run_m / (kind.piece_m + kind.piece_gap_m)).astype(np.int64) + is_wall, 1)
+        spacing_m = run_m / counts if is_wall else np.full(len(runs), kind.piece_m + kind.piece_gap_m)
+        runs = np.repeat(runs, counts)
+        index_in_run = np.arange(len(runs)) - np.repeat(np.cumsum(counts) - counts, counts)
+        start_m = start_m[runs] + index_in_run * spacing_m[runs]
+        piece_m = (spacing_m if is_wall else spacing_m - kind.piece_gap_m)[runs]
+    ends_m = np.stack([start_m, start_m + piece_m], axis=1)
+    positions_m, right = lines.interpolate(line_indices[rows[runs]], ends_m)
+    near_m = positions_m + right * offset_m[runs, None, None]
+    far_m = positions_m + right * (offset_m + depth_m)[runs, None, None]
+    # At corners, pieces that would be stretched outside or squeezed inside by more than this factor are left out.
+    min_scale = 0.6
+    scales = [np.linalg.norm(line[:, 1] - line[:, 0], axis=1) / piece_m for line in (near_m, far_m)]
+    is_undistorted = (np.abs(np.log(np.maximum(scales, TINY_M))) < -np.log(min_scale)).all(axis=0)
+    outlines_m = np.concatenate([far_m, near_m[:, ::-1]], axis=1)[is_undistorted]
+    return RoadsidePieces(outlines_m, height_m[runs][is_undistorted], runs[is_undistorted])
 
 
-def _free(
-    outlines_m: Float64,
-    kinds: Int64,
-    run: Int64,
-    driven: Sequence[shapely.Geometry],
-    walked: Sequence[shapely.Geometry],
-    pavements: Sequence[shapely.Geometry],
+def find_free_pieces(
+    pieces: RoadsidePieces,
+    kind_indices: Int64,
+    drivable_areas: Sequence[shapely.Geometry],
+    walkable_areas: Sequence[shapely.Geometry],
+    sidewalk_areas: Sequence[shapely.Geometry],
 ) -> tuple[Bools, Float64]:
-    """(N,) which pieces are in nobody's way, and how much higher than the ground they stand."""
-    foot = np.array([kind.foot for kind in KINDS.values()])[kinds][:, None, None]
-    middles_m = outlines_m.mean(axis=1, keepdims=True)
-    feet = shapely.linearrings(middles_m + foot * (outlines_m - middles_m))
-    # Of the two geometries it is the query's that is prepared: it had better be the large one.
-    free, on, within = (np.zeros(len(kinds), dtype=bool) for _ in range(3))
-    at_kerb = np.array(["kerb" in kind.zones for kind in KINDS.values()])[kinds]
-    for own, streets in ((at_kerb, driven), (~at_kerb, walked)):
-        met = shapely.STRtree(feet[own]).query(np.array(streets, dtype=object), predicate="intersects")[1]
-        free[own] = ~np.isin(np.arange(np.count_nonzero(own)), met)
-    floors = shapely.STRtree(feet)
-    for found, predicate in ((on, "intersects"), (within, "contains")):
-        found[floors.query(np.array(pavements, dtype=object), predicate=predicate)[1]] = True
-    free &= on == within
-    # On the inside of a tight curve, where the ways to the right meet, outlines fold.
-    sides = np.roll(outlines_m, -1, axis=1) - outlines_m
-    following = np.roll(sides, -1, axis=1)
-    free &= (sides[..., 0] * following[..., 1] > sides[..., 1] * following[..., 0]).all(axis=1)
-    number = np.flatnonzero(free)
-    own = np.unique(np.stack([kinds[number], run[number]]), axis=1, return_inverse=True)[1]
-    later, earlier = number[_meeting(outlines_m[number], own)]
+    """Find pieces that keep off streets, edges of sidewalks and pieces of earlier kinds.
+
+    Args:
+        pieces: N pieces.
+        kind_indices: (N,) index of the kind of each piece in `KINDS`.
+        drivable_areas: See `place_scenery`.
+        walkable_areas: See `place_scenery`.
+        sidewalk_areas: See `place_scenery`.
+
+    Returns:
+        (N,) True for free pieces, and (N,) heights of their base above the ground in meters.
+    """
+    outlines_m = pieces.outlines_m
+    footprint_shares = np.array([kind.footprint_share for kind in KINDS.values()])[kind_indices][:, None, None]
+    centers_m = outlines_m.mean(axis=1, keepdims=True)
+    footprints = shapely.linearrings(centers_m + footprint_shares * (outlines_m - centers_m))
+    is_free, touches_sidewalk, is_on_sidewalk = np.zeros((3, len(kind_indices)), dtype=bool)
+    # shapely prepares the geometries of the query, so that the large ones are queried.
+    is_at_curb = np.array(["curb" in kind.zones for kind in KINDS.values()])[kind_indices]
+    for selection, areas in ((is_at_curb, drivable_areas), (~is_at_curb, walkable_areas)):
+        tree = shapely.STRtree(footprints[selection])
+        blocked = tree.query(np.array(areas, dtype=object), predicate="intersects")[1]
+        is_free[selection] = ~np.isin(np.arange(np.count_nonzero(selection)), blocked)
+    tree = shapely.STRtree(footprints)
+    touches_sidewalk[tree.query(np.array(sidewalk_areas, dtype=object), predicate="intersects")[1]] = True
+    is_on_sidewalk[tree.query(np.array(sidewalk_areas, dtype=object), predicate="contains")[1]] = True
+    is_free &= touches_sidewalk == is_on_sidewalk
+    # On the inside of a tight curve, where the normals meet, outlines are folded.
+    edges_m = np.roll(outlines_m, -1, axis=1) - outlines_m
+    next_edges_m = np.roll(edges_m, -1, axis=1)
+    is_free &= (edges_m[..., 0] * next_edges_m[..., 1] > edges_m[..., 1] * next_edges_m[..., 0]).all(axis=1)
+    candidates = np.flatnonzero(is_free)
+    kinds_and_runs = np.stack([kind_indices[candidates], pieces.runs[candidates]])
+    groups = np.unique(kinds_and_runs, axis=1, return_inverse=True)[1]
+    later, earlier = candidates[find_overlapping_pairs(outlines_m[candidates], groups)]
     order = np.lexsort((earlier, later))
-    for one, other in zip(later[order].tolist(), earlier[order].tolist(), strict=True):
-        if free[other]:
-            free[one] = False
-    return free, PAVEMENT_M * within
+    for later_piece, earlier_piece in zip(later[order].tolist(), earlier[order].tolist(), strict=True):
+        if is_free[earlier_piece]:
+            is_free[later_piece] = False
+    return is_free, PAVEMENT_M * is_on_sidewalk
 
 
-def _meeting(outlines_m: Float64, group: Int64) -> Int64:
-    """(2, P) pairs of (N, 4, 2) convex outlines of two groups that no side of the one or the other separates."""
-    # Their diagonals have the same bounds as boxes, and are made in less time.
+def find_overlapping_pairs(outlines_m: Float64, groups: Int64) -> Int64:
+    """Find pairs (2, P) of convex outlines (N, 4, 2) of different groups that no edge of either separates."""
+    # Diagonals have the same bounds as boxes and are created faster.
     diagonals = shapely.linestrings(np.stack([outlines_m.min(axis=1), outlines_m.max(axis=1)], axis=1))
     pairs = shapely.STRtree(diagonals).query(diagonals)
-    pairs = pairs[:, (pairs[0] > pairs[1]) & (group[pairs[0]] != group[pairs[1]])]
-    for way in (1, -1):
-        one, other = pairs[::way]
-        normals = (np.roll(outlines_m, -1, axis=1) - outlines_m)[one][..., ::-1] * np.array([1.0, -1.0])
-        beyond = np.einsum("pkc,plkc->plk", normals, outlines_m[other][:, :, None] - outlines_m[one][:, None])
-        meet = ~(beyond.min(axis=1) > 0).any(axis=1)
-        pairs = pairs[:, meet]
+    pairs = pairs[:, (pairs[0] > pairs[1]) & (groups[pairs[0]] != groups[pairs[1]])]
+    for order in (1, -1):
+        first, second = pairs[::order]
+        normals = (np.roll(outlines_m, -1, axis=1) - outlines_m)[first][..., ::-1] * np.array([1.0, -1.0])
+        offsets_m = outlines_m[second][:, :, None] - outlines_m[first][:, None]
+        distances = np.einsum("pkc,plkc->plk", normals, offsets_m)
+        overlaps = ~(distances.min(axis=1) > 0).any(axis=1)
+        pairs = pairs[:, overlaps]
     return np.asarray(pairs)
-
-
-def _copies(form: Mesh, outlines_m: Float64, bottom_m: Float64, base_m: Float64, high_m: Float64) -> Mesh:
-    """A form, once over each of (N, 4, 2) outlines: it stands on a base, and its lowest corners go on to a bottom."""
-    x, y, z = form.vertices_m.T
-    weights = np.stack([(1 - x) * (1 - y), x * (1 - y), x * y, (1 - x) * y], axis=1)
-    count, corners = len(outlines_m), len(x)
-    places_m = np.einsum("vc,ncd->nvd", weights, outlines_m)
-    heights_m = np.where(z == 0.0, bottom_m[:, None], base_m[:, None] + high_m[:, None] * z)
-    faces = form.faces + corners * np.arange(count)[:, None, None]
-    return Mesh(
-        np.concatenate([places_m, heights_m[..., None]], axis=2).reshape(-1, 3),
-        faces.reshape(-1, 3),
-        np.tile(form.filled_material_indices, count),
-        np.ones(len(faces) * len(form.faces), dtype=bool),  # as all forms are closed
-    )
-
-
-@cache
-def _form(name: str) -> Mesh:
-    """A form over the unit square with the street beyond y = 1, from z = 0 to 1."""
-    whole = ((0.0, 1.0), (0.0, 1.0), (0.0, 1.0))
-    ring = 0.5 * compute_circle_points(6)
-    middle = np.array([0.5, 0.5])
-
-    def turned(levels: Sequence[float], sizes: Sequence[float]) -> Mesh:
-        return build_prism([middle + size * ring for size in sizes], levels)
-
-    def wheel(x: float) -> Mesh:
-        around = np.array([x, 0.0]) + np.array([0.4, 0.65]) * (ring / np.array([1.0, np.sqrt(0.75)]) + 0.5)
-        disc = build_prism([around, around], [0.46, 0.54])
-        return Mesh(disc.vertices_m[:, [0, 2, 1]], disc.faces[:, ::-1])
-
-    parts = {
-        "house": [build_box_from_bounds(*whole)],
-        "hedge": [build_box_from_bounds(*whole).assign_material("vegetation")],
-        "fence": [build_box_from_bounds(*whole).assign_material("wood")],
-        "bin": [build_box_from_bounds(*whole).assign_material("metal")],
-        "bollard": [turned([0.0, 1.0], [1.0, 1.0]).assign_material("metal")],
-        "lamp": [turned([0.0, 0.97], [1.0, 0.7]).assign_material("metal"), build_box_from_bounds((0.2, 0.8), (0.0, 11.0), (0.975, 1.0))],
-        "tree": [
-            turned([0.0, 0.42], [TRUNK, TRUNK]).assign_material("wood"),
-            turned([0.42, 0.6, 0.8, 1.0], [0.45, 1.0, 0.9, 0.3]).assign_material("vegetation"),
-        ],
-        "bush": [turned([0.0, 0.4, 0.8, 1.0], [0.7, 1.0, 0.9, 0.4]).assign_material("vegetation")],
-        "sign": [
-            build_box_from_bounds((0.0, 1.0), (0.45, 0.55), (0.0, 0.75)).assign_material("metal"),
-            build_box_from_bounds((0.2, 0.8), (0.0, 1.0), (0.755, 1.0)).assign_material("sign"),
-        ],
-        "bicycle": [
-            wheel(0.0), wheel(0.6), build_box_from_bounds((0.42, 0.58), (0.44, 0.56), (0.25, 0.88)),
-            build_box_from_bounds((0.66, 0.7), (0.0, 1.0), (0.94, 1.0)),
-        ],
-    }  # fmt: skip
-    return merge_meshes(parts[name])

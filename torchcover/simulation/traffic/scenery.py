@@ -1,6 +1,7 @@
 """Meshes of roadside scenery: closed pieces that are merged into few meshes."""
 
 from collections.abc import Callable, Sequence
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +17,7 @@ from torchcover.simulation.shapes import Mesh, build_band_faces, build_prism_fac
 PAVEMENT_M = 0.15  # height of curbs and sidewalks above the road
 # Depth to which curbs continue below the ground, since it may rise between two of their vertices.
 SUNK_M = 0.3
+TRUNK_SHARE = 0.1  # width of the trunk of a roadside tree, as a share of the width of the tree
 
 
 class Scenery(NamedTuple):
@@ -172,3 +174,78 @@ def build_tree(
 def merge_by_kind(*kinds: Sequence[Mesh]) -> tuple[Mesh, ...]:
     """Merge the meshes of each kind into one mesh; kinds without meshes are omitted."""
     return tuple(merge_meshes(list(pieces)) for pieces in kinds if pieces)
+
+
+def copy_shape(shape: Mesh, outlines_m: Float64, bottom_m: Float64, base_m: Float64, heights_m: Float64) -> Mesh:
+    """Copy a unit shape onto N outlines.
+
+    Args:
+        shape: Closed mesh in the unit cube.
+        outlines_m: (N, 4, 2) outlines of the unit square in the ground plane.
+        bottom_m: (N,) z of the vertices at z = 0.
+        base_m: (N,) z from which the heights count.
+        heights_m: (N,) heights.
+    """
+    x, y, z = shape.vertices_m.T
+    weights = np.stack([(1 - x) * (1 - y), x * (1 - y), x * y, (1 - x) * y], axis=1)
+    num_copies = len(outlines_m)
+    positions_m = np.einsum("vc,ncd->nvd", weights, outlines_m)
+    z_m = np.where(z == 0.0, bottom_m[:, None], base_m[:, None] + heights_m[:, None] * z)
+    faces = shape.faces + len(x) * np.arange(num_copies)[:, None, None]
+    return Mesh(
+        np.concatenate([positions_m, z_m[..., None]], axis=2).reshape(-1, 3),
+        faces.reshape(-1, 3),
+        np.tile(shape.filled_material_indices, num_copies),
+        np.ones(num_copies * len(shape.faces), dtype=bool),
+    )
+
+
+@cache
+def build_unit_shape(name: str) -> Mesh:
+    """Build a shape in the unit cube, with the street beyond y = 1."""
+    box = build_box_from_bounds((0.0, 1.0), (0.0, 1.0), (0.0, 1.0))
+    if name == "house":
+        return box
+    if name in ("hedge", "fence", "bin"):
+        return box.assign_material({"hedge": "vegetation", "fence": "wood", "bin": "metal"}[name])
+    if name == "bollard":
+        return build_round_shape([0.0, 1.0], [1.0, 1.0]).assign_material("metal")
+    if name == "lamp":
+        post = build_round_shape([0.0, 0.97], [1.0, 0.7]).assign_material("metal")
+        return merge_meshes([post, build_box_from_bounds((0.2, 0.8), (0.0, 11.0), (0.975, 1.0))])
+    if name == "tree":
+        trunk = build_round_shape([0.0, 0.42], [TRUNK_SHARE, TRUNK_SHARE]).assign_material("wood")
+        crown = build_round_shape([0.42, 0.6, 0.8, 1.0], [0.45, 1.0, 0.9, 0.3])
+        return merge_meshes([trunk, crown.assign_material("vegetation")])
+    if name == "bush":
+        return build_round_shape([0.0, 0.4, 0.8, 1.0], [0.7, 1.0, 0.9, 0.4]).assign_material("vegetation")
+    if name == "sign":
+        post = build_box_from_bounds((0.0, 1.0), (0.45, 0.55), (0.0, 0.75)).assign_material("metal")
+        return merge_meshes(
+            [
+                post,
+                build_box_from_bounds((0.2, 0.8), (0.0, 1.0), (0.755, 1.0)).assign_material("sign"),
+            ]
+        )
+    return merge_meshes(
+        [
+            build_wheel(0.0),
+            build_wheel(0.6),
+            build_box_from_bounds((0.42, 0.58), (0.44, 0.56), (0.25, 0.88)),
+            build_box_from_bounds((0.66, 0.7), (0.0, 1.0), (0.94, 1.0)),
+        ]
+    )
+
+
+def build_round_shape(levels: Sequence[float], diameters: Sequence[float]) -> Mesh:
+    """Build a shape with six sides around the vertical axis of the unit cube, from its diameters at given levels."""
+    ring = 0.5 * compute_circle_points(6)
+    return build_prism([np.array([0.5, 0.5]) + diameter * ring for diameter in diameters], levels)
+
+
+def build_wheel(x: float) -> Mesh:
+    """Build a wheel of a bicycle in the unit cube, from an x on."""
+    ring = 0.5 * compute_circle_points(6)
+    outline = np.array([x, 0.0]) + np.array([0.4, 0.65]) * (ring / np.array([1.0, np.sqrt(0.75)]) + 0.5)
+    disc = build_prism([outline, outline], [0.46, 0.54])
+    return Mesh(disc.vertices_m[:, [0, 2, 1]], disc.faces[:, ::-1])
