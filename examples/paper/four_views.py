@@ -18,7 +18,6 @@ from torchcover.report.colors import (
 from torchcover.report.number_format import format_height_band, format_resolution
 from torchcover.report.overlay import get_sensor_color, plot_ego, plot_sensors
 from torchcover.report.plot_layout import (
-    HEADING_POINTS,
     create_sheets,
     find_lower_left,
     fit_paper,
@@ -55,7 +54,7 @@ def plot_four_views(radius_m, point_counts, grid, *, num_frames, title, ego_outl
         entries += plot_sensors(sheet, sensors, show_names=False)
     for sheet in (field_of_view, histogram, *maps):
         entries += plot_ego(sheet.axes, ego_outline_m)
-    write_title(field_of_view.axes, title, format_resolution(num_frames, grid), lift_points=HEADING_POINTS)
+    write_title(field_of_view.axes, title, format_resolution(num_frames, grid), has_heading=True)
     write_legend(find_lower_left(sheet.axes for sheet in maps), entries, field_of_view.legend_columns)
     fit_paper(field_of_view.figure)
     return field_of_view.figure

@@ -61,7 +61,7 @@ def test_rigs_side_by_side_in_words_and_files(torchcover, worlds, monkeypatch):
         (SET, ["--latency-s", "-1"], "latency_s: 0 to 10 seconds"),
         (SET, ["--latency-s", "300"], "latency_s: 0 to 10 seconds are needed; got 300, is that milliseconds?"),
         (SET, ["--set", "crosing_like"], "is 'crossing_like' meant?"),
-        (SET, ["--animation", "a.png"], "a film is a .gif or .mp4 file"),
+        (SET, ["--animation", "a.png"], "an animation is a .gif or .mp4 file"),
         (SET, ["--num-scenes", "16"], "--num-scenes: of no use with a set; leave it out"),
         (SET, ["--max-ttc-s", "4"], "--max-ttc-s: of no use with a set"),
         (SET, ["--scenario", "urban"], "--set: of no use with --scenario"),

@@ -44,7 +44,9 @@ def test_a_rig_is_drawn_on_the_ego_of_a_scenario(torchcover, worlds, drawn):
 
 
 def test_a_scenario_is_drawn_in_the_frame_of_the_ego(torchcover, worlds, drawn):
-    code, _, _ = torchcover("show", worlds / "yard.yaml", "--rig", worlds / "low.yaml", "--frame-index", 3, "--out", worlds)
+    code, _, _ = torchcover(
+        "show", worlds / "yard.yaml", "--rig", worlds / "low.yaml", "--frame-index", 3, "--out", worlds
+    )
     assert code == 0
     assert min(imread(worlds / "yard.png").shape[:2]) > 500
     ahead, far = drawn["actors"]
@@ -161,7 +163,7 @@ def test_a_vehicle_is_drawn_with_its_mount_regions_on_its_skin(torchcover, tmp_p
     assert "A box on wheels" in printed
     assert min(imread(tmp_path / "cart.png").shape[:2]) > 500
     _, _, (lid, tail) = drawn["args"]
-    assert (lid.name, lid.seen_from, tail.name, tail.seen_from) == ("lid", "above", "tail", "rear")
+    assert (lid.name, lid.side, tail.name, tail.side) == ("lid", "above", "tail", "rear")
     for patch, lowest, highest in (
         (lid, [-1.0, -0.4, 0.8], [1.0, 0.4, 0.8]),
         (tail, [-1.5, -0.3, 0.2], [-1.5, 0.3, 0.6]),
@@ -319,7 +321,14 @@ def test_it_prints_where_the_numbers_of_a_rig_come_from(torchcover, tmp_path):
 def test_a_film_shows_what_follows(torchcover, worlds, monkeypatch):
     monkeypatch.setattr(show, "FILM_S", 0.3)
     code, printed, _ = torchcover(
-        "show", worlds / "yard.yaml", "--rig", worlds / "low.yaml", "--animation", worlds / "new" / "a.gif", "--frame-index", 1
+        "show",
+        worlds / "yard.yaml",
+        "--rig",
+        worlds / "low.yaml",
+        "--animation",
+        worlds / "new" / "a.gif",
+        "--frame-index",
+        1,
     )
     assert (code, "a.gif" in printed) == (0, True)
     with Image.open(worlds / "new" / "a.gif") as film:
@@ -337,9 +346,9 @@ def test_a_film_shows_what_follows(torchcover, worlds, monkeypatch):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (("yard.yaml", "--animation", "a.avi"), "a film is a .gif or .mp4 file; got 'a.avi'"),
+        (("yard.yaml", "--animation", "a.avi"), "an animation is a .gif or .mp4 file; got 'a.avi'"),
         (("low.yaml", "--animation", "a.gif"), "--animation: for a scenario only"),
-        (("yard.yaml", "--animation", "a.mp4"), "the program ffmpeg is needed for .mp4 and is not there; write a .gif"),
+        (("yard.yaml", "--animation", "a.mp4"), ".mp4 needs the program ffmpeg, which is missing; write a .gif"),
     ],
 )
 def test_a_film_that_cannot_be_written_is_refused_at_once(options, message, torchcover, worlds, monkeypatch):

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from torchcover.geometry import build_transform, convert_euler_to_rotation
 from torchcover.report import ActorMark, SensorView, StaticFaces, plot_depth_images, plot_rig, plot_scene
 from torchcover.report.page.svg import build_sensor_table, render_rig
-from torchcover.report.scene_plots import PATH, REFERENCE, SENSOR, SKY
+from torchcover.report.scene_plots import PARAMS
 
 VERTICES = np.array([[x, y, z] for x in (-2.0, 2.0) for y in (-1.0, 1.0) for z in (0.0, 1.5)])
 FACES = np.array([[0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [1, 5, 7], [1, 7, 3], [0, 4, 5], [0, 5, 1]])
@@ -176,7 +176,7 @@ def test_what_stands_is_drawn_the_darker_the_higher_and_the_ground_is_not():
     assert ground == 1.0
     assert 1.0 > kerb > house + 0.1
     entries = [text.get_text() for text in picture.figure.axes[0].get_legend().get_texts()]
-    assert entries[0] == "what stands there, the darker the higher"
+    assert entries[0] == "static objects, higher ones darker"
 
 
 def test_actors_are_where_they_are_in_the_colour_of_their_category():
@@ -194,17 +194,17 @@ def test_actors_are_where_they_are_in_the_colour_of_their_category():
 
 def test_the_way_of_the_ego_is_drawn_if_it_moves():
     picture = scene(path_m=np.array([[-10.0, -5.0], [25.0, -5.0]]))
-    assert picture.at(0, 10.0, -5.0) == pytest.approx(to_rgb(PATH), abs=0.3)
+    assert picture.at(0, 10.0, -5.0) == pytest.approx(to_rgb(PARAMS.path_color), abs=0.3)
     assert scene().at(0, 10.0, -5.0) == pytest.approx((1, 1, 1))
     entries = [text.get_text() for text in picture.figure.axes[0].get_legend().get_texts()]
-    assert "way of the ego" in entries
+    assert "path of the ego vehicle" in entries
 
 
 def test_clouds_are_drawn_the_rig_over_the_reference():
     line = np.stack([np.linspace(5, 25, 4000), np.full(4000, 5.0), np.zeros(4000)], axis=1)
     picture = scene(reference_points=line, sensor_points=line[:2000])
-    assert picture.at(0, 8.0, 5.0) == pytest.approx(to_rgb(SENSOR), abs=0.02)
-    assert picture.at(0, 22.0, 5.0) == pytest.approx(to_rgb(REFERENCE), abs=0.02)
+    assert picture.at(0, 8.0, 5.0) == pytest.approx(to_rgb(PARAMS.sensor_color), abs=0.02)
+    assert picture.at(0, 22.0, 5.0) == pytest.approx(to_rgb(PARAMS.reference_color), abs=0.02)
     entries = [text.get_text() for text in picture.figure.axes[0].get_legend().get_texts()]
     assert entries[:2] == ["reference points (4,000)", "points of the rig (2,000)"]
 
@@ -221,7 +221,7 @@ def test_a_depth_image_stands_upright_and_shows_what_has_no_depth():
     picture = depths({"front": image})
     # Cells count from below, rows of an image from above.
     sky, wall, road = (picture.at(0, 15, height) for height in (18, 10, 2))
-    assert sky == pytest.approx(to_rgb(SKY), abs=0.02)
+    assert sky == pytest.approx(to_rgb(PARAMS.sky_color), abs=0.02)
     assert abs(wall - road).max() > 0.2
     hatched = np.array([picture.at(0, 1, height) for height in np.arange(0.5, 19.0, 0.1)])
     assert np.ptp(hatched, axis=1).max() < 0.02

@@ -10,7 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from torchcover.evaluation import build_flat_ground, build_target_record, map_target_visibility, save_target_map
 from torchcover.geometry import BoundingBox
-from torchcover.report.scene_plots import UNSEEN
+from torchcover.report.scene_plots import PARAMS
 from torchcover.simulation import set_ego
 from torchcover.targets import Raster, Target, TargetMap
 
@@ -151,8 +151,8 @@ def test_the_picture_shows_cells_where_they_are():
         column, row = figure.axes[0].transData.transform((x, y))
         return "#" + "".join(f"{value:02x}" for value in pixels[len(pixels) - 1 - int(row), int(column)])
 
-    assert at(-5.3, 4.3) == at(5.3, 1.3) == UNSEEN
-    assert at(5.3, -4.3) not in (UNSEEN, "#ffffff")
+    assert at(-5.3, 4.3) == at(5.3, 1.3) == PARAMS.undetected_color
+    assert at(5.3, -4.3) not in (PARAMS.undetected_color, "#ffffff")
     assert at(1.9, 0.9) == at(-1.9, -0.9) == "#ffffff"  # the vehicle, true to scale
     assert at(5.25, 0.0) < "#202020"  # the line between seen and not
     assert figure.axes[0].get_legend() is not None

@@ -25,7 +25,6 @@ from torchcover.estimation import Quantity
 from torchcover.report.number_format import format_percent, get_display_unit
 from torchcover.report.overlay import SensorView, plot_ego, plot_sensor_positions, plot_sensors
 from torchcover.report.plot_layout import (
-    HEADING_POINTS,
     Sheet,
     create_sheets,
     find_lower_left,
@@ -282,7 +281,7 @@ def plot_side_by_side(
             entries += plot_sensors(sheet, views, show_names=not name)
         else:
             entries += plot_sensor_positions(sheet, views)
-    write_title(sheets[0].axes, title, subtitle, lift_points=HEADING_POINTS if any(arrays) else 0.0)
+    write_title(sheets[0].axes, title, subtitle, has_heading=any(arrays))
     write_legend(find_lower_left(sheet.axes for sheet in sheets), entries, sheets[0].legend_columns)
     fit_paper(sheets[0].figure)
     return sheets[0].figure

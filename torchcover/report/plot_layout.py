@@ -1,4 +1,4 @@
-"""The paper under a picture, as large as what is on it, cells of maps a whole number of pixels; films of pictures."""
+"""Layout of figures: maps, views and charts on paper that fits their content, and animations of figures."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -21,33 +21,55 @@ from torchcover.files import write_atomically
 
 Bounds = tuple[float, float]
 
-MAX_MAP_IN = (9.0, 6.0)
-MAX_PAPER_IN = (14.0, 8.75)
-# Between maps on one paper, with room for the outer labels of two axes; below, for a heading.
-BESIDE_IN = 0.6
-BELOW_IN = 0.4
-# For a heading and the numbers of an axis.
-LABELS_IN = 0.55
-DOTS_PER_INCH = 150
-# Of maps, at least, so that a cell is whole pixels, and not more of them than are read: each is drawn and compressed.
-MIN_DOTS_PER_INCH = 110
-# Beyond this, cells are smaller than pixels and are averaged.
-MAX_DOTS_PER_INCH = 300
-COLOUR_BAR_IN = 0.16
-# The label of the colour bar needs this much.
-MIN_COLOUR_BAR_IN = 2.4
-GAP_IN = 0.15
-X_LABEL_IN = 0.55
-LEGEND_COLUMN_IN = 3.0
-HEADING_POINTS = 18
-ABOVE: dict[str, Any] = {"xycoords": "axes fraction", "textcoords": "offset points", "parse_math": False}
+
+@dataclass(frozen=True)
+class LayoutParams:
+    """Sizes of figures.
+
+    Args:
+        map_size_in: Maximum width and height of a single map, in inches.
+        paper_size_in: Maximum width and height of all maps of a figure, in inches.
+        column_gap_in: Horizontal gap between maps, with room for the labels of two axes.
+        row_gap_in: Vertical gap between maps or images, with room for a heading.
+        view_gap_in: Vertical gap between views in meters, with room for a heading and the numbers of an axis.
+        margin_in: Margin of the paper, and gap between an image and the color bar.
+        dots_per_inch: Resolution of figures other than maps.
+        min_map_dots_per_inch: Minimum resolution of maps, whose cells are whole pixels.
+        max_map_dots_per_inch: Maximum resolution of maps; smaller cells are averaged.
+        color_bar_width_in: Width of the color bar.
+        min_color_bar_height_in: Minimum height of the color bar, so that its label fits.
+        x_label_in: Gap between a map and its legend, with room for the label of the x axis.
+        legend_column_in: Width of a column of the legend.
+    """
+
+    map_size_in: tuple[float, float] = (9.0, 6.0)
+    paper_size_in: tuple[float, float] = (14.0, 8.75)
+    column_gap_in: float = 0.6
+    row_gap_in: float = 0.4
+    view_gap_in: float = 0.55
+    margin_in: float = 0.15
+    dots_per_inch: int = 150
+    min_map_dots_per_inch: int = 110
+    max_map_dots_per_inch: int = 300
+    color_bar_width_in: float = 0.16
+    min_color_bar_height_in: float = 2.4
+    x_label_in: float = 0.55
+    legend_column_in: float = 3.0
+
+
+LAYOUT = LayoutParams()
 
 
 @dataclass(frozen=True)
 class Sheet:
-    """An empty map, x to the right and y upwards in equal metres, alone on its paper or beside others.
+    """Empty map, x forward to the right and y left upwards on equal scales, alone on its paper or with others.
 
-    These share the place of the `color_bar_axes`. So many columns of a legend fit beside each other.
+    Args:
+        figure: Figure of the map.
+        axes: Axes of the map.
+        color_bar_axes: Axes of the color bar, which all maps of a figure share.
+        legend_columns: Number of columns of a legend that fit the paper.
+        meters_per_inch: Scale of the map.
     """
 
     figure: Figure
@@ -58,96 +80,147 @@ class Sheet:
 
 
 def create_sheets(grid: BevGrid, num_maps: int = 1) -> list[Sheet]:
-    """Empty maps of the grid on one paper: long ones below each other, others beside each other.
+    """Create empty maps of a grid on one paper: long maps below each other, others next to each other.
 
-    `grid`: bounds and cells; `num_maps`: how many. Returns the maps, row by row from the upper left.
+    Args:
+        grid: Bounds and cells of each map.
+        num_maps: Number of maps.
+
+    Returns:
+        The maps, row by row from the upper left.
     """
     _, rows, columns = grid.shape
-    across, inches_per_cell = _arrange(grid, num_maps)
-    dpi = min(math.ceil(MIN_DOTS_PER_INCH * inches_per_cell) / inches_per_cell, MAX_DOTS_PER_INCH)
-    map_in = inches_per_cell * np.array([columns, rows])
-    # Gaps of whole pixels, so that every cell of every map is whole pixels.
-    step_in = map_in + np.round(np.array([BESIDE_IN, BELOW_IN]) * dpi) / dpi
-    paper_in = map_in + step_in * [across - 1, math.ceil(num_maps / across) - 1]
+    maps_per_row, cell_in = _arrange_maps(grid, num_maps)
+    dpi = min(math.ceil(LAYOUT.min_map_dots_per_inch * cell_in) / cell_in, LAYOUT.max_map_dots_per_inch)
+    map_in = cell_in * np.array([columns, rows])
+    # Gaps are whole pixels, so that each cell of each map is a whole number of pixels.
+    pitch_in = map_in + np.round(np.array([LAYOUT.column_gap_in, LAYOUT.row_gap_in]) * dpi) / dpi
+    paper_in = map_in + pitch_in * [maps_per_row - 1, math.ceil(num_maps / maps_per_row) - 1]
     figure = Figure(figsize=tuple(paper_in), dpi=dpi)
 
-    def place(left_in: float, top_in: float, size_in: NDArray[np.float64]) -> tuple[float, float, float, float]:
+    def build_box(left_in: float, top_in: float, size_in: NDArray[np.float64]) -> tuple[float, float, float, float]:
         corner = np.array([left_in, paper_in[1] - top_in - size_in[1]]) / paper_in
         return (*corner.tolist(), *(size_in / paper_in).tolist())
 
-    views = []
-    for at in range(num_maps):
-        left_in, top_in = (step_in * [at % across, at // across]).tolist()
-        views.append(figure.add_axes(place(left_in, top_in, map_in), xlim=grid.x_m, ylim=grid.y_m))
-        left, lowest = at % across == 0, at + across >= num_maps
-        views[-1].set(xlabel="x forward (m)" if lowest else "", ylabel="y left (m)" if left else "")
-        views[-1].tick_params(labelbottom=lowest, labelleft=left)
-    bar_in = np.array([COLOUR_BAR_IN, max(paper_in[1], MIN_COLOUR_BAR_IN)])
-    gap_in = GAP_IN if num_maps == 1 else BESIDE_IN  # the axis of a map above the last row has labels beside the bar
-    bar = figure.add_axes(place(paper_in[0] + gap_in, 0.0, bar_in))
-    legend_columns = max(1, int(paper_in[0] / LEGEND_COLUMN_IN))
-    scale = grid.cell_m / inches_per_cell
-    return [Sheet(figure, axes, bar, legend_columns, scale) for axes in views]
+    maps = []
+    for index in range(num_maps):
+        left_in, top_in = (pitch_in * [index % maps_per_row, index // maps_per_row]).tolist()
+        axes = figure.add_axes(build_box(left_in, top_in, map_in), xlim=grid.x_m, ylim=grid.y_m)
+        is_leftmost, is_lowest = index % maps_per_row == 0, index + maps_per_row >= num_maps
+        axes.set(xlabel="x forward (m)" if is_lowest else "", ylabel="y left (m)" if is_leftmost else "")
+        axes.tick_params(labelbottom=is_lowest, labelleft=is_leftmost)
+        maps.append(axes)
+    bar_in = np.array([LAYOUT.color_bar_width_in, max(paper_in[1], LAYOUT.min_color_bar_height_in)])
+    # With several rows, the axis of a map above the last row has labels next to the color bar.
+    gap_in = LAYOUT.margin_in if num_maps == 1 else LAYOUT.column_gap_in
+    color_bar_axes = figure.add_axes(build_box(paper_in[0] + gap_in, 0.0, bar_in))
+    legend_columns = max(1, int(paper_in[0] / LAYOUT.legend_column_in))
+    return [Sheet(figure, axes, color_bar_axes, legend_columns, grid.cell_m / cell_in) for axes in maps]
 
 
-def _arrange(grid: BevGrid, maps: int) -> tuple[int, float]:
-    """How many maps beside each other, and inches for each cell: the most that the paper allows."""
+def _arrange_maps(grid: BevGrid, num_maps: int) -> tuple[int, float]:
+    """Find the number of maps per row with the largest cells, and the size of a cell in inches."""
     _, rows, columns = grid.shape
-    width_in, height_in = MAX_MAP_IN if maps == 1 else MAX_PAPER_IN
-
-    def inches_per_cell(across: int) -> float:
-        return min(width_in / (across * columns), height_in / (math.ceil(maps / across) * rows))
-
-    across = max(range(1, maps + 1), key=inches_per_cell)
-    return across, inches_per_cell(across)
+    width_in, height_in = LAYOUT.map_size_in if num_maps == 1 else LAYOUT.paper_size_in
+    best_maps_per_row, best_cell_in = 1, 0.0
+    for maps_per_row in range(1, num_maps + 1):
+        map_rows = math.ceil(num_maps / maps_per_row)
+        cell_in = min(width_in / (maps_per_row * columns), height_in / (map_rows * rows))
+        if cell_in > best_cell_in:
+            best_maps_per_row, best_cell_in = maps_per_row, cell_in
+    return best_maps_per_row, best_cell_in
 
 
 def stack_views(views: Sequence[tuple[Bounds, Bounds]], *, width_in: float) -> tuple[Figure, list[Axes]]:
-    """Empty views in metres without cells, below each other, each in equal metres on both axes.
+    """Create empty views below each other, each with equal scales of both axes.
 
-    `views`: bounds of the axis to the right, and of that upwards, in metres; from the top; `width_in`: width in inches.
-    Returns the paper, and the views from the top.
+    Args:
+        views: Horizontal and vertical bounds of each view in meters, from the top.
+        width_in: Width in inches.
+
+    Returns:
+        The figure, and the axes from the top.
     """
     heights_in = [width_in * (y[1] - y[0]) / (x[1] - x[0]) for x, y in views]
-    paper_in = sum(heights_in) + LABELS_IN * (len(heights_in) - 1)
-    figure = Figure(figsize=(width_in, paper_in), dpi=DOTS_PER_INCH)
+    paper_in = sum(heights_in) + LAYOUT.view_gap_in * (len(heights_in) - 1)
+    figure = Figure(figsize=(width_in, paper_in), dpi=LAYOUT.dots_per_inch)
     top_in, axes = paper_in, []
     for (x, y), height_in in zip(views, heights_in, strict=True):
-        place = (0.0, (top_in - height_in) / paper_in, 1.0, height_in / paper_in)
-        axes.append(figure.add_axes(place, xlim=x, ylim=y))
-        top_in -= height_in + LABELS_IN
+        box = (0.0, (top_in - height_in) / paper_in, 1.0, height_in / paper_in)
+        axes.append(figure.add_axes(box, xlim=x, ylim=y))
+        top_in -= height_in + LAYOUT.view_gap_in
     return figure, axes
 
 
 def create_charts(
     rows: int, columns: int, size_in: tuple[float, float], title: str, *, sharey: bool = False
 ) -> tuple[Figure, list[list[Axes]]]:
-    """Empty charts in rows under a title, which matplotlib arranges: a figure of its own, outside pyplot."""
-    figure = Figure(figsize=size_in, dpi=DOTS_PER_INCH, layout="constrained")
+    """Create empty charts in rows under a title, arranged by matplotlib, outside pyplot.
+
+    Args:
+        rows: Number of rows.
+        columns: Number of charts per row.
+        size_in: Width and height of the figure in inches.
+        title: Title of the figure, as plain text.
+        sharey: Whether all charts have the same y axis.
+
+    Returns:
+        The figure, and the axes of each row.
+    """
+    figure = Figure(figsize=size_in, dpi=LAYOUT.dots_per_inch, layout="constrained")
     FigureCanvasAgg(figure)
     figure.suptitle(title, parse_math=False)
     return figure, [list(row) for row in figure.subplots(rows, columns, squeeze=False, sharey=sharey)]
 
 
-def write_title(axes: Axes, title: str, subtitle: str, lift_points: float = 0.0) -> None:
-    """Write two lines above the map, the second smaller, both as they are: `$` is no formula."""
-    axes.annotate(title, (0, 1), (0, 22 + lift_points), fontsize=11, fontweight="bold", **ABOVE)
-    axes.annotate(subtitle, (0, 1), (0, 8 + lift_points), fontsize=9, color="#404040", **ABOVE)
+def write_title(axes: Axes, title: str, subtitle: str, *, has_heading: bool = False) -> None:
+    """Write two lines of plain text above a map, the second smaller.
+
+    Args:
+        axes: Axes of the first map.
+        title: First line.
+        subtitle: Second line.
+        has_heading: Whether there is a heading between the map and the title.
+    """
+    lift_points = 18 if has_heading else 0
+    _write_above(axes, title, 22 + lift_points, fontsize=11, fontweight="bold")
+    _write_above(axes, subtitle, 8 + lift_points, fontsize=9, color="#404040")
 
 
 def write_heading(axes: Axes, heading: str) -> None:
-    """Write a line above one map of several, which leaves room for a title if that is lifted by `HEADING_POINTS`."""
-    axes.annotate(heading, (0, 1), (0, 5), fontsize=9, fontweight="bold", **ABOVE)
+    """Write a line of plain text above one map of several.
+
+    Args:
+        axes: Axes of the map.
+        heading: The line.
+    """
+    _write_above(axes, heading, 5, fontsize=9, fontweight="bold")
+
+
+def _write_above(axes: Axes, text: str, points: float, **style: Any) -> None:  # noqa: ANN401  (style of matplotlib)
+    axes.annotate(
+        text, (0, 1), (0, points), xycoords="axes fraction", textcoords="offset points", parse_math=False, **style
+    )
 
 
 def find_lower_left(views: Iterable[Axes]) -> Axes:
-    """The one in the lower left corner, under which the legend of all has its place."""
+    """Find the axes in the lower left corner, under which the common legend is.
+
+    Args:
+        views: Axes of one figure.
+    """
     return min(views, key=lambda axes: (axes.get_position().y0, axes.get_position().x0))
 
 
 def write_legend(axes: Axes, entries: Sequence[Artist], columns: int) -> None:
-    """Write the legend under the map, where it hides nothing; what several maps share is in it once."""
-    below = ScaledTranslation(0, -X_LABEL_IN, axes.figure.dpi_scale_trans)
+    """Write the legend below a map; entries with the same label appear once.
+
+    Args:
+        axes: Axes of the map.
+        entries: Entries of all maps.
+        columns: Number of columns.
+    """
+    below = ScaledTranslation(0, -LAYOUT.x_label_in, axes.figure.dpi_scale_trans)
     legend = axes.legend(
         handles=list({entry.get_label(): entry for entry in entries}.values()),
         loc="upper left",
@@ -163,66 +236,68 @@ def write_legend(axes: Axes, entries: Sequence[Artist], columns: int) -> None:
 
 
 def fit_paper(figure: Figure) -> None:
-    """Make the paper as large as what is drawn on it, with a margin. Nothing is clipped, nothing changes its size."""
+    """Resize the paper to its content with a margin, without clipping or scaling.
+
+    Args:
+        figure: Finished figure.
+    """
     FigureCanvasAgg(figure)
-    drawn = figure.get_tightbbox().padded(GAP_IN)
-    dots = figure.dpi
-    left, bottom = (math.floor(edge * dots) / dots for edge in drawn.min)
-    right, top = (math.ceil(edge * dots) / dots for edge in drawn.max)
-    old, new = figure.get_size_inches(), (right - left, top - bottom)
-    figure.set_size_inches(*new)
+    content = figure.get_tightbbox().padded(LAYOUT.margin_in)
+    dpi = figure.dpi
+    left, bottom = (math.floor(edge * dpi) / dpi for edge in content.min)
+    right, top = (math.ceil(edge * dpi) / dpi for edge in content.max)
+    old_size, new_size = figure.get_size_inches(), (right - left, top - bottom)
+    figure.set_size_inches(*new_size)
     for axes in figure.axes:
-        corners = axes.get_position(original=True).get_points() * old - (left, bottom)
-        axes.set_position(Bbox(corners / new))
+        corners = axes.get_position(original=True).get_points() * old_size - (left, bottom)
+        axes.set_position(Bbox(corners / new_size))
 
 
-WRITERS: dict[str, type[FFMpegWriter] | type[PillowWriter]] = {".gif": PillowWriter, ".mp4": FFMpegWriter}
+ANIMATION_WRITERS: dict[str, type[FFMpegWriter] | type[PillowWriter]] = {".gif": PillowWriter, ".mp4": FFMpegWriter}
 
 
 def check_animation(path: Path) -> None:
-    """Refuse, before the first figure is drawn, a film that could not be written.
+    """Check that an animation can be written, before its first figure is plotted.
+
+    Args:
+        path: File of the animation.
 
     Raises:
-        ValueError: Neither .gif nor .mp4.
-        FileNotFoundError: .mp4, and the program ffmpeg is not there.
+        ValueError: The file is neither .gif nor .mp4.
+        FileNotFoundError: The program ffmpeg, which .mp4 needs, is missing.
     """
-    if path.suffix not in WRITERS:
-        raise ValueError(f"a film is a .gif or .mp4 file; got {path.name!r}")
-    if not WRITERS[path.suffix].isAvailable():
-        raise FileNotFoundError(f"{path.name}: the program ffmpeg is needed for .mp4 and is not there; write a .gif")
-
-
-def _pixels(figure: Figure) -> NDArray[np.uint8]:
-    """(rows, columns, 4) red, green, blue, alpha."""
-    canvas: Any = FigureCanvasAgg(figure)  # matplotlib has no types for it
-    canvas.draw()
-    return np.asarray(canvas.buffer_rgba())
+    if path.suffix not in ANIMATION_WRITERS:
+        raise ValueError(f"an animation is a .gif or .mp4 file; got {path.name!r}")
+    if not ANIMATION_WRITERS[path.suffix].isAvailable():
+        raise FileNotFoundError(f"{path.name}: .mp4 needs the program ffmpeg, which is missing; write a .gif")
 
 
 def write_animation(path: Path, figures: Iterable[Figure], *, frames_per_s: float) -> None:
-    """Write figures as a film. It is as large as the first of them; what a later one has beyond that is cut off.
+    """Write figures as an animation with the size of the first figure; larger figures are cropped.
 
     Args:
-        path: The file, .gif or .mp4; `check_animation` says whether it can be written.
-        figures: At least one, each drawn when it is its turn.
-        frames_per_s: How many of them a second shows.
+        path: File that passes `check_animation`.
+        figures: At least one figure; each is plotted on demand.
+        frames_per_s: Figures per second.
     """
-    write_atomically(path, partial(_write, figures, frames_per_s))
+    write_atomically(path, partial(_write_frames, figures, frames_per_s))
 
 
-def _write(figures: Iterable[Figure], per_s: float, path: Path) -> None:
-    writer: AbstractMovieWriter = WRITERS[path.suffix](fps=per_s)  # type: ignore[arg-type]  # any number will do
+def _write_frames(figures: Iterable[Figure], frames_per_s: float, path: Path) -> None:
+    writer: AbstractMovieWriter = ANIMATION_WRITERS[path.suffix](fps=frames_per_s)  # type: ignore[arg-type]  # not only int
     screen: Figure | None = None
     for figure in figures:
-        image = _pixels(figure)
+        canvas: Any = FigureCanvasAgg(figure)  # matplotlib has no types for it
+        canvas.draw()
+        image = np.asarray(canvas.buffer_rgba())
         if screen is None:
-            # What encodes films wants even numbers of pixels.
+            # Video encoders need even numbers of pixels.
             height, width = (size + size % 2 for size in image.shape[:2])
             screen = Figure(figsize=(width / figure.dpi, height / figure.dpi), dpi=figure.dpi)
             FigureCanvasAgg(screen)
             writer.setup(screen, str(path), dpi=figure.dpi)
         screen.clear()
-        # Images lie with their first row at the top of the screen.
+        # The first row of an image is at the top of the screen.
         screen.figimage(image, 0, height - len(image))
         writer.grab_frame()
     writer.finish()

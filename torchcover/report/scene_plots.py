@@ -1,9 +1,8 @@
-"""Pictures of a frame, from above and as the cameras of a rig see it, and of the points on targets around a vehicle."""
+"""Plots of a frame in bird's-eye view and as depth images, and of the points on test targets around a vehicle."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import accumulate
 
 import numpy as np
 from matplotlib.artist import Artist
@@ -21,11 +20,7 @@ from torchcover.report.colors import UNOBSERVED_STYLE, ColorScale, plot_cells, p
 from torchcover.report.number_format import format_percent
 from torchcover.report.overlay import HALO, plot_ego
 from torchcover.report.plot_layout import (
-    BELOW_IN,
-    COLOUR_BAR_IN,
-    DOTS_PER_INCH,
-    GAP_IN,
-    HEADING_POINTS,
+    LAYOUT,
     Bounds,
     Sheet,
     create_sheets,
@@ -40,30 +35,70 @@ from torchcover.report.plot_layout import (
 Points = NDArray[np.floating]
 Image = NDArray[np.floating]
 
-WIDTH_IN = 13.0
-REFERENCE, SENSOR = "#e0b878", "#3b6ea5"
-# Kerbs are drawn, the road is not; greys of what is low and of what is high.
-LOWEST_STANDING_M = 0.08
-LOW_GREY, HIGH_GREY, GREY_HEIGHT_M = 0.92, 0.55, 3.0
-# These have the same colours in every picture; others take what follows.
-CATEGORIES = ("car", "truck", "bus", "cyclist", "motorcycle", "pedestrian")
-COLOURS = ("#d55e00", "#7a3fa0", "#e6b400", "#009e73", "#8b5a2b", "#d62598", "#a3122f", "#555555", "#000000")
-PATH = "#111111"
-IMAGE_HEIGHT_IN = 2.4
-SKY = "#dfe9f2"
-MAX_ROW_IN = 13.5
-# The colours leave out this share of the pixels at either end: a bumper, and a few walls at the horizon.
-ROBUST_PERCENTILES = (0.5, 99.5)
-FALLBACK_SCALE_M = (1.0, 100.0)
+
+@dataclass(frozen=True)
+class ScenePlotParams:
+    """Colors and sizes of plots of a frame.
+
+    Args:
+        width_in: Width of the bird's-eye view in inches.
+        sensor_color: Color of sensor points.
+        reference_color: Color of reference points.
+        path_color: Color of the path of the ego vehicle.
+        sky_color: Color of pixels of a depth image whose rays hit nothing within range.
+        undetected_color: Color of cells in which a test target has no point.
+        category_colors: Color of each category of actors; other categories share `other_colors`.
+        other_colors: Colors of other categories, in alphabetical order.
+        min_static_height_m: Lower faces are not plotted: curbs are plotted, roads are not.
+        low_gray: Brightness of low static faces.
+        high_gray: Brightness of high static faces.
+        gray_height_m: Height at which the brightness has changed by 63 % from low to high.
+        image_height_in: Height of a depth image in inches.
+        max_row_in: Maximum width of a row of depth images in inches.
+        depth_percentiles: Percentiles of depths at the ends of the colors: the bumper and walls at the horizon must not
+            dominate them.
+        default_depths_m: Ends of the colors if there is no depth.
+        points_percentile: Percentile of the number of points on a target at the upper end of the colors.
+        ring_distances_m: Distances of the dashed lines around the vehicle.
+    """
+
+    width_in: float = 13.0
+    sensor_color: str = "#3b6ea5"
+    reference_color: str = "#e0b878"
+    path_color: str = "#111111"
+    sky_color: str = "#dfe9f2"
+    undetected_color: str = "#d55e00"
+    category_colors: tuple[tuple[str, str], ...] = (
+        ("car", "#d55e00"),
+        ("truck", "#7a3fa0"),
+        ("bus", "#e6b400"),
+        ("cyclist", "#009e73"),
+        ("motorcycle", "#8b5a2b"),
+        ("pedestrian", "#d62598"),
+    )
+    other_colors: tuple[str, ...] = ("#a3122f", "#555555", "#000000")
+    min_static_height_m: float = 0.08
+    low_gray: float = 0.92
+    high_gray: float = 0.55
+    gray_height_m: float = 3.0
+    image_height_in: float = 2.4
+    max_row_in: float = 13.5
+    depth_percentiles: tuple[float, float] = (0.5, 99.5)
+    default_depths_m: tuple[float, float] = (1.0, 100.0)
+    points_percentile: float = 98.0
+    ring_distances_m: tuple[float, ...] = (1.0, 2.0, 3.0)
+
+
+PARAMS = ScenePlotParams()
 
 
 @dataclass(frozen=True, eq=False)
 class ActorMark:
-    """An actor as a frame shows it.
+    """Actor in a plot of a frame.
 
     Args:
-        category: What it is; one colour each.
-        outline_m: (K, 2) corners x, y in the vehicle frame in metres.
+        category: Category, which has one color.
+        outline_m: (K, 2) corners x, y in the vehicle frame, in meters.
     """
 
     category: str
@@ -72,11 +107,11 @@ class ActorMark:
 
 @dataclass(frozen=True, eq=False)
 class StaticFaces:
-    """What stands in a frame and never moves.
+    """Static part of a scene in a plot of a frame.
 
     Args:
-        triangles_m: (F, 3, 2) its faces from above, x, y in the vehicle frame in metres.
-        height_m: (F,) how high each reaches above the ground under the vehicle.
+        triangles_m: (F, 3, 2) corners x, y of faces in the vehicle frame, in meters.
+        height_m: (F,) height of the highest corner above the ground under the vehicle.
     """
 
     triangles_m: Points
@@ -96,72 +131,77 @@ def plot_scene(
     subtitle: str = "",
     path_m: Points | None = None,
 ) -> Figure:
-    """Draw a frame.
+    """Plot a frame in bird's-eye view.
 
     Args:
-        x: Bounds forward in metres.
-        y: Bounds to the left in metres.
-        static_faces: What stands there.
-        ego_outline_m: (K, 2) corners of the ego in the vehicle frame in metres.
-        actors: The others; what lies beyond the bounds is left out.
+        x: Bounds forward in meters.
+        y: Bounds to the left in meters.
+        static_faces: Static part of the scene.
+        ego_outline_m: (K, 2) corners of the ego vehicle in the vehicle frame, in meters.
+        actors: Actors; those beyond the bounds are not plotted.
         sensor_points: (N, 3) points of the rig.
-        reference_points: (M, 3) points of the reference sensor, if there is one.
+        reference_points: (M, 3) reference points; None without a reference.
         title: First line.
         subtitle: Second line, smaller.
-        path_m: (T, 2) the ego's way in the vehicle frame in metres; not drawn if it does not move.
+        path_m: (T, 2) path of the ego vehicle in the vehicle frame, in meters; None if it does not move.
 
     Returns:
-        A figure of its own, outside pyplot.
+        A new figure outside pyplot.
     """
-    figure, (axes,) = stack_views([(x, y)], width_in=WIDTH_IN)
+    figure, (axes,) = stack_views([(x, y)], width_in=PARAMS.width_in)
     axes.set(xlabel="x forward (m)", ylabel="y left (m)")
-    inside = [actor for actor in actors if _is_inside(actor.outline_m, x, y)]
-    entries = [
-        *_draw_standing(axes, static_faces),
-        *([] if reference_points is None else _draw_cloud(axes, reference_points, REFERENCE, "reference points")),
-        *_draw_cloud(axes, sensor_points, SENSOR, "points of the rig"),
-        *_draw_actors(axes, inside),
-        *([] if path_m is None else axes.plot(*path_m.T, color=PATH, linewidth=1.2, label="way of the ego", zorder=3)),
-        *plot_ego(axes, ego_outline_m),
-    ]
+    entries = _plot_static_faces(axes, static_faces)
+    if reference_points is not None:
+        entries.append(_plot_points(axes, reference_points, PARAMS.reference_color, "reference points"))
+    entries.append(_plot_points(axes, sensor_points, PARAMS.sensor_color, "points of the rig"))
+    entries += _plot_actors(axes, [actor for actor in actors if _is_inside(actor.outline_m, x, y)])
+    if path_m is not None:
+        style = {"color": PARAMS.path_color, "linewidth": 1.2, "zorder": 3}
+        entries += axes.plot(*path_m.T, label="path of the ego vehicle", **style)
+    entries += plot_ego(axes, ego_outline_m)
     write_title(axes, title, subtitle)
     write_legend(axes, entries, columns=4)
     fit_paper(figure)
     return figure
 
 
-def _draw_standing(axes: Axes, standing: StaticFaces) -> list[Artist]:
-    """Faces from above, the highest last; the ground itself is not drawn."""
-    stands = standing.height_m > LOWEST_STANDING_M
-    height_m = standing.height_m[stands]
+def _plot_static_faces(axes: Axes, static_faces: StaticFaces) -> list[Artist]:
+    """Plot faces above the ground, the highest last."""
+    is_above_ground = static_faces.height_m > PARAMS.min_static_height_m
+    height_m = static_faces.height_m[is_above_ground]
     order = np.argsort(height_m)
-    grey = HIGH_GREY + (LOW_GREY - HIGH_GREY) * np.exp(-height_m[order] / GREY_HEIGHT_M)
-    colours = np.repeat(grey[:, None], 3, axis=1)
-    faces = list(standing.triangles_m[stands][order])
-    axes.add_collection(PolyCollection(faces, facecolors=colours, edgecolors=colours, linewidths=0.4, zorder=0.5))
-    if not faces:
+    contrast = PARAMS.low_gray - PARAMS.high_gray
+    gray = PARAMS.high_gray + contrast * np.exp(-height_m[order] / PARAMS.gray_height_m)
+    colors = np.repeat(gray[:, None], 3, axis=1)
+    triangles = list(static_faces.triangles_m[is_above_ground][order])
+    axes.add_collection(PolyCollection(triangles, facecolors=colors, edgecolors=colors, linewidths=0.4, zorder=0.5))
+    if not triangles:
         return []
-    words = "what stands there, the darker the higher"
-    return [Patch(facecolor=str((LOW_GREY + HIGH_GREY) / 2), edgecolor="none", label=words)]
+    medium_gray = str((PARAMS.low_gray + PARAMS.high_gray) / 2)
+    return [Patch(facecolor=medium_gray, edgecolor="none", label="static objects, higher ones darker")]
 
 
-def _draw_cloud(axes: Axes, points: Points, colour: str, label: str) -> list[Artist]:
-    # A point is a pixel, however many there are.
-    axes.plot(points[:, 0], points[:, 1], linestyle="none", marker=",", color=colour, zorder=1)
-    return [Line2D([], [], linestyle="none", marker=".", color=colour, label=f"{label} ({len(points):,})")]
+def _plot_points(axes: Axes, points: Points, color: str, label: str) -> Artist:
+    # Each point is one pixel, for any number of points.
+    axes.plot(points[:, 0], points[:, 1], linestyle="none", marker=",", color=color, zorder=1)
+    return Line2D([], [], linestyle="none", marker=".", color=color, label=f"{label} ({len(points):,})")
 
 
-def _draw_actors(axes: Axes, actors: Sequence[ActorMark]) -> list[Artist]:
+def _plot_actors(axes: Axes, actors: Sequence[ActorMark]) -> list[Artist]:
     counts = Counter(actor.category for actor in actors)
-    known = [*CATEGORIES, *sorted(set(counts) - set(CATEGORIES))]
-    colours = {category: COLOURS[at % len(COLOURS)] for at, category in enumerate(known) if category in counts}
+    colors = dict(PARAMS.category_colors)
+    palette = (*colors.values(), *PARAMS.other_colors)
+    for category in sorted(set(counts) - set(colors)):
+        colors[category] = palette[len(colors) % len(palette)]
     for actor in actors:
-        colour = colours[actor.category]
-        axes.add_patch(Polygon(actor.outline_m, facecolor=(colour, 0.45), edgecolor=colour, linewidth=0.9, zorder=2))
-    return [
-        Patch(facecolor=(colour, 0.45), edgecolor=colour, label=f"{category} ({counts[category]})")
-        for category, colour in colours.items()
-    ]
+        color = colors[actor.category]
+        axes.add_patch(Polygon(actor.outline_m, facecolor=(color, 0.45), edgecolor=color, linewidth=0.9, zorder=2))
+    entries: list[Artist] = []
+    for category, color in colors.items():
+        if category in counts:
+            label = f"{category} ({counts[category]})"
+            entries.append(Patch(facecolor=(color, 0.45), edgecolor=color, label=label))
+    return entries
 
 
 def _is_inside(outline_m: Points, x: Bounds, y: Bounds) -> bool:
@@ -170,120 +210,104 @@ def _is_inside(outline_m: Points, x: Bounds, y: Bounds) -> bool:
 
 
 def plot_depth_images(images: Mapping[str, Image], *, title: str, subtitle: str = "") -> Figure:
-    """Draw depth images.
+    """Plot depth images with logarithmic colors.
 
     Args:
-        images: (rows, columns) distances along the ray in metres, by the name of the camera; infinite where a ray hits
-            nothing within its range, NaN where a pixel has no ray. Their sizes may differ.
+        images: Name of the camera -> (rows, columns) distances along the ray in meters; infinite where a ray hits
+            nothing within range, NaN where a pixel has no ray. Sizes may differ.
         title: First line.
         subtitle: Second line, smaller.
 
     Returns:
-        A figure of its own, outside pyplot. Colours are logarithmic: twice as far is the same step everywhere.
+        A new figure outside pyplot.
 
     Raises:
-        ValueError: No image, or one that has not two dimensions or no pixel.
+        ValueError: No image, or an image without two dimensions or without pixels.
 
     Example:
         >>> figure = plot_depth_images({"front": np.array([[2.0, np.inf], [1.0, np.nan]])}, title="My rig")
         >>> [text.get_text() for text in figure.axes[0].get_legend().get_texts()]
         ['nothing within range (25.0 % of the pixels)', 'no ray: beyond the lens (25.0 % of the pixels)']
     """
-    arrays = {name: _checked(name, image) for name, image in images.items()}
+    arrays = {name: _check_image(name, image) for name, image in images.items()}
     if not arrays:
-        raise ValueError("images: at least one is needed; got none")
-    scale = _scale(np.concatenate([array.ravel() for array in arrays.values()]))
-    figure = _paper(list(arrays.values()))
-    *views, bar = figure.axes
+        raise ValueError("images: got none; give at least one")
+    depths_m = np.concatenate([array.ravel() for array in arrays.values()])
+    scale = _build_depth_scale(depths_m)
+    figure = _create_image_axes(list(arrays.values()))
+    *views, color_bar_axes = figure.axes
     for axes, (name, array) in zip(views, arrays.items(), strict=True):
-        # The first row of an image is its top; the first row of cells is their bottom.
-        image = plot_cells(axes, array[::-1], scale, infinite_color=SKY)
+        # The first row of an image is its top; the first row of cells is at the bottom.
+        image = plot_cells(axes, array[::-1], scale, infinite_color=PARAMS.sky_color)
         write_heading(axes, name)
-    colours = figure.colorbar(
-        image, cax=bar, extend="both", label=scale.label, ticks=LogLocator(subs=(1, 2, 5)), format="{x:g}"
+    color_bar = figure.colorbar(
+        image, cax=color_bar_axes, extend="both", label=scale.label, ticks=LogLocator(subs=(1, 2, 5)), format="{x:g}"
     )
-    colours.minorformatter = NullFormatter()
-    write_title(views[0], title, subtitle, lift_points=HEADING_POINTS)
-    write_legend(find_lower_left(views), _entries(arrays), columns=2)
+    color_bar.minorformatter = NullFormatter()
+    write_title(views[0], title, subtitle, has_heading=True)
+    write_legend(find_lower_left(views), _build_depth_legend(depths_m), columns=2)
     fit_paper(figure)
     return figure
 
 
-def _checked(name: str, image: Image) -> NDArray[np.float64]:
+def _check_image(name: str, image: Image) -> NDArray[np.float64]:
     array = np.asarray(image, dtype=np.float64)
     if array.ndim != 2 or array.size == 0:
-        raise ValueError(f"image {name!r}: (rows, columns) distances are needed; got shape {array.shape}")
+        raise ValueError(f"image {name!r}: got shape {array.shape}; give (rows, columns) distances")
     return array
 
 
-def _scale(values: NDArray[np.float64]) -> ColorScale:
-    hits = values[np.isfinite(values) & (values > 0)]
-    low, high = np.percentile(hits, ROBUST_PERCENTILES) if len(hits) else FALLBACK_SCALE_M
-    # A wall at one distance has no range of colours of its own.
+def _build_depth_scale(depths_m: NDArray[np.float64]) -> ColorScale:
+    hits_m = depths_m[np.isfinite(depths_m) & (depths_m > 0)]
+    low, high = np.percentile(hits_m, PARAMS.depth_percentiles) if len(hits_m) else PARAMS.default_depths_m
+    # A scale needs low < high, also if all depths are equal.
     high = max(high, 1.01 * low)
     return ColorScale("distance along the ray", "m", "viridis_r", float(low), float(high), logarithmic=True)
 
 
-def _paper(arrays: list[NDArray[np.float64]]) -> Figure:
-    """Empty images of one height, in rows as long as the paper allows, and the place of the colour bar last."""
-    widths_in = [IMAGE_HEIGHT_IN * array.shape[1] / array.shape[0] for array in arrays]
-    rows = _rows(widths_in)
-    paper_in = (
-        max(sum(row) + GAP_IN * (len(row) - 1) for row in rows),
-        len(rows) * (IMAGE_HEIGHT_IN + BELOW_IN) - BELOW_IN,
-    )
-    figure = Figure(figsize=paper_in, dpi=DOTS_PER_INCH)
+def _create_image_axes(arrays: list[NDArray[np.float64]]) -> Figure:
+    """Create axes of images of equal height, in rows up to the maximum width; the axes of the color bar come last."""
+    height_in, gap_in = PARAMS.image_height_in, LAYOUT.margin_in
+    corners_in, widths_in, row, row_width_in = [], [], 0, -gap_in
+    paper_width_in = 0.0
+    for array in arrays:
+        width_in = height_in * array.shape[1] / array.shape[0]
+        if row_width_in > 0 and row_width_in + gap_in + width_in > PARAMS.max_row_in:
+            row, row_width_in = row + 1, -gap_in
+        corners_in.append((row_width_in + gap_in, row * (height_in + LAYOUT.row_gap_in)))
+        widths_in.append(width_in)
+        row_width_in += gap_in + width_in
+        paper_width_in = max(paper_width_in, row_width_in)
+    paper_height_in = (row + 1) * (height_in + LAYOUT.row_gap_in) - LAYOUT.row_gap_in
+    figure = Figure(figsize=(paper_width_in, paper_height_in), dpi=LAYOUT.dots_per_inch)
 
-    def place(left_in: float, top_in: float, width_in: float) -> tuple[float, float, float, float]:
-        bottom_in = paper_in[1] - top_in - IMAGE_HEIGHT_IN
-        return left_in / paper_in[0], bottom_in / paper_in[1], width_in / paper_in[0], IMAGE_HEIGHT_IN / paper_in[1]
+    def build_box(left_in: float, top_in: float, width_in: float) -> tuple[float, float, float, float]:
+        bottom_in = paper_height_in - top_in - height_in
+        relative_left, relative_width = left_in / paper_width_in, width_in / paper_width_in
+        return relative_left, bottom_in / paper_height_in, relative_width, height_in / paper_height_in
 
-    shapes = iter(array.shape for array in arrays)
-    for at, row in enumerate(rows):
-        lefts_in = accumulate(row[:-1], lambda left_in, width_in: left_in + width_in + GAP_IN, initial=0.0)
-        for left_in, width_in in zip(lefts_in, row, strict=True):
-            height, width = next(shapes)
-            figure.add_axes(
-                place(left_in, at * (IMAGE_HEIGHT_IN + BELOW_IN), width_in),
-                xlim=(-0.5, width - 0.5),
-                ylim=(-0.5, height - 0.5),
-                xticks=[],
-                yticks=[],
-            )
-    figure.add_axes(place(paper_in[0] + GAP_IN, 0.0, COLOUR_BAR_IN))
+    for array, (left_in, top_in), width_in in zip(arrays, corners_in, widths_in, strict=True):
+        rows, columns = array.shape
+        limits = {"xlim": (-0.5, columns - 0.5), "ylim": (-0.5, rows - 0.5)}
+        figure.add_axes(build_box(left_in, top_in, width_in), **limits, xticks=[], yticks=[])
+    figure.add_axes(build_box(paper_width_in + gap_in, 0.0, LAYOUT.color_bar_width_in))
     return figure
 
 
-def _rows(widths_in: list[float]) -> list[list[float]]:
-    rows = [[widths_in[0]]]
-    for width_in in widths_in[1:]:
-        if sum(rows[-1]) + width_in + GAP_IN * len(rows[-1]) > MAX_ROW_IN:
-            rows.append([])
-        rows[-1].append(width_in)
-    return rows
-
-
-def _entries(arrays: Mapping[str, NDArray[np.float64]]) -> list[Artist]:
-    values = np.concatenate([array.ravel() for array in arrays.values()])
-    infinite, none = float(np.isinf(values).mean()), float(np.isnan(values).mean())
+def _build_depth_legend(depths_m: NDArray[np.float64]) -> list[Artist]:
+    infinite_share, missing_share = float(np.isinf(depths_m).mean()), float(np.isnan(depths_m).mean())
     entries: list[Artist] = []
-    if infinite:
-        label = f"nothing within range ({format_percent(infinite)} % of the pixels)"
-        entries.append(Patch(facecolor=SKY, edgecolor="#9fb0c0", label=label))
-    if none:
-        entries.append(
-            Patch(label=f"no ray: beyond the lens ({format_percent(none)} % of the pixels)", **UNOBSERVED_STYLE)
-        )
+    if infinite_share:
+        label = f"nothing within range ({format_percent(infinite_share)} % of the pixels)"
+        entries.append(Patch(facecolor=PARAMS.sky_color, edgecolor="#9fb0c0", label=label))
+    if missing_share:
+        label = f"no ray: beyond the lens ({format_percent(missing_share)} % of the pixels)"
+        entries.append(Patch(label=label, **UNOBSERVED_STYLE))
     return entries
 
 
 Float64 = NDArray[np.float64]
 Bools = NDArray[np.bool_]
-
-UNSEEN = "#d55e00"
-ROBUST_PERCENTILE = 98
-RINGS_M = (1.0, 2.0, 3.0)
-CORNER_POINTS = 25
 
 
 def plot_target_visibility(
@@ -298,32 +322,32 @@ def plot_target_visibility(
     title: str,
     subtitle: str = "",
 ) -> Figure:
-    """Draw how many points there are on a target.
+    """Plot the number of points on a test target by its position, with lines between detected and undetected cells.
 
     Args:
-        point_counts: (Y, X) number of points, NaN where the target cannot stand.
-        detected: (Y, X) whether that is enough to see it.
-        grid: The cells.
-        vehicle_outline_m: (K, 2) what the vehicle looks like from above.
-        vehicle_box_m: (4, 2) its box, from which the dashed lines are 1, 2 and 3 m away.
-        sensors_m: (S, 2) where sensors are.
-        min_points: How many points are enough, for the legend.
+        point_counts: (Y, X) number of points; NaN where the target overlaps the vehicle or another object.
+        detected: (Y, X) whether the target is detected.
+        grid: Grid of the positions.
+        vehicle_outline_m: (K, 2) outline of the vehicle from above.
+        vehicle_box_m: (4, 2) corners of its bounding box, the origin of the distances of the dashed lines.
+        sensors_m: (S, 2) positions of sensors.
+        min_points: Number of points that a detection needs, for the legend.
         title: First line.
         subtitle: Second line, smaller.
 
     Returns:
-        A figure of its own, outside pyplot. Lines divide places where it is seen from those where it is not.
+        A new figure outside pyplot.
 
     Raises:
-        ValueError: Arrays of another shape than the grid.
+        ValueError: An array has another shape than the grid.
     """
-    for name, array in (("points", point_counts), ("enough", detected)):
+    for name, array in (("point_counts", point_counts), ("detected", detected)):
         if array.shape != grid.shape[1:]:
-            raise ValueError(f"{name}: shape {grid.shape[1:]} is needed, as of the grid; got {array.shape}")
+            raise ValueError(f"{name}: got shape {array.shape}; give that of the grid, {grid.shape[1:]}")
     (sheet,) = create_sheets(grid)
-    entries = _draw_points(sheet, point_counts)
-    entries += _draw_rings(sheet.axes, vehicle_box_m)
-    entries += _draw_boundary(sheet.axes, detected, ~np.isnan(point_counts), grid, min_points)
+    entries = _plot_point_counts(sheet, point_counts)
+    entries.append(_plot_rings(sheet.axes, vehicle_box_m))
+    entries.append(_plot_boundary(sheet.axes, detected, ~np.isnan(point_counts), grid, min_points))
     entries += plot_ego(sheet.axes, vehicle_outline_m)
     sheet.axes.plot(*sensors_m.T, linestyle="none", marker="o", markersize=3.5, color="black", zorder=4)
     entries.append(Line2D([], [], linestyle="none", marker="o", markersize=3.5, color="black", label="sensors"))
@@ -333,54 +357,53 @@ def plot_target_visibility(
     return sheet.figure
 
 
-def _draw_points(sheet: Sheet, points: Float64) -> list[Artist]:
-    some = points[points > 0]
-    high = max(float(np.percentile(some, ROBUST_PERCENTILE)), 10.0) if len(some) else 10.0
-    scale = ColorScale("points on the target", "mean of the steps", "viridis", 1.0, high, logarithmic=True)
-    # Fewer than one in the mean is as dark as one.
-    shown = np.where(points > 0, np.maximum(points, 1.0), np.nan)
-    plot_color_bar(sheet, plot_cells(sheet.axes, shown, scale), shown, scale)
-    unseen = np.ma.masked_where(points != 0, np.ones_like(points))
+def _plot_point_counts(sheet: Sheet, point_counts: Float64) -> list[Artist]:
+    positive = point_counts[point_counts > 0]
+    high = max(float(np.percentile(positive, PARAMS.points_percentile)), 10.0) if len(positive) else 10.0
+    scale = ColorScale("points on the target", "mean of the frames", "viridis", 1.0, high, logarithmic=True)
+    # Means below 1 have the color of 1.
+    values = np.where(point_counts > 0, np.maximum(point_counts, 1.0), np.nan)
+    plot_color_bar(sheet, plot_cells(sheet.axes, values, scale), values, scale)
     sheet.axes.imshow(
-        unseen,
+        np.ma.masked_where(point_counts != 0, np.ones_like(point_counts)),
         extent=(*sheet.axes.get_xlim(), *sheet.axes.get_ylim()),
         origin="lower",
         interpolation="nearest",
-        cmap=ListedColormap([UNSEEN]),
+        cmap=ListedColormap([PARAMS.undetected_color]),
     )
     entries: list[Artist] = []
-    if (points == 0).any():
-        entries.append(Patch(facecolor=UNSEEN, label="no point at all"))
-    if np.isnan(points).any():
-        entries.append(Patch(label="no room for it", **UNOBSERVED_STYLE))
+    if (point_counts == 0).any():
+        entries.append(Patch(facecolor=PARAMS.undetected_color, label="no points"))
+    if np.isnan(point_counts).any():
+        entries.append(Patch(label="no room for the target", **UNOBSERVED_STYLE))
     return entries
 
 
-def _draw_boundary(axes: Axes, enough: Bools, free: Bools, grid: BevGrid, hits: int) -> list[Artist]:
-    """Lines along the edges between cells that are seen and cells that are not."""
-    x, y = np.linspace(*grid.x_m, enough.shape[1] + 1), np.linspace(*grid.y_m, enough.shape[0] + 1)
-    row, column = np.nonzero((enough[:, 1:] != enough[:, :-1]) & free[:, 1:] & free[:, :-1])
-    upright = [((x[c + 1], y[r]), (x[c + 1], y[r + 1])) for r, c in zip(row, column, strict=True)]
-    row, column = np.nonzero((enough[1:] != enough[:-1]) & free[1:] & free[:-1])
-    level = [((x[c], y[r + 1]), (x[c + 1], y[r + 1])) for r, c in zip(row, column, strict=True)]
-    lines = LineCollection(upright + level, colors="black", linewidths=1.4, zorder=2, path_effects=HALO)
-    axes.add_collection(lines)
-    return [Line2D([], [], color="black", linewidth=1.4, label=f"between fewer than {hits} points and more")]
+def _plot_boundary(axes: Axes, detected: Bools, is_free: Bools, grid: BevGrid, min_points: int) -> Artist:
+    """Plot lines along the edges between detected and undetected free cells."""
+    x, y = np.linspace(*grid.x_m, detected.shape[1] + 1), np.linspace(*grid.y_m, detected.shape[0] + 1)
+    segments = []
+    is_edge = (detected[:, 1:] != detected[:, :-1]) & is_free[:, 1:] & is_free[:, :-1]
+    for row, column in np.argwhere(is_edge):
+        segments.append(((x[column + 1], y[row]), (x[column + 1], y[row + 1])))
+    is_edge = (detected[1:] != detected[:-1]) & is_free[1:] & is_free[:-1]
+    for row, column in np.argwhere(is_edge):
+        segments.append(((x[column], y[row + 1]), (x[column + 1], y[row + 1])))
+    axes.add_collection(LineCollection(segments, colors="black", linewidths=1.4, zorder=2, path_effects=HALO))
+    return Line2D([], [], color="black", linewidth=1.4, label=f"limit of {min_points} points")
 
 
-def _draw_rings(axes: Axes, box_m: Float64) -> list[Artist]:
+def _plot_rings(axes: Axes, box_m: Float64) -> Artist:
+    """Plot dashed lines at some distances from the vehicle: rectangles with rounded corners."""
     low, high = box_m.min(axis=0), box_m.max(axis=0)
-    for ring_m in RINGS_M:
-        axes.plot(*_ring(low, high, ring_m).T, color="white", linewidth=0.9, linestyle=(0, (4, 4)), zorder=1.5)
-    words = ", ".join(f"{ring_m:g}" for ring_m in RINGS_M)
-    patch = Line2D([], [], color="#808080", linewidth=0.9, linestyle=(0, (4, 4)), label=f"{words} m from the vehicle")
-    return [patch]
-
-
-def _ring(low: Float64, high: Float64, away_m: float) -> Float64:
-    """(K, 2) closed line at a distance from a rectangle."""
-    angles = np.linspace(0.0, 2 * np.pi, 4 * CORNER_POINTS, endpoint=False)
-    circle = np.stack([np.cos(angles), np.sin(angles)], axis=1)
-    corners = np.array([high, (low[0], high[1]), low, (high[0], low[1])])
-    ring = corners.repeat(CORNER_POINTS, axis=0) + away_m * circle
-    return np.vstack([ring, ring[:1]])
+    num_corner_points = 25
+    angles = np.linspace(0.0, 2 * np.pi, 4 * num_corner_points, endpoint=False)
+    directions = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    corners = np.array([high, (low[0], high[1]), low, (high[0], low[1])]).repeat(num_corner_points, axis=0)
+    dashes = (0, (4, 4))
+    for distance_m in PARAMS.ring_distances_m:
+        ring = corners + distance_m * directions
+        axes.plot(*np.vstack([ring, ring[:1]]).T, color="white", linewidth=0.9, linestyle=dashes, zorder=1.5)
+    distances = ", ".join(f"{distance_m:g}" for distance_m in PARAMS.ring_distances_m)
+    label = f"{distances} m from the vehicle"
+    return Line2D([], [], color="#808080", linewidth=0.9, linestyle=dashes, label=label)
