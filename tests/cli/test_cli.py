@@ -248,7 +248,7 @@ def test_too_few_steps_for_errors_are_told_and_a_recording_has_no_reference_sens
         (["evaluate", "front_roof_128", "--set", "cell_m=0.3"], "not a multiple of the cell of 0.3 m"),
         (
             ["evaluate", "front_roof_128", "--set", "cell_m=20"],
-            "region '20m' holds no cell centre; use smaller cells than 20 m",
+            "region '20m' holds no cell center; use smaller cells than 20 m",
         ),
         (["evaluate", "front_roof_128", "--set", "cell_m=1e-310"], "x_m: inf cells of 1e-310 m, over 100,000,000"),
         (["evaluate", "front_roof_128", "--thresholds-m", "inf"], "thresholds"),

@@ -153,7 +153,7 @@ def test_cells_are_those_of_a_search_among_the_borders(x, cell, monkeypatch):
     points = torch.zeros(len(values), 3, dtype=torch.float64)
     points[:, 0] = torch.from_numpy(values)
     for part in (65_536, 1000):
-        monkeypatch.setattr("torchcover.coverage.grid.PART", part)
+        monkeypatch.setattr("torchcover.coverage.grid.CHUNK_POINTS", part)
         np.testing.assert_array_equal(grid.find_cells(points), expected)
 
 
@@ -207,7 +207,7 @@ def test_a_grid_does_not_change_with_its_arguments():
 
 @pytest.mark.parametrize("cell", [0.0, -0.5, math.nan, math.inf])
 def test_a_cell_without_a_length_is_refused(cell):
-    with pytest.raises(ValueError, match=f"cell_m: a positive length in metres is needed; got {cell}"):
+    with pytest.raises(ValueError, match=f"cell_m: a positive length in meters is needed; got {cell}"):
         BevGrid(x_m=(0, 1), y_m=(0, 1), cell_m=cell)
 
 
@@ -217,9 +217,9 @@ def test_a_cell_without_a_length_is_refused(cell):
     [
         ((1.0, 1.0), "the lower bound must be below the upper one; got .1.0, 1.0"),
         ((2.0, -2.0), "the lower bound must be below the upper one"),
-        ((0.0, math.inf), "two finite bounds in metres are needed; got .0.0, inf"),
-        ((math.nan, 1.0), "two finite bounds in metres are needed"),
-        ((0.0, 1.0, 2.0), "two finite bounds in metres are needed"),
+        ((0.0, math.inf), "two finite bounds in meters are needed; got .0.0, inf"),
+        ((math.nan, 1.0), "two finite bounds in meters are needed"),
+        ((0.0, 1.0, 2.0), "two finite bounds in meters are needed"),
         ((0.0, 1.2), "its extent of 1.2 m is not a multiple of the cell of 0.5 m .2.4 cells.; a cell of 0.6 m would"),
         ((0.0, 0.2), "its extent of 0.2 m is not a multiple of the cell of 0.5 m .0.4 cells.; a cell of 0.2 m would"),
         ((0.0, 1e-7), "its extent of 1e-07 m is not a multiple of the cell of 0.5 m .2e-07 cells."),

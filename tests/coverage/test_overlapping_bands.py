@@ -59,7 +59,7 @@ def test_bins_are_the_cells_of_each_band():
 @pytest.mark.parametrize("heights", [BANDS, {"ground": (-0.5, 0.5), "obstacle": (0.5, 2.0)}], ids=["over", "above"])
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_points_by_column_are_those_of_the_bins(heights, dtype, monkeypatch):
-    monkeypatch.setattr("torchcover.coverage.grid.PART", 300)
+    monkeypatch.setattr("torchcover.coverage.grid.CHUNK_POINTS", 300)
     points = torch.randn(1000, 3, generator=torch.Generator().manual_seed(1), dtype=dtype)
     points[:9] = torch.tensor([-2.0, -1.0, 0.05, 0.5, 1.0, 1.1, 2.0, torch.inf, torch.nan])[:, None]
     points[9:18, :2], points[9:18, 2] = 0.25, points[:9, 0]  # on the borders of the bands

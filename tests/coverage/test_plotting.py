@@ -41,15 +41,15 @@ def test_the_map_holds_the_layer_in_its_place_and_the_vehicle_is_at_the_origin()
     np.testing.assert_allclose(values.compressed(), [0.0, math.sqrt(5)], rtol=1e-6)
     assert axes.lines[0].get_xydata().tolist() == [[0.0, 0.0]]
     assert (axes.get_xlim(), axes.get_ylim()) == ((0.0, 8.0), (-1.0, 1.0))
-    assert axes.get_title() == "mean blind spot radius, high, 1 steps (grey: unknown)"
+    assert axes.get_title() == "mean blind spot radius, high, 1 frames (gray: unobserved)"
 
 
 @pytest.mark.parametrize(
     ("options", "title"),
     [
-        ({}, "detection within 0.4 m, low, 1 steps (grey: unknown)"),
-        ({"thresholds_m": ()}, "mean blind spot radius, low, 1 steps (grey: unknown)"),
-        ({"has_area_weights": True}, "detection within 0.4 m, by area, low, 1 steps (grey: unknown)"),
+        ({}, "detection within 0.4 m, low, 1 frames (gray: unobserved)"),
+        ({"thresholds_m": ()}, "mean blind spot radius, low, 1 frames (gray: unobserved)"),
+        ({"has_area_weights": True}, "detection within 0.4 m, by area, low, 1 frames (gray: unobserved)"),
     ],
 )
 def test_detection_of_the_first_band_unless_something_else_is_asked_for(options, title):

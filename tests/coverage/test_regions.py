@@ -78,7 +78,7 @@ def test_a_forward_region_of_no_range_is_refused():
 
 def test_regions_without_a_cell_are_found_before_a_run():
     check_regions([Region("all", x_m=GRID.x_m, y_m=GRID.y_m)], GRID)
-    with pytest.raises(ValueError, match="region 'gap' holds no cell centre; use smaller cells than"):
+    with pytest.raises(ValueError, match="region 'gap' holds no cell center; use smaller cells than"):
         check_regions([Region("gap", x_m=(0.3, 0.7), y_m=(0.0, 1.0))], GRID)
 
 

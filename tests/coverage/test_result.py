@@ -100,7 +100,7 @@ def test_the_regions_of_the_paper_are_given_where_the_grid_holds_them(x, y, name
 def test_a_region_the_grid_cannot_speak_of_is_refused():
     with pytest.raises(ValueError, match="region 'far' spans x = 0 to 30 m, beyond the grid's -1 to 20 m"):
         a_coverage().summary([Region("far", (0.0, 30.0), (-1.0, 1.0))])
-    with pytest.raises(ValueError, match=r"region 'slit' holds no cell centre; use smaller cells than 0\.5 m"):
+    with pytest.raises(ValueError, match=r"region 'slit' holds no cell center; use smaller cells than 0\.5 m"):
         a_coverage().summary([Region("slit", (0.3, 0.7), (-1.0, 1.0))])
 
 
@@ -160,7 +160,7 @@ def test_what_was_not_aggregated_has_no_numbers():
 def test_the_share_of_known_cells_is_in_the_repr():
     grid = BevGrid(x_m=(0.0, 1.0), y_m=(0.0, 1.0), cell_m=0.5, heights={"all": (0.0, 1.0)})
     result = a_coverage(grid=grid, frames=torch.tensor([[[1, 0], [0, 0]]]))
-    assert repr(result) == "Coverage((1, 2, 2) cells, 3 steps, 25.0% of the cells known)"
+    assert repr(result) == "Coverage((1, 2, 2) cells, 3 frames, 25.0% of the cells observed)"
 
 
 # Files

@@ -10,7 +10,7 @@ from scipy import stats
 
 from torchcover.coverage.quantities import RADIUS, make_detection_quantity
 from torchcover.estimation import Estimate
-from torchcover.estimation.errors import BLIND_SIDE, compute_interval95
+from torchcover.estimation.errors import BLIND_SIDE_FACTOR, compute_interval95
 
 BOTH = (RADIUS, make_detection_quantity(0.4))
 
@@ -51,8 +51,8 @@ def test_differences_of_means_over_worlds_are_a_paired_t_test(blocks):
         assert difference.value / difference.error == pytest.approx(test.statistic, rel=1e-9)
         assert difference.p_value == pytest.approx(test.pvalue, rel=1e-9)
         # Of radii the side away from 0 is longer.
-        below = BLIND_SIDE if at == 0 and difference.value < 0 else 1.0
-        above = BLIND_SIDE if at == 0 and difference.value > 0 else 1.0
+        below = BLIND_SIDE_FACTOR if at == 0 and difference.value < 0 else 1.0
+        above = BLIND_SIDE_FACTOR if at == 0 and difference.value > 0 else 1.0
         middle = difference.value
         expected = middle - below * (middle - low), middle + above * (high - middle)
         assert (difference.low, difference.high) == pytest.approx(expected, rel=1e-3)

@@ -8,7 +8,7 @@ from scipy import special, stats
 
 from torchcover.coverage.quantities import RADIUS, make_detection_quantity
 from torchcover.estimation import Quantity, compute_interval95, compute_student_p, compute_student_t95
-from torchcover.estimation.errors import BLIND_SIDE, is_significant
+from torchcover.estimation.errors import BLIND_SIDE_FACTOR, is_significant
 
 SHARE = make_detection_quantity(0.4)
 BLIND = Quantity("blind", "share that is not seen", "share", lower_is_better=True)
@@ -38,7 +38,7 @@ def twin(value, error, freedom, quantity, is_difference):
     """The ends, in SciPy's words."""
     t = error * stats.t.ppf(0.975, freedom) * np.array([-1.0, 1.0])
     if quantity.unit == "m":
-        t[int(value > 0) if is_difference else int(quantity.lower_is_better)] *= BLIND_SIDE
+        t[int(value > 0) if is_difference else int(quantity.lower_is_better)] *= BLIND_SIDE_FACTOR
     if is_difference or quantity.unit not in ("m", "share"):
         return value + t
     if quantity.unit == "m":

@@ -90,7 +90,7 @@ def test_files_keep_them_and_compare_reads_them(both, tmp_path):
     assert [one.band for one in both.page.maps].count("pole_100cm") == 2
     without = evaluate(RIGS[1], yard("yard"), **{**SMALL, "num_frames": 1, "test_targets": "none"})
     assert of_bodies(without) == []
-    with pytest.raises(ValueError, match="other bodies were put beside them"):
+    with pytest.raises(ValueError, match="they were measured with different test targets"):
         _ = compare([both, without]).table
 
 
@@ -110,7 +110,7 @@ def test_a_mixture_is_the_weighted_mean(both):
         assert row["target_positions_5_points"] == pytest.approx(value)
         assert row["observed_cells"] == first["observed_cells"] + second["observed_cells"]
     without = evaluate(RIGS, yard("other"), **{**SMALL, "num_frames": 1, "test_targets": "none"})
-    with pytest.raises(ValueError, match="other bodies"):
+    with pytest.raises(ValueError, match="differ in their test targets"):
         _ = MixedResult.from_results({"yard": both, "road_user": without}, {"yard": 0.75, "road_user": 0.25})
 
 

@@ -56,7 +56,7 @@ def test_the_page_has_what_was_asked_for(result):
     page = result.page
     assert [line.name for line in page.outlines] == [region.name for region in result.regions]
     quantities = dict.fromkeys(one.quantity for one in page.maps)
-    assert "sensors that see within 0.4 m" in quantities
+    assert "sensors that detect within 0.4 m" in quantities
     assert "mean blind spot radius, without roof" in quantities
     assert {one.rig for one in page.maps} == set(result.coverages)
 

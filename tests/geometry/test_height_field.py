@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from torchcover.geometry.height_field import VERGE_SHARE, HeightField, accumulate_heights, fit_height_field
+from torchcover.geometry.height_field import VERGE_WEIGHT, HeightField, accumulate_heights, fit_height_field
 
 RANDOM = np.random.default_rng(5)
 
@@ -52,7 +52,7 @@ def test_a_place_is_shared_by_the_corners_around_it():
             share = max(0.0, 1 - abs(x - column)) * max(0.0, 1 - abs(y - row)) * weight
             for at_row, at_column in np.ndindex(rows, columns):
                 apart = max(abs(at_row - row), abs(at_column - column))
-                part = share * ((apart == 0) + VERGE_SHARE * (apart <= 1))
+                part = share * ((apart == 0) + VERGE_WEIGHT * (apart <= 1))
                 expected[:, at_row, at_column] += part * height_m, part
     assert np.array(accumulate_heights(cells, heights_m, rows, columns, weights)) == pytest.approx(expected, abs=1e-12)
 

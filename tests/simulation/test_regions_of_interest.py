@@ -74,7 +74,7 @@ def test_a_region_within_the_vehicle_is_warned_of():
 
 
 def test_a_region_between_the_centres_of_cells_is_refused():
-    with pytest.raises(ValueError, match=r"region 'thin' holds no cell centre; use smaller cells than 0.25 m"):
+    with pytest.raises(ValueError, match=r"region 'thin' holds no cell center; use smaller cells than 0.25 m"):
         RegionsOfInterest(regions={"thin": rectangle((0.0, 0.1), (0.0, 1.0))}).build_query_plan(ROBOT_M)
 
 

@@ -119,7 +119,9 @@ def contacts():
         for other_kmh in (0.0, *SPEEDS_KMH):
             other = {"body": {"type": "box", "size_m": OTHER_M}, "speed_kmh": other_kmh}
             staged = StagedEncounter(
-                Encounter.model_validate({"name": "e", "ego": {"speed_kmh": ego_kmh}, "road_user": other, "max_lead_time_s": 2.0}),
+                Encounter.model_validate(
+                    {"name": "e", "ego": {"speed_kmh": ego_kmh}, "road_user": other, "max_lead_time_s": 2.0}
+                ),
                 ego,
             )
             # The other heads along y: its width is before the ego's front, its length beside its sides.

@@ -14,8 +14,6 @@ from .grid import BevGrid as BevGrid
 from .metric import CoverageMetric as CoverageMetric
 from .mixture import CoverageMixture as CoverageMixture
 from .number_metric import CoverageNumberMetric as CoverageNumberMetric
-from .paired import OF_BODIES as OF_BODIES
-from .paired import PARTS as PARTS
 from .paired import check_paired as check_paired
 from .paired import compute_differences as compute_differences
 from .redundancy import Redundancy as Redundancy

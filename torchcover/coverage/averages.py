@@ -1,4 +1,4 @@
-"""The numbers of one region, over its visible surface or over its known cells; and the errors of maps."""
+"""Averages over regions, by area or over observed cells, and standard errors of maps."""
 
 import math
 from collections.abc import Sequence
@@ -10,112 +10,165 @@ from torch import Tensor
 
 from torchcover.coverage.regions import Region
 from torchcover.coverage.sparse_sums import BlockSums, ObservedCells
-from torchcover.estimation import MIN_BLOCKS_OF_A_CELL, Estimate, Quantity, estimate_ratio_errors
+from torchcover.estimation import MIN_BLOCKS, Estimate, Quantity, estimate_ratio_errors
 
 if TYPE_CHECKING:
     from torchcover.coverage.result import Coverage
 
-# What the number of a region is a mean over: its visible surface, its known cells, or places of a body.
+# The number of a region averages its visible surface, its observed cells, or the positions of a test target.
 Average = Literal["area", "cells", "target_positions"]
 
 
 def estimate_cell_average(coverage: "Coverage", region: Region, band: str) -> Estimate:
-    """Unweighted means over the known cells of a region, NaN without any, and what they become without each block."""
-    cells, band_index, blocks = coverage.get_cell_mask(region), coverage.get_band_index(band), coverage.block_sums
-    known = coverage.observed_cells.mask_cells(cells, band_index)
-    probed = coverage.observed_cells.observed_frames[known]
-    sums = probed * torch.stack([coverage.sparse_layers[one.key].values[known] for one in coverage.quantities])
-    whole = compute_cell_average(probed, sums)
+    """Estimate the unweighted mean over the observed cells of a region (the average of the paper).
+
+    Args:
+        coverage: Result with maps, and with sums in blocks for errors.
+        region: Region within the grid.
+        band: Name of the height band.
+
+    Returns:
+        Radius and detection rates; NaN without observed cells.
+    """
+    cell_mask, band_index = coverage.get_cell_mask(region), coverage.get_band_index(band)
+    observed = coverage.observed_cells.mask_cells(cell_mask, band_index)
+    frame_counts = coverage.observed_cells.observed_frames[observed]
+    layers = [coverage.sparse_layers[quantity.key].values[observed] for quantity in coverage.quantities]
+    sums = frame_counts * torch.stack(layers)
+    value = compute_cell_average(frame_counts, sums)
+    blocks = coverage.block_sums
     if blocks is None:
-        return Estimate.from_values(coverage.quantities, whole)
-    used = blocks.frame_counts.nonzero().flatten().tolist()
-    own_probed, own_sums = blocks.extract_cells(cells, band_index)
-    left_out = [compute_cell_average(probed - own_probed[block], sums - own_sums[:, block]) for block in used]
-    without = torch.stack(left_out) if left_out else whole[None][:0]
-    return Estimate(
-        coverage.quantities, whole, without, blocks.frame_counts[used], partial(_known_again, blocks, band_index, cells)
-    )
+        return Estimate.from_values(coverage.quantities, value)
+    used_blocks = blocks.frame_counts.nonzero().flatten().tolist()
+    block_frame_counts, block_sums = blocks.extract_cells(cell_mask, band_index)
+    jackknife_values = [value.new_empty((0, len(value)))]
+    for block in used_blocks:
+        value_without = compute_cell_average(frame_counts - block_frame_counts[block], sums - block_sums[:, block])
+        jackknife_values.append(value_without[None])
+    recompute = partial(_recompute_cell_average, blocks, band_index, cell_mask)
+    used_frame_counts = blocks.frame_counts[used_blocks]
+    return Estimate(coverage.quantities, value, torch.cat(jackknife_values), used_frame_counts, recompute)
 
 
 def estimate_area_average(coverage: "Coverage", region: Region, band: str) -> Estimate:
-    """The ratios of `sum_area_by_block`; NaN where no square metre was seen."""
-    steps, sums = sum_area_by_block(coverage, region, band)
-    return Estimate.from_ratios(coverage.quantities, sums[:, 0], sums[:, 1:], steps)
+    """Estimate the mean over the visible surface of a region from the sums of `sum_area_by_block`.
+
+    Args:
+        coverage: Result with area weights.
+        region: As in `sum_area_by_block`.
+        band: Name of the height band.
+
+    Returns:
+        Radius and detection rates; NaN without visible surface.
+    """
+    frame_counts, sums = sum_area_by_block(coverage, region, band)
+    return Estimate.from_ratios(coverage.quantities, sums[:, 0], sums[:, 1:], frame_counts)
 
 
 def sum_area_by_block(coverage: "Coverage", region: Region, band: str) -> tuple[Tensor, Tensor]:
-    """The sums over the visible surface of one region in one band, in blocks.
+    """Sum over the visible surface of a region in each block of frames.
 
-    R = E[ sum of r dA ] / E[ sum of dA ]: a ratio of additive sums, so that the number of points, the size of cells and
-    the share of known ones do not move it. Points were summed up by their own place, or the region's bounds are edges
-    of cells, which have the same points.
+    R = E[ sum of r dA ] / E[ sum of dA ] is a ratio of additive sums, which does not depend on the number of points, the
+    cell size or the share of observed cells. Either the metric assigned the points to the region by their position, or
+    the bounds of the region are cell edges, so that its cells contain the same points.
 
-    Returns (B,) int64 steps of each block; (B, 1 + Q) float64 its square metres, then those times each of the
-    quantities.
+    Args:
+        coverage: Result with area weights.
+        region: Region of the result, or one whose bounds are cell edges.
+        band: Name of the height band.
+
+    Returns:
+        (B,) int64 frames of each block, and (B, 1 + Q) float64 area in square meters and each quantity times area.
+
+    Raises:
+        ValueError: The reference points have no area weights, or the region has other bounds than cells.
     """
     if coverage.area_sums is None:
         raise ValueError(
-            "no estimate by area: the reference points had no square metres; take them from a SurfaceReference and "
-            "give the metric square_metres=True"
+            "no average over area: the reference points have no area weights; take them from a SurfaceReference and "
+            "set has_area_weights=True"
         )
-    place, places = coverage.find_region_band(region, band), coverage.region_sums
-    if places is not None and place is not None:
-        own = places.sums[:, : len(coverage.quantities), place]
-        return places.frame_counts, torch.cat([places.areas_m2[:, place, None], own], dim=1)
+    region_band_index, region_sums = coverage.find_region_band(region, band), coverage.region_sums
+    if region_sums is not None and region_band_index is not None:
+        sums = region_sums.sums[:, : len(coverage.quantities), region_band_index]
+        return region_sums.frame_counts, torch.cat([region_sums.areas_m2[:, region_band_index, None], sums], dim=1)
     if not region.has_whole_cells(coverage.grid):
         raise ValueError(
-            f"region {region.name!r}: no points were summed up over it, and cells of {coverage.grid.cell_m:g} m cannot "
-            "tell, for its edges are not theirs; ask for it when measuring, or move its edges"
+            f"region {region.name!r}: its points were not summed, and its bounds are not edges of the cells of "
+            f"{coverage.grid.cell_m:g} m; give the region to the metric, or move its bounds to cell edges"
         )
-    return coverage.area_sums.frame_counts, coverage.area_sums.sum_cells(
-        coverage.get_cell_mask(region), coverage.get_band_index(band)
-    )
+    cell_mask, band_index = coverage.get_cell_mask(region), coverage.get_band_index(band)
+    return coverage.area_sums.frame_counts, coverage.area_sums.sum_cells(cell_mask, band_index)
 
 
 def estimate_redundancy(coverage: "Coverage", region: Region, band: str) -> Estimate:
-    """The numbers of a region with all sensors, then those of `list_redundancy_quantities`.
+    """Estimate the numbers of a region with all sensors, followed by those of `list_redundancy_quantities`.
 
-    By area they are unknown where the metric was not told of the region. Over known cells they have no errors.
+    Args:
+        coverage: Result of a metric with `sensor_names`.
+        region: Region within the grid.
+        band: Name of the height band.
+
+    Returns:
+        By area, numbers are NaN for regions that the metric did not sum. Over cells, numbers have no errors.
     """
     assert coverage.redundancy is not None
     layers = coverage.redundancy.sparse_layers.values()
     quantities = (*coverage.quantities, *(layer.quantity for layer in layers))
-    place = coverage.find_region_band(region, band)
-    if coverage.region_sums is not None and place is not None:
-        return coverage.region_sums.estimate(quantities, place)
+    region_band_index = coverage.find_region_band(region, band)
+    if coverage.region_sums is not None and region_band_index is not None:
+        return coverage.region_sums.estimate(quantities, region_band_index)
     if coverage.average == "area":
-        return Estimate.from_values(
-            quantities, torch.full((len(quantities),), math.nan, dtype=torch.float64, device="cpu")
-        )
-    known = coverage.mask_observed_cells(region, band)
-    own = torch.stack([layer.values[known].mean() for layer in layers])
-    return Estimate.from_values(quantities, torch.cat([coverage.estimate(region, band).value, own]))
+        unknown = torch.full((len(quantities),), math.nan, dtype=torch.float64, device="cpu")
+        return Estimate.from_values(quantities, unknown)
+    observed = coverage.mask_observed_cells(region, band)
+    means = torch.stack([layer.values[observed].mean() for layer in layers])
+    return Estimate.from_values(quantities, torch.cat([coverage.estimate(region, band).value, means]))
 
 
 def estimate_cell_errors(
     quantities: Sequence[Quantity], observed_cells: ObservedCells, block_sums: BlockSums
 ) -> dict[str, Tensor]:
-    """Key of each quantity -> (K,) standard errors in the known cells; NaN where too few blocks probed."""
-    cells, base, sums = block_sums.extract_common_cells(MIN_BLOCKS_OF_A_CELL)
-    where, errors = torch.searchsorted(observed_cells.cell_indices, cells), {}
-    for quantity, own in zip(quantities, sums, strict=True):
-        errors[quantity.key] = sums.new_full((len(observed_cells.cell_indices),), math.nan)
-        errors[quantity.key][where] = estimate_ratio_errors(base, own, quantity.unit)
+    """Estimate the standard errors of maps.
+
+    Args:
+        quantities: Q quantities of the sums.
+        observed_cells: K observed cells.
+        block_sums: Sums over these cells in blocks.
+
+    Returns:
+        (K,) standard errors by the key of each quantity; NaN where fewer than 8 blocks observed the cell.
+    """
+    cells, denominators, sums = block_sums.extract_common_cells(MIN_BLOCKS)
+    positions = torch.searchsorted(observed_cells.cell_indices, cells)
+    errors = {}
+    for quantity, numerators in zip(quantities, sums, strict=True):
+        values = sums.new_full((len(observed_cells.cell_indices),), math.nan)
+        values[positions] = estimate_ratio_errors(denominators, numerators, quantity.unit)
+        errors[quantity.key] = values
     return errors
 
 
 def compute_cell_average(frame_counts: Tensor, sums: Tensor) -> Tensor:
-    """(Q,) unweighted means over K known cells of sums (Q, K) over the (K,) steps that probed them; NaN without any."""
-    known = frame_counts > 0
-    return (sums[:, known] / frame_counts[known]).mean(dim=1)
+    """Compute the unweighted mean over observed cells.
+
+    Args:
+        frame_counts: (K,) frames that observed each cell; cells with 0 do not count.
+        sums: (Q, K) sums over these frames.
+
+    Returns:
+        (Q,) means; NaN without observed cells.
+    """
+    observed = frame_counts > 0
+    return (sums[:, observed] / frame_counts[observed]).mean(dim=1)
 
 
-def _known_again(blocks: BlockSums, band: int, cells: Tensor, weights: Tensor) -> Tensor:
-    """(R, Q) the same if the blocks in use come as often as (R, g) they are weighted."""
-    used = blocks.frame_counts > 0
-    # Not kept with the estimate: for all regions it is as large as the sums of the run.
-    probed, sums = blocks.extract_cells(cells, band)
-    steps = weights @ probed[used].double()
-    known = steps > 0
-    means = (weights @ sums[:, used]) / steps.where(known, 1.0)
-    return (means.sum(dim=2) / known.sum(dim=1)).T
+def _recompute_cell_average(blocks: BlockSums, band_index: int, cell_mask: Tensor, weights: Tensor) -> Tensor:
+    """Recompute the (R, Q) means for (R, g) weights of the used blocks."""
+    used_blocks = blocks.frame_counts > 0
+    # Extracted on each call, since for all regions together it would be as large as the sums of the run.
+    block_frame_counts, block_sums = blocks.extract_cells(cell_mask, band_index)
+    frame_counts = weights @ block_frame_counts[used_blocks].double()
+    observed = frame_counts > 0
+    means = (weights @ block_sums[:, used_blocks]) / frame_counts.where(observed, 1.0)
+    return (means.sum(dim=2) / observed.sum(dim=1)).T

@@ -1,4 +1,4 @@
-"""The bird's-eye-view grid: which cell a point belongs to. Bins are half-open, [lo, hi), on every axis."""
+"""Bird's-eye-view grid of square cells in height bands; cells and bands are half-open, [lo, hi), on every axis."""
 
 import math
 from collections.abc import Iterator, Mapping
@@ -12,29 +12,27 @@ from torch import Tensor
 from torchcover.coverage.binning import count_borders_below, count_edges_below, pad_ends
 from torchcover.devices import run_with_float64
 
-# What heights are measured from: the local ground, or z = 0 of the vehicle frame, which pitches and rolls.
+# Heights are measured above the local ground, or from z = 0 of the vehicle frame, which pitches and rolls.
 BandFrame = Literal["ground", "vehicle"]
 
 # Height bands of Uecker & Zöllner 2024.
 PAPER_HEIGHTS: Mapping[str, tuple[float, float]] = MappingProxyType({"ground": (-0.5, 0.5), "obstacle": (0.5, 2.0)})
 
-# The extents of a grid are written in decimals; a multiple of the cell is one up to their rounding.
-MULTIPLE_TOLERANCE = 1e-6  # of the extent,
-MULTIPLE_TOLERANCE_CELLS = 1e-3  # and never more than this share of a cell
-# An int64 count and three float64 sums for every cell: 3 GB.
+# An int64 count and three float64 sums for every cell take 3 GB.
 MAX_CELLS = 100_000_000
-
-# Points that are looked at together on a CPU.
-PART = 32_768
-# A sum with it is negative, whatever the other terms.
+# Points processed at once on a CPU, so that all intermediate arrays stay in its cache.
+CHUNK_POINTS = 32_768
+# Term of a cell index that makes the sum negative, whatever the other terms are.
 OUTSIDE = -(2**40)
 
 
 class CellAssignment(NamedTuple):
-    """Where points are in a grid.
+    """Cells that contain points, as K pairs of a point and a cell.
 
-    `point_indices` (M,) int64 numbers of the points that are in any cell, ascending. For each of K pairs of a point and a cell
-    that it is in: `point_positions` (K,) which of these points, `cell_indices` (K,) int64 the number of the cell.
+    Args:
+        point_indices: (M,) int64 indices of the points that are in any cell, ascending.
+        point_positions: (K,) int64 position of the point of each pair in `point_indices`.
+        cell_indices: (K,) int64 index of the cell of each pair.
     """
 
     point_indices: Tensor
@@ -44,22 +42,22 @@ class CellAssignment(NamedTuple):
 
 @dataclass(frozen=True)
 class BevGrid:
-    """Square cells over x and y in the vehicle frame, in height bands over the ground or over its z.
+    """Square cells over x and y in the vehicle frame, in height bands above ground or over z of the vehicle frame.
 
-    A cell's number is `(h * Y + y) * X + x`; arrays over the grid have the shape (H, Y, X).
+    The index of a cell is `(h * Y + y) * X + x`; arrays over the grid have the shape (H, Y, X).
 
     Args:
-        x_m: Lower and upper bound forward, in metres.
-        y_m: Lower and upper bound to the left, in metres.
-        cell_m: Side of a cell in metres. The extents must be multiples of it.
-        heights: Name of each height band -> lower and upper bound in metres. Bands may overlap, and leave gaps. The
-            default is the paper's: ground [-0.5, 0.5) and obstacle [0.5, 2.0).
-        band_frame: What these are bounds of: "vehicle", z of the vehicle frame, or "ground", the height above the local
-            ground, which every point is then to come with.
+        x_m: Lower and upper bound along x (forward) in meters.
+        y_m: Lower and upper bound along y (left) in meters.
+        cell_m: Side length of a cell in meters. The extents must be multiples of it.
+        heights: Lower and upper bound in meters by name of the height band. Bands may overlap and leave gaps. The
+            default is that of the paper: ground [-0.5, 0.5) and obstacle [0.5, 2.0).
+        band_frame: Zero of these bounds: "vehicle" for z of the vehicle frame, or "ground" for the height above the
+            local ground, which is then required for every point.
 
     Raises:
-        ValueError: Inverted or infinite bounds, a cell that is not positive, an extent that is not a multiple of the
-            cell_m, no band, another band frame, or more than 1e8 cells.
+        ValueError: Bounds are inverted or infinite, `cell_m` is not positive, an extent is not a multiple of `cell_m`,
+            there is no band, the band frame does not exist, or there are more than 1e8 cells.
 
     Example:
         >>> grid = BevGrid(x_m=(0.0, 20.0), y_m=(-5.0, 5.0), cell_m=0.5)
@@ -77,7 +75,7 @@ class BevGrid:
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.cell_m) and self.cell_m > 0):
-            raise ValueError(f"cell_m: a positive length in metres is needed; got {self.cell_m}")
+            raise ValueError(f"cell_m: a positive length in meters is needed; got {self.cell_m}")
         for axis, bounds in (("x_m", self.x_m), ("y_m", self.y_m)):
             _check_bounds(axis, bounds)
             _check_multiple(axis, bounds, self.cell_m)
@@ -89,13 +87,14 @@ class BevGrid:
             raise ValueError(f"band_frame: ground or vehicle is needed; got {self.band_frame!r}")
         if math.prod(self.shape) > MAX_CELLS:
             raise ValueError(f"the grid has {math.prod(self.shape):,} cells, over {MAX_CELLS:,}: use larger cells")
-        # Plain floats in copies: lists, whole numbers and a dict that its owner changes later make no difference.
+        # Copies with plain floats, so that lists, integers and later changes of the dict do not affect equality.
+        object.__setattr__(self, "x_m", (float(self.x_m[0]), float(self.x_m[1])))
+        object.__setattr__(self, "y_m", (float(self.y_m[0]), float(self.y_m[1])))
+        object.__setattr__(self, "cell_m", float(self.cell_m))
         heights = {name: (float(low), float(high)) for name, (low, high) in self.heights.items()}
-        own = {"x_m": tuple(map(float, self.x_m)), "y_m": tuple(map(float, self.y_m)), "cell_m": float(self.cell_m)}
-        for name, value in {**own, "heights": heights}.items():
-            object.__setattr__(self, name, value)
+        object.__setattr__(self, "heights", heights)
 
-    # The order of the bands is part of a cell's number; equal dicts may differ in it.
+    # The order of the bands determines cell indices, but equal dicts may differ in it.
     def __eq__(self, other: object) -> bool:
         return isinstance(other, BevGrid) and self._key == other._key
 
@@ -108,8 +107,8 @@ class BevGrid:
 
     @property
     def shape(self) -> tuple[int, int, int]:
-        """Number of bands, cells along y, cells along x: (H, Y, X)."""
-        return len(self.heights), _count(self.y_m, self.cell_m), _count(self.x_m, self.cell_m)
+        """Number of bands, cells along y and cells along x: (H, Y, X)."""
+        return len(self.heights), _count_cells(self.y_m, self.cell_m), _count_cells(self.x_m, self.cell_m)
 
     @property
     def num_cells(self) -> int:
@@ -118,55 +117,59 @@ class BevGrid:
 
     @property
     def diagonal_m(self) -> float:
-        """Longest distance between two points of the grid, heights included, in metres."""
+        """Longest distance between two points of the grid, heights included, in meters."""
         lowest = min(low for low, _ in self.heights.values())
         highest = max(high for _, high in self.heights.values())
         return math.hypot(self.x_m[1] - self.x_m[0], self.y_m[1] - self.y_m[0], highest - lowest)
 
     @property
     def x_edges_m(self) -> Tensor:
-        """(X + 1,) float64 cell borders along x."""
-        return _edges(self.x_m, self.cell_m)
+        """(X + 1,) float64 cell edges along x."""
+        return _compute_edges(self.x_m, self.cell_m)
 
     @property
     def y_edges_m(self) -> Tensor:
-        """(Y + 1,) float64 cell borders along y."""
-        return _edges(self.y_m, self.cell_m)
+        """(Y + 1,) float64 cell edges along y."""
+        return _compute_edges(self.y_m, self.cell_m)
 
     @property
     def x_centers_m(self) -> Tensor:
-        """(X,) float64 cell centres along x."""
-        return _centres(self.x_m, self.cell_m)
+        """(X,) float64 cell centers along x."""
+        return _compute_centers(self.x_m, self.cell_m)
 
     @property
     def y_centers_m(self) -> Tensor:
-        """(Y,) float64 cell centres along y."""
-        return _centres(self.y_m, self.cell_m)
+        """(Y,) float64 cell centers along y."""
+        return _compute_centers(self.y_m, self.cell_m)
 
     def find_cells(self, points: Tensor, heights_m: Tensor | None = None) -> Tensor:
-        """Number of the cell of each point, in a grid whose bands do not overlap.
+        """Find the cell of each point, in a grid whose bands do not overlap.
 
         Args:
-            points: (N, 3) coordinates in metres, any floating-point type.
-            heights_m: (N,) metres above the local ground, of a grid whose band frame it is, and of no other; NaN, where
-                there is no ground at or below a point, is in no band.
+            points: (N, 3) coordinates in meters, any floating-point type.
+            heights_m: (N,) height above the local ground in meters; required if `band_frame` is "ground", refused
+                otherwise. A point with NaN, without ground at or below it, is in no band.
 
         Returns:
-            (N,) int64 cell numbers; -1 for a point outside every cell or band.
+            (N,) int64 cell indices; -1 for a point outside every cell or band.
 
         Raises:
-            ValueError: Another shape, heights that are missing or of no use, or bands that overlap, so that a point has
-                several cells: see `bins`.
+            ValueError: Another shape, heights that are missing or not used, or bands that overlap, so that a point may
+                be in several cells: see `assign_cells`.
         """
-        if len(self._tiers) > 1:
-            raise ValueError("the height bands overlap, so that a point may be in several cells: use `bins`")
-        return self._cells_of(points, heights_m)[0]
+        if len(self._group_disjoint_bands()) > 1:
+            raise ValueError("the height bands overlap, so that a point may be in several cells: use `assign_cells`")
+        return self._compute_cell_indices(points, heights_m)[0]
 
     def assign_cells(self, points: Tensor, heights_m: Tensor | None = None) -> CellAssignment:
-        """The cells that points are in, several where bands overlap; it takes what `find_cells` takes.
+        """Find all cells of each point, several where bands overlap.
+
+        Args:
+            points: As in `find_cells`.
+            heights_m: As in `find_cells`.
 
         Raises:
-            ValueError: Another shape, heights that are missing or of no use.
+            ValueError: Another shape, heights that are missing or not used.
 
         Example:
             >>> bands = {"dog": (0.05, 0.5), "child": (0.1, 1.1)}
@@ -174,102 +177,114 @@ class BevGrid:
             >>> grid.assign_cells(torch.tensor([[0.5, 0.5, 0.0], [0.5, 0.5, 0.3], [1.5, 0.5, 0.9]]))
             CellAssignment(point_indices=tensor([1, 2]), point_positions=tensor([0, 0, 1]), cell_indices=tensor([0, 2, 3]))
         """
-        cells = self._cells_of(points, heights_m)
-        within = cells >= 0
-        inside = within.any(dim=0).nonzero().squeeze(1)
+        cells = self._compute_cell_indices(points, heights_m)
+        is_in_cell = cells >= 0
+        point_indices = is_in_cell.any(dim=0).nonzero().squeeze(1)
         if len(cells) == 1:
-            return CellAssignment(inside, torch.arange(len(inside), device=inside.device), cells[0, inside])
-        tier, of = within[:, inside].nonzero(as_tuple=True)
-        return CellAssignment(inside, of, cells[tier, inside[of]])
+            positions = torch.arange(len(point_indices), device=point_indices.device)
+            return CellAssignment(point_indices, positions, cells[0, point_indices])
+        groups, positions = is_in_cell[:, point_indices].nonzero(as_tuple=True)
+        return CellAssignment(point_indices, positions, cells[groups, point_indices[positions]])
 
     @run_with_float64
     def count_points_by_column(self, points: Tensor, heights_m: Tensor | None = None) -> Tensor:
-        """(Y, X) float64: how many points lie above each square of ground in each band, as by counting `bins`, sooner.
+        """Count the points above each ground square, once per band; faster than counting `assign_cells`.
+
+        Args:
+            points: As in `find_cells`.
+            heights_m: As in `find_cells`.
+
+        Returns:
+            (Y, X) float64 counts.
 
         Raises:
-            ValueError: Another shape, heights that are missing or of no use.
+            ValueError: Another shape, heights that are missing or not used.
 
         Example:
             >>> grid = BevGrid(x_m=(0.0, 2.0), y_m=(0.0, 1.0), cell_m=1.0)
             >>> grid.count_points_by_column(torch.tensor([[0.5, 0.5, 0.0], [0.5, 0.5, 0.9], [1.5, 0.5, 9.0]]))
             tensor([[2., 0.]], dtype=torch.float64)
         """
-        parts = self._parts_of(points, heights_m)
-        _, rows, columns = (count + 2 for count in self.shape)  # with a border for what is beyond
-        x_bounds, y_bounds = self._bounds_on(points.device)
+        chunks = self._split_coordinates(points, heights_m)
+        _, y_count, x_count = self.shape
+        rows, columns = y_count + 2, x_count + 2  # with a border for points outside
+        x_bounds, y_bounds = self._get_padded_edges(points.device)
         count = torch.zeros(rows * columns, dtype=torch.float64, device=points.device)
-        for x, y, z in parts:
-            place = (
-                count_edges_below(y, y_bounds, *self.y_m).mul_(columns).add_(count_edges_below(x, x_bounds, *self.x_m))
-            )
-            bands = torch.zeros_like(z)
+        for x, y, height in chunks:
+            row = count_edges_below(y, y_bounds, *self.y_m)
+            square = row.mul_(columns).add_(count_edges_below(x, x_bounds, *self.x_m))
+            band_count = torch.zeros_like(height)
             for low, high in self.heights.values():
-                bands += (z >= low) & (z < high)
-            count += torch.bincount(place, weights=bands, minlength=len(count))
+                band_count += (height >= low) & (height < high)
+            count += torch.bincount(square, weights=band_count, minlength=len(count))
         return count.view(rows, columns)[1:-1, 1:-1]
 
-    @property
-    def _tiers(self) -> list[list[int]]:
-        """The numbers of the bands, from below, shared out so that those of a tier do not overlap."""
-        bounds, tiers = list(self.heights.values()), list[list[int]]()
+    def _group_disjoint_bands(self) -> list[list[int]]:
+        """Group the band indices, from below, so that the bands of a group do not overlap."""
+        bounds = list(self.heights.values())
+        groups: list[list[int]] = []
         for band in sorted(range(len(bounds)), key=bounds.__getitem__):
-            free = [tier for tier in tiers if bounds[tier[-1]][1] <= bounds[band][0]]
-            if free:
-                free[0].append(band)
+            for group in groups:
+                if bounds[group[-1]][1] <= bounds[band][0]:
+                    group.append(band)
+                    break
             else:
-                tiers.append([band])
-        return tiers
+                groups.append([band])
+        return groups
 
     @run_with_float64
-    def _cells_of(self, points: Tensor, height: Tensor | None) -> Tensor:
-        """(tiers, N) int64 cell numbers, -1 for none."""
-        parts = self._parts_of(points, height)
+    def _compute_cell_indices(self, points: Tensor, heights_m: Tensor | None) -> Tensor:
+        """Compute the (groups of disjoint bands, N) int64 cell indices, -1 outside."""
+        chunks = self._split_coordinates(points, heights_m)
         _, rows, columns = self.shape
-        x_bounds, y_bounds = self._bounds_on(points.device)
-        steps = torch.arange(columns, device="cpu"), torch.arange(rows, device="cpu") * columns
-        x_terms, y_terms = (pad_ends(terms, OUTSIDE).to(points.device) for terms in steps)
-        # Between the borders of the bands of a tier lie, in turn, a band and a gap (which may be empty).
-        bounds, tiers = list(self.heights.values()), []
-        for bands in self._tiers:
-            terms = torch.tensor(
-                [term for band in bands for term in (band * rows * columns, OUTSIDE)][:-1], device="cpu"
-            )
-            borders = [border for band in bands for border in bounds[band]]
-            tiers.append((borders, pad_ends(terms, OUTSIDE).to(points.device)))
+        x_bounds, y_bounds = self._get_padded_edges(points.device)
+        x_terms = pad_ends(torch.arange(columns, device="cpu"), OUTSIDE).to(points.device)
+        y_terms = pad_ends(torch.arange(rows, device="cpu") * columns, OUTSIDE).to(points.device)
+        # Between the borders of the bands of a group lie, in turn, a band and a gap (which may be empty).
+        bounds = list(self.heights.values())
+        band_groups = []
+        for group in self._group_disjoint_bands():
+            borders: list[float] = []
+            terms: list[int] = []
+            for band in group:
+                borders += bounds[band]
+                terms += [band * rows * columns, OUTSIDE]
+            band_terms = torch.tensor(terms[:-1], device="cpu")
+            band_groups.append((borders, pad_ends(band_terms, OUTSIDE).to(points.device)))
+        cells = []
+        for x, y, height in chunks:
+            square = x_terms.index_select(0, count_edges_below(x, x_bounds, *self.x_m))
+            square += y_terms.index_select(0, count_edges_below(y, y_bounds, *self.y_m))
+            group_cells = []
+            for borders, band_terms in band_groups:
+                group_cells.append(square + band_terms.index_select(0, count_borders_below(height, borders)))
+            cells.append(torch.stack(group_cells).clamp_(min=-1))
+        return torch.cat(cells, dim=1)
 
-        def cells_of(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
-            place = x_terms.index_select(0, count_edges_below(x, x_bounds, *self.x_m))
-            place += y_terms.index_select(0, count_edges_below(y, y_bounds, *self.y_m))
-            in_tiers = [place + z_terms.index_select(0, count_borders_below(z, borders)) for borders, z_terms in tiers]
-            return torch.stack(in_tiers).clamp_(min=-1)
+    def _get_padded_edges(self, device: torch.device) -> tuple[Tensor, Tensor]:
+        """Return the edges along x and y in the form that `count_edges_below` takes."""
+        return pad_ends(self.x_edges_m, math.nan).to(device), pad_ends(self.y_edges_m, math.nan).to(device)
 
-        return torch.cat([cells_of(*part) for part in parts], dim=1)
-
-    def _bounds_on(self, device: torch.device) -> tuple[Tensor, Tensor]:
-        """The borders along x and along y as `count_edges_below` takes them."""
-        x, y = (pad_ends(edges, math.nan).to(device) for edges in (self.x_edges_m, self.y_edges_m))
-        return x, y
-
-    def _parts_of(self, points: Tensor, height: Tensor | None) -> Iterator[tuple[Tensor, ...]]:
-        """Float64 x, y and what bands are of, in parts that stay in the processor's cache; a GPU takes all at once."""
+    def _split_coordinates(self, points: Tensor, heights_m: Tensor | None) -> Iterator[tuple[Tensor, ...]]:
+        """Yield float64 x, y and height in chunks; heights default to z."""
         if points.ndim != 2 or points.shape[1] != 3:
             raise ValueError(f"points: shape (N, 3) is needed; got {tuple(points.shape)}")
-        self.check_heights(points, height)
-        each = (points[:, 0], points[:, 1], points[:, 2] if height is None else height.to(points.device))
-        size = PART if points.device.type == "cpu" else max(len(points), 1)
-        parts = zip(*(torch.split(values.detach(), size) for values in each), strict=True)
-        return (tuple(values.double() for values in part) for part in parts)
+        self.check_heights(points, heights_m)
+        height = points[:, 2] if heights_m is None else heights_m.to(points.device)
+        chunk_size = CHUNK_POINTS if points.device.type == "cpu" else max(len(points), 1)
+        axes = [torch.split(values.detach(), chunk_size) for values in (points[:, 0], points[:, 1], height)]
+        return (tuple(values.double() for values in chunk) for chunk in zip(*axes, strict=True))
 
     def check_heights(self, points: Tensor, heights_m: Tensor | None, name: str = "heights_m") -> None:
-        """Refuse heights that do not go with the bands.
+        """Check that heights above ground are given if and only if the bands need them.
 
         Args:
             points: (N, 3) points.
-            heights_m: Their heights above the local ground, if there are any.
-            name: What messages call them.
+            heights_m: (N,) height of each point above the local ground in meters, or None.
+            name: Name of the heights in messages.
 
         Raises:
-            ValueError: None where bands are over the ground, any where they are over z; other than one for each point.
+            ValueError: Heights are missing for bands above ground, given for bands over z, or of another shape.
         """
         if heights_m is None:
             if self.band_frame == "ground" and len(points):
@@ -277,50 +292,52 @@ class BevGrid:
         elif self.band_frame == "vehicle":
             raise ValueError(f"{name}: of no use for bands over z of the vehicle; use BevGrid(band_frame='ground')")
         elif heights_m.shape != points.shape[:1]:
-            needed = f"({len(points)},), one for each point,"
-            raise ValueError(f"{name}: shape {needed} is needed; got {tuple(heights_m.shape)}")
+            expected = f"({len(points)},), one for each point,"
+            raise ValueError(f"{name}: shape {expected} is needed; got {tuple(heights_m.shape)}")
 
 
 def _check_bounds(name: str, bounds: tuple[float, float]) -> None:
     if len(bounds) != 2 or not all(math.isfinite(bound) for bound in bounds):
-        raise ValueError(f"{name}: two finite bounds in metres are needed; got {bounds}")
+        raise ValueError(f"{name}: two finite bounds in meters are needed; got {bounds}")
     if not bounds[0] < bounds[1]:
         raise ValueError(f"{name}: the lower bound must be below the upper one; got {bounds}")
 
 
-def _check_multiple(name: str, bounds: tuple[float, float], cell: float) -> None:
-    extent = bounds[1] - bounds[0]
-    cells = extent / cell
-    if not cells <= MAX_CELLS:
-        raise ValueError(f"{name}: {cells:.6g} cells of {cell:.10g} m, over {MAX_CELLS:,}: use larger cells")
-    if cells < 0.5 or abs(cells - round(cells)) > min(MULTIPLE_TOLERANCE * max(1.0, cells), MULTIPLE_TOLERANCE_CELLS):
-        fits = extent / max(1, round(cells))
+def _check_multiple(name: str, bounds: tuple[float, float], cell_m: float) -> None:
+    extent_m = bounds[1] - bounds[0]
+    cell_count = extent_m / cell_m
+    if not cell_count <= MAX_CELLS:
+        raise ValueError(f"{name}: {cell_count:.6g} cells of {cell_m:.10g} m, over {MAX_CELLS:,}: use larger cells")
+    # Extents are written in decimals: a multiple is exact up to rounding, 1e-6 of the extent and 1e-3 of a cell.
+    tolerance_cells = min(1e-6 * max(1.0, cell_count), 1e-3)
+    if cell_count < 0.5 or abs(cell_count - round(cell_count)) > tolerance_cells:
+        fitting_cell_m = extent_m / max(1, round(cell_count))
         raise ValueError(
-            f"{name}: its extent of {extent:.10g} m is not a multiple of the cell of {cell:.10g} m "
-            f"({cells:.10g} cells); a cell of {fits:.10g} m would fit"
+            f"{name}: its extent of {extent_m:.10g} m is not a multiple of the cell of {cell_m:.10g} m "
+            f"({cell_count:.10g} cells); a cell of {fitting_cell_m:.10g} m would fit"
         )
 
 
-def _count(bounds: tuple[float, float], cell: float) -> int:
-    return round((bounds[1] - bounds[0]) / cell)
+def _count_cells(bounds: tuple[float, float], cell_m: float) -> int:
+    return round((bounds[1] - bounds[0]) / cell_m)
 
 
-def _edges(bounds: tuple[float, float], cell: float) -> Tensor:
-    count = _count(bounds, cell)
-    edges = _between(bounds, torch.arange(count + 1, dtype=torch.float64, device="cpu"), count)
+def _compute_edges(bounds: tuple[float, float], cell_m: float) -> Tensor:
+    count = _count_cells(bounds, cell_m)
+    edges = _interpolate(bounds, torch.arange(count + 1, dtype=torch.float64, device="cpu"), count)
     edges[0], edges[-1] = bounds
     return edges
 
 
-def _centres(bounds: tuple[float, float], cell: float) -> Tensor:
-    count = _count(bounds, cell)
-    return _between(bounds, 2 * torch.arange(count, dtype=torch.float64, device="cpu") + 1, 2 * count)
+def _compute_centers(bounds: tuple[float, float], cell_m: float) -> Tensor:
+    count = _count_cells(bounds, cell_m)
+    return _interpolate(bounds, 2 * torch.arange(count, dtype=torch.float64, device="cpu") + 1, 2 * count)
 
 
-def _between(bounds: tuple[float, float], step: Tensor, steps: int) -> Tensor:
-    # (lo (n - i) + hi i) / n rounds once where lo and hi are whole numbers: the border at 0.3 is 0.3, not 3 * 0.1.
-    return (bounds[0] * (steps - step) + bounds[1] * step) / steps
+def _interpolate(bounds: tuple[float, float], numerators: Tensor, denominator: int) -> Tensor:
+    # (lo (n - i) + hi i) / n rounds once if lo and hi are integers: the edge at 0.3 is 0.3, not 3 * 0.1.
+    return (bounds[0] * (denominator - numerators) + bounds[1] * numerators) / denominator
 
 
-# `torch.load` gives them back with weights_only=True, its default.
+# Allows `torch.load` with weights_only=True, its default.
 torch.serialization.add_safe_globals([BevGrid])

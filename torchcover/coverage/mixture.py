@@ -1,87 +1,104 @@
-"""The numbers of one rig over several kinds of world, each with its share."""
+"""Coverage of one rig over several scenarios with weights."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 from torchcover.coverage.averages import Average, estimate_redundancy
 from torchcover.coverage.regions import Region, list_region_bands
 from torchcover.coverage.result import Coverage
-from torchcover.coverage.summary import RegionSummary, summarize_redundancy
+from torchcover.coverage.summary import RegionSummary, convert_to_cell_numbers, summarize_redundancy
 from torchcover.coverage.target_sums import TargetMixture
 from torchcover.estimation import Estimate
 
-SAME = ("band_frame", "grid", "thresholds_m", "max_radius_m", "average", "regions")
-
 
 class CoverageMixture:
-    """What `Coverage` says of one kind of world, of a mixture of kinds; maps it has none.
+    """Numbers of `Coverage` as weighted means over scenarios; a mixture has no maps.
 
-    The kinds are given, not drawn: errors are about what happens by chance within each (`Estimate.mixed`).
+    The scenarios are fixed, not sampled: errors describe the random variation within each (`Estimate.from_strata`).
 
     Args:
-        scenario_names: What was measured in each kind of world, by its name, with its weight: above 0, and they sum to 1.
+        scenario_coverages: Weight and result by the name of the scenario; weights are above 0 and sum to 1.
 
     Raises:
-        ValueError: Two that were not asked about the same.
+        ValueError: Two results differ in grid, thresholds, average, regions or test targets.
     """
 
     def __init__(self, scenario_coverages: Mapping[str, tuple[float, Coverage]]) -> None:
         self.scenario_names = tuple(scenario_coverages)
         self.weighted_coverages = tuple(scenario_coverages.values())
         (_, first), *others = self.weighted_coverages
-        for what in SAME:
-            if any(getattr(coverage, what) != getattr(first, what) for _, coverage in others):
-                raise ValueError(f"kinds of world cannot be mixed: they differ in their {what}; ask about the same")
+        for attribute in ("band_frame", "grid", "thresholds_m", "max_radius_m", "average", "regions"):
+            if any(getattr(coverage, attribute) != getattr(first, attribute) for _, coverage in others):
+                raise ValueError(
+                    f"scenarios cannot be mixed: they differ in their {attribute}; use the same setting in all scenarios"
+                )
         self.grid, self.thresholds_m, self.max_radius_m = first.grid, first.thresholds_m, first.max_radius_m
-        self.average, self.quantities, self.aggregated_numbers = (
-            first.average,
-            first.quantities,
-            first.aggregated_numbers,
-        )
-        each = [(weight, part.target_sums) for weight, part in self.weighted_coverages if part.target_sums]
-        if any(bodies.region_targets != each[0][1].region_targets for _, bodies in each) or 0 < len(each) < len(
-            self.weighted_coverages
-        ):
-            raise ValueError("kinds of world cannot be mixed: other bodies were put beside the vehicle in one of them")
-        self.target_sums = TargetMixture(each, each[0][1].region_targets) if each else None
+        self.average, self.quantities = first.average, first.quantities
+        self.aggregated_numbers = first.aggregated_numbers
+        target_sums = [(weight, part.target_sums) for weight, part in self.weighted_coverages if part.target_sums]
+        self.target_sums = None
+        if target_sums:
+            region_targets = target_sums[0][1].region_targets
+            is_equal = all(sums.region_targets == region_targets for _, sums in target_sums)
+            if not is_equal or len(target_sums) < len(self.weighted_coverages):
+                raise ValueError("scenarios cannot be mixed: they differ in their test targets; use the same in all")
+            self.target_sums = TargetMixture(target_sums, region_targets)
+
+    def _mix(self, estimate: Callable[[Coverage], Estimate]) -> Estimate:
+        return Estimate.from_strata([(weight, estimate(coverage)) for weight, coverage in self.weighted_coverages])
 
     def estimate(self, region: Region, band: str, average: Average | None = None) -> Estimate:
-        """As `Coverage.estimate`."""
-        return Estimate.from_strata(
-            [(weight, part.estimate(region, band, average)) for weight, part in self.weighted_coverages]
-        )
+        """Estimate the weighted mean of `Coverage.estimate`.
+
+        Args:
+            region: As in `Coverage.estimate`.
+            band: As in `Coverage.estimate`.
+            average: As in `Coverage.estimate`.
+        """
+        return self._mix(lambda coverage: coverage.estimate(region, band, average))
 
     def estimate_aggregated(self, region: Region, band: str) -> Estimate:
-        """As `Coverage.estimate_aggregated`."""
-        return Estimate.from_strata(
-            [(weight, part.estimate_aggregated(region, band)) for weight, part in self.weighted_coverages]
-        )
+        """Estimate the weighted mean of `Coverage.estimate_aggregated`.
+
+        Args:
+            region: As in `Coverage.estimate_aggregated`.
+            band: As in `Coverage.estimate_aggregated`.
+        """
+        return self._mix(lambda coverage: coverage.estimate_aggregated(region, band))
 
     @property
     def counts(self) -> dict[str, int]:
-        """As `Coverage.counts`, of all kinds together."""
-        return {name: sum(part.counts[name] for _, part in self.weighted_coverages) for name in Coverage.COUNTS}
+        """Sum of `Coverage.counts` over all scenarios."""
+        return {name: sum(coverage.counts[name] for _, coverage in self.weighted_coverages) for name in Coverage.COUNTS}
 
     def summary(self, regions: Sequence[Region]) -> list[RegionSummary]:
-        """As `Coverage.summary`; of cells and square metres, means with the same weights, redundancy's too."""
-        places = list_region_bands(regions, self.grid)
-        rows = zip(*(part.summary(regions) for _, part in self.weighted_coverages), strict=True)
-        return [self._row(place, row) for place, row in zip(places, rows, strict=True)]
+        """Summarize regions as `Coverage.summary`; cell counts, areas and redundancy are weighted means, too.
 
-    def _row(self, place: tuple[Region, str], rows: Sequence[RegionSummary]) -> RegionSummary:
-        weights = [weight for weight, _ in self.weighted_coverages]
-        observed_cells = round(sum(weight * row.observed_cells for weight, row in zip(weights, rows, strict=True)))
-        estimates = self.estimate(*place), self.estimate_aggregated(*place), self.estimate(*place, "cells")
-        numbers = [estimate.to_numbers(count=observed_cells, counted_items="known cells") for estimate in estimates]
+        Args:
+            regions: Regions within the grid.
+        """
+        region_bands = list_region_bands(regions, self.grid)
+        rows = zip(*(coverage.summary(regions) for _, coverage in self.weighted_coverages), strict=True)
+        return [self._mix_rows(*region_band, row) for region_band, row in zip(region_bands, rows, strict=True)]
+
+    def _mix_rows(self, region: Region, band: str, rows: Sequence[RegionSummary]) -> RegionSummary:
+        weighted_rows = [(weight, row) for (weight, _), row in zip(self.weighted_coverages, rows, strict=True)]
+        observed_cells = round(sum(weight * row.observed_cells for weight, row in weighted_rows))
+        estimates = (
+            self.estimate(region, band),
+            self.estimate_aggregated(region, band),
+            self.estimate(region, band, "cells"),
+        )
+        numbers, aggregated_numbers, cell_averages = convert_to_cell_numbers(estimates, observed_cells)
         redundancy = None
-        if sensors := rows[0].redundancy and tuple(rows[0].redundancy.failure_numbers):
-            each = [(weight, estimate_redundancy(part, *place)) for weight, part in self.weighted_coverages]
-            redundancy = summarize_redundancy(sensors, self.thresholds_m, Estimate.from_strata(each))
+        if rows[0].redundancy and rows[0].redundancy.failure_numbers:
+            estimate = self._mix(lambda coverage: estimate_redundancy(coverage, region, band))
+            redundancy = summarize_redundancy(tuple(rows[0].redundancy.failure_numbers), self.thresholds_m, estimate)
         return replace(
             rows[0],
             observed_cells=observed_cells,
-            numbers=numbers[0] | numbers[1],
-            cell_averages=numbers[2],
-            visible_m2=sum(weight * row.visible_m2 for weight, row in zip(weights, rows, strict=True)),
+            numbers=numbers | aggregated_numbers,
+            cell_averages=cell_averages,
+            visible_m2=sum(weight * row.visible_m2 for weight, row in weighted_rows),
             redundancy=redundancy,
         )

@@ -1,4 +1,4 @@
-"""One number of the coverage as a metric of its own."""
+"""Metric with one number of the coverage as its result."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -17,21 +17,21 @@ if TYPE_CHECKING:
 
 
 class CoverageNumberMetric(CoverageMetric):
-    """One number of `Coverage.summary`, for torchmetrics' `MetricTracker`, which wants one and its better direction.
+    """One number of `Coverage.summary`, for `torchmetrics.MetricTracker`, which needs a scalar and its direction.
 
-    Of detection more is better, of the radius less. In a `MetricCollection`, numbers with the same `grid` and options
-    share their sums: each step is measured once.
+    Higher is better for detection rates, lower for the radius. In a `MetricCollection`, numbers with the same `grid` and
+    options share their sums, so that each frame is measured once.
 
     Args:
         quantity_key: "radius_m", or "detection_0.4m" with one of the thresholds.
-        region: Where.
-        band: Name of the band.
-        grid: As in `CoverageMetric`, and so are the others.
-        thresholds: Detection thresholds in metres.
-        options: `max_radius`, `square_metres`, ...
+        region: Region within the grid.
+        band: Name of the height band.
+        grid: As in `CoverageMetric`.
+        thresholds_m: Detection thresholds in meters.
+        options: Further arguments of `CoverageMetric`, such as `max_radius_m` or `has_area_weights`.
 
     Raises:
-        ValueError: No such quantity or band, a region that the grid does not hold, or as `CoverageMetric`.
+        ValueError: The quantity or band does not exist, the region reaches beyond the grid, or as in `CoverageMetric`.
 
     Example:
         >>> import torch
@@ -52,37 +52,37 @@ class CoverageNumberMetric(CoverageMetric):
         band: str,
         grid: BevGrid,
         thresholds_m: Sequence[float] = (0.4,),
-        **options: Any,  # noqa: ANN401  (whatever CoverageMetric takes)
+        **options: Any,  # noqa: ANN401  (arguments of CoverageMetric)
     ) -> None:
         super().__init__(grid, thresholds_m, **options)
         check_regions([region], grid)
-        quantities = MeanOfMeans(self.thresholds_m).quantities
-        keys = [known.key for known in quantities]
-        for name, given, there in (("quantity", quantity_key, keys), ("height", band, list(grid.heights))):
-            if given not in there:
-                raise ValueError(f"{name}: one of {', '.join(there)} is needed; got {given!r}")
-        self.quantity_key = quantities[keys.index(quantity_key)]
+        quantities = {quantity.key: quantity for quantity in MeanOfMeans(self.thresholds_m).quantities}
+        if quantity_key not in quantities:
+            raise ValueError(f"quantity: one of {', '.join(quantities)} is needed; got {quantity_key!r}")
+        if band not in grid.heights:
+            raise ValueError(f"height: one of {', '.join(grid.heights)} is needed; got {band!r}")
+        self.quantity = quantities[quantity_key]
         self.region = region
         self.band = band
 
     @property
-    def higher_is_better(self) -> bool:  # type: ignore[override]  # a constant of the class, in torchmetrics
-        """Whether more of it is better."""
-        return not self.quantity_key.lower_is_better
+    def higher_is_better(self) -> bool:  # type: ignore[override]  # a constant of the class in torchmetrics
+        """Direction of improvement of the number."""
+        return not self.quantity.lower_is_better
 
-    def compute(self) -> Tensor:  # type: ignore[override]  # the sums are those of its parent, what comes out is not
-        """() float64 the number so far, in metres or as a share; NaN where it is unknown."""
+    def compute(self) -> Tensor:  # type: ignore[override]  # the sums are those of the base class, the result is not
+        """Compute the number over all frames: () float64 in meters or as a share; NaN if unknown."""
         coverage = super().compute()
-        return coverage.estimate(self.region, self.band).value[coverage.quantities.index(self.quantity_key)]
+        return coverage.estimate(self.region, self.band).value[coverage.quantities.index(self.quantity)]
 
     def plot(  # type: ignore[override]
         self, val: Tensor | Sequence[Tensor] | None = None, ax: "Axes | None" = None
     ) -> "tuple[Figure, Axes]":
-        """Draw the number, or several of them in a row, as torchmetrics does.
+        """Plot the number, or a sequence of numbers, as torchmetrics does.
 
         Args:
-            val: What `compute` or `forward` returned, once or several times; the number so far if not given.
-            ax: Where to; a new figure of pyplot's if not given.
+            val: Results of `compute` or `forward`; by default the current number.
+            ax: Axes; by default those of a new pyplot figure.
         """
         fig, ax = get_figure(ax)
         self._plot(val, ax)

@@ -1,9 +1,7 @@
-"""Comparisons are paired: rigs at the same instants, measured against the same reference."""
+"""Paired comparisons: rigs at the same frames, measured against the same reference points."""
 
 import math
-from collections.abc import Callable, Mapping
-from operator import attrgetter
-from typing import TypeAlias
+from collections.abc import Mapping
 
 import torch
 
@@ -12,91 +10,109 @@ from torchcover.coverage.regions import Region
 from torchcover.coverage.result import Coverage
 from torchcover.estimation import Difference, Estimate
 
-EstimatorGetters: TypeAlias = tuple[Callable[[Coverage | CoverageMixture], Callable[[Region, str], Estimate]], ...]
-
-# What there is an estimate of, in each region and band, and in each region of each body.
-PARTS = attrgetter("estimate"), attrgetter("estimate_aggregated")
-OF_BODIES = (attrgetter("target_sums.estimate"),)
-
 
 def check_paired(coverages: Mapping[str, Coverage]) -> None:
-    """Check that the coverages, by the names of their rigs, may be compared cell by cell.
+    """Check that coverages may be compared cell by cell.
+
+    Args:
+        coverages: Results by the name of the rig.
 
     Raises:
-        ValueError: Fewer than two, or two that differ in the grid, its band frame, the thresholds, the limit of the
-            radius, the steps or the reference points of any cell, and so in the cells that they know.
+        ValueError: There are fewer than two, or two differ in grid, band frame, thresholds, maximum radius, test
+            targets, frames, or reference points of any cell.
     """
     if len(coverages) < 2:
         raise ValueError(f"a comparison needs at least two rigs; got {', '.join(coverages) or 'none'}")
     (first, expected), *others = coverages.items()
     for name, coverage in others:
-        for what in ("band_frame", "grid", "thresholds_m", "max_radius_m"):
-            if getattr(coverage, what) != getattr(expected, what):
-                raise ValueError(f"{first!r} and {name!r} cannot be compared: they differ in their {what}")
-        if (coverage.target_sums and coverage.target_sums.region_targets) != (
-            expected.target_sums and expected.target_sums.region_targets
-        ):
-            raise ValueError(f"{first!r} and {name!r} cannot be compared: other bodies were put beside them")
+        subject = f"{first!r} and {name!r} cannot be compared"
+        for attribute in ("band_frame", "grid", "thresholds_m", "max_radius_m"):
+            if getattr(coverage, attribute) != getattr(expected, attribute):
+                raise ValueError(f"{subject}: they differ in their {attribute}")
+        targets = coverage.target_sums and coverage.target_sums.region_targets
+        expected_targets = expected.target_sums and expected.target_sums.region_targets
+        if targets != expected_targets:
+            raise ValueError(f"{subject}: they were measured with different test targets")
         if coverage.average != expected.average or coverage.layers.keys() != expected.layers.keys():
-            raise ValueError(f"{first!r} and {name!r} cannot be compared: they have different layers")
-        if not _same_steps(coverage, expected):
+            raise ValueError(f"{subject}: they have different layers")
+        if not _has_same_points(coverage, expected):
             raise ValueError(
-                f"{first!r} and {name!r} cannot be compared: they were measured against different reference points; "
-                "evaluate both in one run; of one rig on two vehicles, give it what only one vehicle has as `bodies`"
+                f"{subject}: they were measured against different reference points; evaluate both in one run; for one "
+                "rig on two vehicles, put the parts of a single vehicle into its `bodies`"
             )
 
 
-def _same_steps(a: Coverage, b: Coverage) -> bool:
-    same = torch.equal(a.observed_cells.cell_indices, b.observed_cells.cell_indices) and torch.equal(
-        a.observed_cells.point_counts, b.observed_cells.point_counts
-    )
-    same = same and a.counts["num_frames"] == b.counts["num_frames"]
+def _has_same_points(a: Coverage, b: Coverage) -> bool:
+    has_same_cells = torch.equal(a.observed_cells.cell_indices, b.observed_cells.cell_indices)
+    has_same_counts = torch.equal(a.observed_cells.point_counts, b.observed_cells.point_counts)
+    if not (has_same_cells and has_same_counts and a.counts["num_frames"] == b.counts["num_frames"]):
+        return False
     if a.block_sums is None or b.block_sums is None:
-        return same and a.block_sums is b.block_sums
-    return same and torch.equal(a.block_sums.frame_counts, b.block_sums.frame_counts)
+        return a.block_sums is b.block_sums
+    return torch.equal(a.block_sums.frame_counts, b.block_sums.frame_counts)
+
+
+def _list_estimates(
+    coverage: Coverage | CoverageMixture, region: Region, band_or_target: str, is_target: bool
+) -> list[Estimate]:
+    if is_target:
+        assert coverage.target_sums is not None
+        return [coverage.target_sums.estimate(region, band_or_target)]
+    return [coverage.estimate(region, band_or_target), coverage.estimate_aggregated(region, band_or_target)]
 
 
 def compute_differences(
-    coverages: Mapping[str, Coverage | CoverageMixture],
-    region: Region,
-    band: str,
-    estimator_getters: EstimatorGetters = PARTS,
+    coverages: Mapping[str, Coverage | CoverageMixture], region: Region, band_or_target: str, *, is_target: bool = False
 ) -> dict[str, dict[str, Difference]]:
-    """The differences of every rig, the first one too, to the first.
+    """Compute the difference of every rig, including the first, to the first.
 
     Args:
-        coverages: By the name of the rig, from the same frames.
-        region: A region within the grid.
-        band: Name of the band, or of a body.
-        estimator_getters: What there is an estimate of there.
+        coverages: Results by the name of the rig, from the same frames.
+        region: Region within the grid.
+        band_or_target: Name of a height band, or of a test target.
+        is_target: The name is that of a test target; the differences are those of target visibility.
 
     Returns:
-        Name of the rig -> key of the quantity -> difference.
+        For each rig, the differences by the key of their quantity.
     """
-    first = next(iter(coverages.values()))
-    found: dict[str, dict[str, Difference]] = {name: {} for name in coverages}
-    for part in estimator_getters:
-        expected = part(first)(region, band)
-        for name, coverage in coverages.items():
-            found[name] |= part(coverage)(region, band).compute_differences(expected)
-    return found
+    baselines = _list_estimates(next(iter(coverages.values())), region, band_or_target, is_target)
+    differences: dict[str, dict[str, Difference]] = {}
+    for name, coverage in coverages.items():
+        differences[name] = {}
+        estimates = _list_estimates(coverage, region, band_or_target, is_target)
+        for estimate, baseline in zip(estimates, baselines, strict=True):
+            differences[name] |= estimate.compute_differences(baseline)
+    return differences
 
 
 def find_leaders(
-    coverages: Mapping[str, Coverage | CoverageMixture],
-    region: Region,
-    band: str,
-    estimator_getters: EstimatorGetters = PARTS,
+    coverages: Mapping[str, Coverage | CoverageMixture], region: Region, band_or_target: str, *, is_target: bool = False
 ) -> dict[str, str]:
-    """Key of a quantity -> the rig that is best in it, where its lead over the next is more than chance."""
-    found = {}
-    for part in estimator_getters:
-        each = {rig: part(coverage)(region, band) for rig, coverage in coverages.items()}
-        for at, quantity in enumerate(next(iter(each.values())).quantities):
-            gains = {rig: quantity.compute_improvement(float(estimate.value[at])) for rig, estimate in each.items()}
-            ranked = sorted((rig for rig in gains if not math.isnan(gains[rig])), key=gains.__getitem__)
-            if len(ranked) > 1:
-                best, following = (each[rig][at : at + 1] for rig in (ranked[-1], ranked[-2]))
-                if best.compute_differences(following)[quantity.key].is_significant:
-                    found[quantity.key] = ranked[-1]
-    return found
+    """Find the best rig of each quantity, where its difference to the second is significant.
+
+    Args:
+        coverages: As in `compute_differences`.
+        region: As in `compute_differences`.
+        band_or_target: As in `compute_differences`.
+        is_target: As in `compute_differences`.
+
+    Returns:
+        Name of the rig by the key of the quantity; quantities without a significant leader are missing.
+    """
+    estimates = [_list_estimates(coverage, region, band_or_target, is_target) for coverage in coverages.values()]
+    leaders = {}
+    for rig_estimates in zip(*estimates, strict=True):
+        estimate_by_rig = dict(zip(coverages, rig_estimates, strict=True))
+        for index, quantity in enumerate(rig_estimates[0].quantities):
+            scores = {}
+            for rig, estimate in estimate_by_rig.items():
+                score = quantity.compute_improvement(float(estimate.value[index]))
+                if not math.isnan(score):
+                    scores[rig] = score
+            if len(scores) > 1:
+                second, best = sorted(scores, key=scores.__getitem__)[-2:]
+                best_estimate = estimate_by_rig[best][index : index + 1]
+                differences = best_estimate.compute_differences(estimate_by_rig[second][index : index + 1])
+                if differences[quantity.key].is_significant:
+                    leaders[quantity.key] = best
+    return leaders

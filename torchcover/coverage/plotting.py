@@ -1,4 +1,4 @@
-"""One map of a result on matplotlib's axes, for `CoverageMetric.plot`; the maps of a whole run are in `report`."""
+"""Map of one layer on matplotlib axes, for `CoverageMetric.plot`; maps of whole runs are in `torchcover.report`."""
 
 from typing import TYPE_CHECKING
 
@@ -10,31 +10,44 @@ from torchcover.coverage.result import Coverage
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# A few cells far behind an obstacle must not take the colours away from all others.
-ROBUST_PERCENTILE = 98
-
 
 def plot_coverage(coverage: object, ax: "Axes", quantity_key: str | None, band: str | None) -> None:
-    """Draw one layer in one height band, seen from above: x forward to the right, y left upwards, the vehicle at 0, 0.
+    """Plot one layer in one height band in bird's-eye view: x to the right, y up, the vehicle at the origin.
 
-    Dark is blind, grey is unknown; what is beyond the colours, such as an infinite radius, has the last one. If not
-    given, the layer is the detection at the first threshold, or the radius if there is none, by area where the points
-    have square metres; the band is the first.
+    Dark cells are blind, gray cells unobserved. Values beyond the color scale, such as an infinite radius, have its last
+    color.
+
+    Args:
+        coverage: Result of a `CoverageMetric`.
+        ax: Axes to plot on.
+        quantity_key: Key of the layer; by default the detection at the first threshold, or the radius without
+            thresholds, by area if the result is.
+        band: Name of the height band; by default the first.
+
+    Raises:
+        TypeError: `coverage` is not a single `Coverage`.
+        ValueError: The layer or the band does not exist.
     """
     if not isinstance(coverage, Coverage):
         raise TypeError(f"val: one Coverage, as compute() returns it, is needed; got {type(coverage).__name__}")
     bands = list(coverage.grid.heights)
-    first = coverage.quantities[min(1, len(coverage.thresholds_m))]
-    first = first if coverage.average == "cells" else make_area_quantity(first)
-    key = first.key if quantity_key is None else quantity_key
-    band_name = bands[0] if band is None else band
-    for name, given, there in (("layer", key, list(coverage.layers)), ("height", band_name, bands)):
-        if given not in there:
-            raise ValueError(f"{name}: one of {', '.join(there)} is needed; got {given!r}")
-    quantity, values = coverage.layers[key].quantity, coverage.layers[key].values[bands.index(band_name)].cpu().numpy()
+    if quantity_key is None:
+        quantity = coverage.quantities[min(1, len(coverage.thresholds_m))]
+        quantity_key = (quantity if coverage.average == "cells" else make_area_quantity(quantity)).key
+    if quantity_key not in coverage.layers:
+        raise ValueError(f"layer: one of {', '.join(coverage.layers)} is needed; got {quantity_key!r}")
+    if band is None:
+        band = bands[0]
+    if band not in bands:
+        raise ValueError(f"height: one of {', '.join(bands)} is needed; got {band!r}")
+    layer = coverage.layers[quantity_key]
+    quantity, values = layer.quantity, layer.values[bands.index(band)].cpu().numpy()
     finite = values[np.isfinite(values)]
-    highest = (float(np.percentile(finite, ROBUST_PERCENTILE)) if quantity.unit == "m" and len(finite) else 0.0) or 1.0
-    values = np.where(np.isinf(values), 2 * highest, values)  # what is infinite matplotlib would leave out, as unknown
+    vmax = 1.0
+    if quantity.unit == "m" and len(finite):
+        # The largest 2 % lie in a few cells far behind obstacles, and would compress the color scale.
+        vmax = float(np.percentile(finite, 98)) or 1.0
+    values = np.where(np.isinf(values), 2 * vmax, values)  # matplotlib would treat infinite cells as unobserved
     (x_low, x_high), (y_low, y_high) = coverage.grid.x_m, coverage.grid.y_m
     _, rows, columns = coverage.grid.shape
     mesh = ax.pcolormesh(
@@ -43,7 +56,7 @@ def plot_coverage(coverage: object, ax: "Axes", quantity_key: str | None, band: 
         np.ma.masked_where(np.isnan(values), values),
         cmap="viridis_r" if quantity.lower_is_better else "viridis",
         vmin=0.0,
-        vmax=highest,
+        vmax=vmax,
         rasterized=True,
     )
     ax.set_facecolor("#c4c4c4")
@@ -54,7 +67,7 @@ def plot_coverage(coverage: object, ax: "Axes", quantity_key: str | None, band: 
         aspect="equal",
         xlabel="x forward (m)",
         ylabel="y left (m)",
-        title=f"{quantity.title}, {band_name}, {coverage.counts['num_frames']} steps (grey: unknown)",
+        title=f"{quantity.title}, {band}, {coverage.counts['num_frames']} frames (gray: unobserved)",
     )
     label = f"{quantity.title} (m)" if quantity.unit == "m" else quantity.title
-    ax.figure.colorbar(mesh, ax=ax, label=label, shrink=0.7, extend="max" if (values > highest).any() else "neither")
+    ax.figure.colorbar(mesh, ax=ax, label=label, shrink=0.7, extend="max" if (values > vmax).any() else "neither")

@@ -1,13 +1,17 @@
-"""The numbers of coverage: radii and detections, and what a rig is without a sensor."""
+"""Quantities of coverage: radii, detection rates, and numbers of a rig without a sensor."""
 
 from torchcover.estimation import Quantity
 
-# What was measured farther off than this is no point where no threshold decides: the threshold of the paper.
+# Points measured farther off than this do not count where no threshold applies; the threshold of the paper.
 MEASURED_WITHIN_M = 0.4
 
 
 def make_radius_quantity(statistic: str = "", title: str = "mean") -> Quantity:
-    """A blind spot radius in metres: which one, as a part of its key, and in words.
+    """Make a quantity for a statistic of the blind spot radius, in meters.
+
+    Args:
+        statistic: Statistic as part of the key; empty for the mean.
+        title: Statistic in words.
 
     Example:
         >>> make_radius_quantity("maximum", "largest")
@@ -18,38 +22,55 @@ def make_radius_quantity(statistic: str = "", title: str = "mean") -> Quantity:
 
 
 def make_detection_quantity(threshold_m: float) -> Quantity:
-    """The share of reference points, or steps, whose radius is at most a threshold in metres."""
-    return Quantity(
-        f"detection_{threshold_m:g}m", f"detection within {threshold_m:g} m", "share", lower_is_better=False
-    )
+    """Make a quantity for the share of reference points, or frames, whose radius is at most a threshold.
+
+    Args:
+        threshold_m: Threshold in meters.
+    """
+    title = f"detection within {threshold_m:g} m"
+    return Quantity(f"detection_{threshold_m:g}m", title, "share", lower_is_better=False)
 
 
 def make_sensor_count_quantity(threshold_m: float) -> Quantity:
-    """The number of sensors of a rig whose radius is at most a threshold in metres."""
-    title = f"sensors that see within {threshold_m:g} m"
+    """Make a quantity for the number of sensors of a rig whose radius is at most a threshold.
+
+    Args:
+        threshold_m: Threshold in meters.
+    """
+    title = f"sensors that detect within {threshold_m:g} m"
     return Quantity(f"sensors_{threshold_m:g}m", title, "sensors", lower_is_better=False)
 
 
 def make_redundancy_quantity(threshold_m: float) -> Quantity:
-    """The share of reference points that two sensors or more see within a threshold in metres."""
+    """Make a quantity for the share of reference points that two or more sensors detect within a threshold.
+
+    Args:
+        threshold_m: Threshold in meters.
+    """
     title = f"detected by two sensors or more within {threshold_m:g} m"
     return Quantity(f"detected_by_two_{threshold_m:g}m", title, "share", lower_is_better=False)
 
 
 def make_failure_quantity(sensor_name: str, quantity: Quantity) -> Quantity:
-    """A number of the rig without one of its sensors.
+    """Make a quantity for a number of the rig without one of its sensors.
+
+    Args:
+        sensor_name: Name of the sensor that fails.
+        quantity: Number of the whole rig.
 
     Example:
         >>> make_failure_quantity("roof", make_detection_quantity(0.4)).key
         'detection_0.4m_without_roof'
     """
-    return quantity._replace(
-        key=f"{quantity.key}_without_{sensor_name}", title=f"{quantity.title}, without {sensor_name}"
-    )
+    title = f"{quantity.title}, without {sensor_name}"
+    return quantity._replace(key=f"{quantity.key}_without_{sensor_name}", title=title)
 
 
 def make_area_quantity(quantity: Quantity) -> Quantity:
-    """The same over the surface that the reference sees, where every square metre weighs the same.
+    """Make a quantity for the mean over the visible surface.
+
+    Args:
+        quantity: Radius or detection rate as mean of means.
 
     Example:
         >>> make_area_quantity(make_detection_quantity(0.4)).key, make_area_quantity(RADIUS).title
@@ -60,13 +81,16 @@ def make_area_quantity(quantity: Quantity) -> Quantity:
 
 
 def make_cells_quantity(quantity: Quantity) -> Quantity:
-    """The same over the known cells of a region, every cell weighing the same, where the number itself is by area.
+    """Make a quantity for the mean over observed cells, for results whose numbers are by area.
+
+    Args:
+        quantity: Radius or detection rate.
 
     Example:
         >>> make_cells_quantity(RADIUS).key
         'cells_radius_m'
     """
-    return quantity._replace(key=f"cells_{quantity.key}", title=f"{quantity.title}, over known cells")
+    return quantity._replace(key=f"cells_{quantity.key}", title=f"{quantity.title}, over observed cells")
 
 
 RADIUS = make_radius_quantity()

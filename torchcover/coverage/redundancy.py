@@ -1,4 +1,4 @@
-"""Redundancy: by how many sensors of a rig a place is seen, and what is lost when one of them fails."""
+"""Redundancy: number of sensors that detect a point, and coverage of the rig when one sensor fails."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -21,15 +21,15 @@ from torchcover.estimation import Quantity
 
 @dataclass(frozen=True)
 class Redundancy:
-    """What a `CoverageMetric` with `sensor_names` knows of them.
+    """Maps of a `CoverageMetric` with `sensor_names`.
 
     Args:
-        sensor_names: Their names.
-        observed_cells: The cells that it is known of.
-        sparse_layers: In these, by the key of their quantity: for each threshold by how many sensors the points of a
-            cell are seen ("sensors_0.4m") and the share that two or more see ("detected_by_two_0.4m"); for each sensor the
-            radius and the detection without it ("radius_m_without_roof"). By area if the coverage is, else means of
-            means.
+        sensor_names: Names of the sensors.
+        observed_cells: K observed cells.
+        sparse_layers: (K,) layers by the key of their quantity, means over area if the coverage is, else means of means:
+            for each threshold the number of sensors that detect a point ("sensors_0.4m") and the share of points that
+            two or more detect ("detected_by_two_0.4m"); for each sensor the radius and the detection rates without it
+            ("radius_m_without_roof").
     """
 
     sensor_names: tuple[str, ...]
@@ -38,35 +38,55 @@ class Redundancy:
 
     @property
     def layers(self) -> Mapping[str, Layer]:
-        """The same over the grid."""
+        """Layers over the full grid."""
         return expand_layers(self.sparse_layers, self.observed_cells)
 
 
 def expand_layers(sparse_layers: Mapping[str, Layer], observed_cells: ObservedCells) -> Mapping[str, Layer]:
-    """Layers over the grid from those over the known cells."""
-    return LazyMaps(sparse_layers, lambda layer: Layer(layer.quantity, observed_cells.expand_to_grid(layer.values)))
+    """Expand layers to the full grid, each on access.
+
+    Args:
+        sparse_layers: (K,) layers over the observed cells.
+        observed_cells: K observed cells.
+    """
+
+    def expand(layer: Layer) -> Layer:
+        return Layer(layer.quantity, observed_cells.expand_to_grid(layer.values))
+
+    return LazyMaps(sparse_layers, expand)
 
 
 def list_redundancy_quantities(sensor_names: Sequence[str], thresholds_m: Sequence[float]) -> tuple[Quantity, ...]:
-    """What there is a layer, and a number of each region, of: in the order in which they are summed up.
+    """List the quantities of redundancy in the order of their sums.
+
+    Args:
+        sensor_names: Names of the sensors.
+        thresholds_m: Detection thresholds in meters.
 
     Example:
-        >>> [each.key for each in list_redundancy_quantities(["roof"], [0.4])]
+        >>> [quantity.key for quantity in list_redundancy_quantities(["roof"], [0.4])]
         ['sensors_0.4m', 'detected_by_two_0.4m', 'radius_m_without_roof', 'detection_0.4m_without_roof']
     """
-    several = [
-        each(threshold) for threshold in thresholds_m for each in (make_sensor_count_quantity, make_redundancy_quantity)
-    ]
-    single = (RADIUS, *map(make_detection_quantity, thresholds_m))
-    return (*several, *(make_failure_quantity(sensor, quantity) for sensor in sensor_names for quantity in single))
+    quantities = []
+    for threshold_m in thresholds_m:
+        quantities += [make_sensor_count_quantity(threshold_m), make_redundancy_quantity(threshold_m)]
+    for sensor in sensor_names:
+        quantities.append(make_failure_quantity(sensor, RADIUS))
+        quantities += [make_failure_quantity(sensor, make_detection_quantity(value_m)) for value_m in thresholds_m]
+    return tuple(quantities)
 
 
 @dataclass(frozen=True)
 class SensorFailures(Aggregation):
-    """Sums of how many sensors see a point, and of what the rig would be without each of them.
+    """Sums of the number of detecting sensors, and of radius and detections without each sensor.
 
-    The radius of a rig is the smallest of those of its sensors, so that the radius without a sensor is the smallest of
-    the others', and no search is made for it.
+    The radius of a rig is the smallest radius of its sensors. The radius without a sensor is therefore the smallest of
+    the other sensors and needs no further search.
+
+    Args:
+        sensor_names: Names of the sensors.
+        thresholds_m: Detection thresholds in meters.
+        has_area_weights: Sum over area instead of means of frames.
     """
 
     name: ClassVar[str] = "redundancy"
@@ -78,49 +98,57 @@ class SensorFailures(Aggregation):
 
     @property
     def quantities(self) -> tuple[Quantity, ...]:
-        """As `list_redundancy_quantities`."""
+        """Quantities as in `list_redundancy_quantities`."""
         return list_redundancy_quantities(self.sensor_names, self.thresholds_m)
 
     def create_states(self, num_cells: int) -> dict[str, SumState]:
-        """`sums` (V, C): means of each step, or with square metres those times them, and `m2` (C)."""
-        m2 = (
-            {"m2": SumState(torch.zeros(num_cells, dtype=torch.float64, device="cpu"))} if self.has_area_weights else {}
-        )
-        return {"sums": SumState(torch.zeros(len(self.quantities), num_cells, dtype=torch.float64, device="cpu")), **m2}
+        """Create `sums` (V, C) of the means of frames; with area weights, of values times area, and `m2` (C,)."""
+        states = {"sums": SumState(torch.zeros(len(self.quantities), num_cells, dtype=torch.float64, device="cpu"))}
+        if self.has_area_weights:
+            states["m2"] = SumState(torch.zeros(num_cells, dtype=torch.float64, device="cpu"))
+        return states
 
     def update(self, sums: Mapping[str, Tensor], frame: BinnedFrame) -> None:
-        """Add the points of a step, whose last values are those of `values`."""
-        own, weight = frame.cell_means.means[-len(self.quantities) :], frame.cell_means.weight_sums
-        sums["sums"].add_(own * weight if self.has_area_weights else own)
+        """Add the points of a frame, whose last values are those of `compute_values`."""
+        means, weight_sums = frame.cell_means.means[-len(self.quantities) :], frame.cell_means.weight_sums
         if self.has_area_weights:
-            sums["m2"].add_(weight)
+            sums["sums"].add_(means * weight_sums)
+            sums["m2"].add_(weight_sums)
+        else:
+            sums["sums"].add_(means)
 
     def compute_values(self, sensor_distances_m: Sequence[Tensor], max_radius_m: float) -> Tensor:
-        """(V, N) float64 what there is to say of each point, with radii that saturate.
+        """Compute the values of each point, in the order of `quantities`.
 
-        `sensor_distances_m` (S, N) are distances to the nearest point of each sensor, infinite where none is near: for the
-        radius, then for each threshold.
+        Args:
+            sensor_distances_m: (S, N) distances to the nearest point of each sensor, infinite without one: for the
+                radius, then for each threshold.
+            max_radius_m: Radius in meters at which r saturates.
+
+        Returns:
+            (V, N) float64.
         """
         rows = []
-        for distance, threshold in zip(sensor_distances_m[1:], self.thresholds_m, strict=True):
-            seeing = (distance <= threshold).sum(dim=0)
-            rows += [seeing.double(), (seeing >= 2).double()]
-        for radius, *others in zip(*map(_without_each, sensor_distances_m), strict=True):
+        for distances_m, threshold_m in zip(sensor_distances_m[1:], self.thresholds_m, strict=True):
+            detecting_sensors = (distances_m <= threshold_m).sum(dim=0)
+            rows += [detecting_sensors.double(), (detecting_sensors >= 2).double()]
+        distances_without = [_compute_minimum_without_each(distances_m) for distances_m in sensor_distances_m]
+        for radius, *detection_distances in zip(*distances_without, strict=True):
             rows.append(radius.clamp(max=radius.new_tensor(max_radius_m)).double())
-            pairs = zip(others, self.thresholds_m, strict=True)
-            rows += [(distance <= threshold).double() for distance, threshold in pairs]
+            for distance_m, threshold_m in zip(detection_distances, self.thresholds_m, strict=True):
+                rows.append((distance_m <= threshold_m).double())
         return torch.stack(rows)
 
     def compute_layers(self, sums: Mapping[str, Tensor], observed_frames: Tensor, max_radius_m: float) -> list[Layer]:
-        """One for each quantity; 0 / 0, which is NaN, where nothing was seen."""
+        """Compute one layer per quantity; NaN (0 / 0) in cells without reference points."""
         values = sums["sums"] / (sums["m2"] if self.has_area_weights else observed_frames)
-        return list(map(Layer, self.quantities, values))
+        return [Layer(quantity, row) for quantity, row in zip(self.quantities, values, strict=True)]
 
 
-def _without_each(of_sensors: Tensor) -> Tensor:
-    """(S, N) the smallest distances without each of the sensors."""
-    nearest, which = of_sensors.min(dim=0)
-    # Without any sensor but the nearest the distance stays as it is.
-    second = of_sensors.scatter(0, which[None], torch.inf).amin(dim=0)
-    failed = torch.arange(len(of_sensors), device=which.device)[:, None]
-    return torch.where(which == failed, second, nearest)
+def _compute_minimum_without_each(sensor_distances_m: Tensor) -> Tensor:
+    """Compute the (S, N) smallest distances without each of the sensors."""
+    nearest, nearest_sensor = sensor_distances_m.min(dim=0)
+    # Without any other sensor than the nearest, the distance does not change.
+    second = sensor_distances_m.scatter(0, nearest_sensor[None], torch.inf).amin(dim=0)
+    failed_sensor = torch.arange(len(sensor_distances_m), device=nearest_sensor.device)[:, None]
+    return torch.where(nearest_sensor == failed_sensor, second, nearest)

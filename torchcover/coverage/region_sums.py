@@ -1,4 +1,4 @@
-"""Sums over regions: a region in a height band is one large cell of the points in it, by their own places."""
+"""Sums over regions: a region in a height band acts as one large cell that contains points by their position."""
 
 import math
 from collections.abc import Sequence
@@ -13,10 +13,12 @@ from torchcover.estimation import Estimate, Quantity
 
 
 class AggregatedNumbers(NamedTuple):
-    """What aggregations say of P regions and bands, region by region.
+    """Numbers of aggregations for P pairs of region and band, ordered by region, then by band.
 
-    `values` (P, Q) float64, NaN where unknown; `jackknife_values` (B, P, Q) without each of the blocks, NaN of an aggregation
-    that no error is known of; no row where there is one block.
+    Args:
+        quantities: Q quantities of all aggregations.
+        values: (P, Q) float64; NaN where unknown.
+        jackknife_values: (B, P, Q) numbers without each block; NaN for aggregations without errors; B = 0 for one block.
     """
 
     quantities: tuple[Quantity, ...]
@@ -25,10 +27,13 @@ class AggregatedNumbers(NamedTuple):
 
 
 class RegionSums(NamedTuple):
-    """Sums over the visible surface of P regions and bands, region by region, in B fine blocks of steps.
+    """Sums over the visible surface of P pairs of region and band, in B fine blocks of frames.
 
-    `frame_counts` (B,) int64 steps in each block; `areas_m2` (B, P) float64 square metres; `sums` (B, V, P) those times the radius
-    and the detections, then, of a metric that knows the sensors, times each of `list_redundancy_quantities`.
+    Args:
+        frame_counts: (B,) int64 frames in each block.
+        areas_m2: (B, P) float64 area in square meters.
+        sums: (B, V, P) area times the radius and the detections, followed by area times each quantity of
+            `list_redundancy_quantities` if the metric distinguishes sensors.
     """
 
     frame_counts: Tensor
@@ -36,38 +41,49 @@ class RegionSums(NamedTuple):
     sums: Tensor
 
     def estimate(self, quantities: Sequence[Quantity], region_band_index: int) -> Estimate:
-        """The ratios of one place: the first of the V, as many as there are quantities."""
-        return Estimate.from_ratios(
-            quantities,
-            self.areas_m2[:, region_band_index],
-            self.sums[:, : len(quantities), region_band_index],
-            self.frame_counts,
-        )
+        """Estimate the ratios of sums for one region and band.
+
+        Args:
+            quantities: Quantities of the first rows of `sums`.
+            region_band_index: Index of the pair.
+        """
+        denominators = self.areas_m2[:, region_band_index]
+        numerators = self.sums[:, : len(quantities), region_band_index]
+        return Estimate.from_ratios(quantities, denominators, numerators, self.frame_counts)
 
 
 def compute_aggregated_numbers(
     sums: CellSums, aggregations: Sequence[Aggregation], max_radius_m: float
 ) -> AggregatedNumbers:
-    """What aggregations say of P places, from (..., B, P) sums in blocks: as of maps, of one cell a region and band.
+    """Compute the numbers of aggregations for regions, as for a map with one cell per region and band.
 
-    Of a largest value no error is known, for it is the same whichever block is left out but one.
+    Largest values have no errors, since they are equal without any block except one.
+
+    Args:
+        sums: Sums of shape (..., B, P) in blocks.
+        aggregations: Aggregations of these sums.
+        max_radius_m: Radius in meters at which r saturates.
     """
-    every = list(range(len(sums.observed_frames)))
-    choices = [every, *(every[:block] + every[block + 1 :] for block in every if len(every) > 1)]
-    values = []
+    all_blocks = list(range(len(sums.observed_frames)))
+    selections = [all_blocks]
+    if len(all_blocks) > 1:
+        selections += [all_blocks[:block] + all_blocks[block + 1 :] for block in all_blocks]
+    values, quantities = [], []
     for aggregation in aggregations:
-        reductions = {name: state.reduction for name, state in aggregation.create_states(1).items()}
-        added = "max" not in reductions.values()
-        each = []
-        for blocks in choices if added else choices[:1]:
-            own = {
-                name: state[..., blocks, :].sum(dim=-2) if reductions[name] == "sum" else state.amax(dim=-2)
-                for name, state in sums.sums_by_aggregation[aggregation.name].items()
-            }
-            layers = aggregation.compute_layers(own, sums.observed_frames[blocks].sum(dim=0).long(), max_radius_m)
-            each.append(torch.stack([layer.values for layer in layers], dim=1))
-        unknown = torch.full_like(each[0], math.nan)
-        values.append(torch.stack(each if added else [*each, *[unknown] * (len(choices) - 1)]))
-    found = torch.cat(values, dim=2)
-    quantities = tuple(quantity for one in aggregations for quantity in one.quantities)
-    return AggregatedNumbers(quantities, found[0], found[1:])
+        quantities += aggregation.quantities
+        states = aggregation.create_states(1)
+        is_additive = all(state.reduction == "sum" for state in states.values())
+        selection_values = []
+        for blocks in selections if is_additive else selections[:1]:
+            reduced_sums = {}
+            for name, block_sums in sums.sums_by_aggregation[aggregation.name].items():
+                is_sum = states[name].reduction == "sum"
+                reduced_sums[name] = block_sums[..., blocks, :].sum(dim=-2) if is_sum else block_sums.amax(dim=-2)
+            observed_frames = sums.observed_frames[blocks].sum(dim=0).long()
+            layers = aggregation.compute_layers(reduced_sums, observed_frames, max_radius_m)
+            selection_values.append(torch.stack([layer.values for layer in layers], dim=1))
+        unknown = torch.full_like(selection_values[0], math.nan)
+        selection_values += [unknown] * (len(selections) - len(selection_values))
+        values.append(torch.stack(selection_values))
+    all_values = torch.cat(values, dim=2)
+    return AggregatedNumbers(tuple(quantities), all_values[0], all_values[1:])

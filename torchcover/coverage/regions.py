@@ -1,4 +1,4 @@
-"""Regions: named rectangles and polygons that a number is given for, and which points belong to them."""
+"""Regions of interest: named rectangles and polygons in bird's-eye view."""
 
 import math
 from collections.abc import Sequence
@@ -10,27 +10,25 @@ from torch import Tensor
 from torchcover.coverage.grid import BevGrid
 from torchcover.devices import run_with_float64
 
-# How far around the vehicle its near field reaches.
+# Width of the strip around the vehicle that belongs to its near field.
 NEAR_FIELD_M = 3.0
-# A bound lies on an edge of a cell if it is within this share of one: both are written in decimals.
-ON_AN_EDGE = 1e-6
 
 
 @dataclass(frozen=True)
 class Region:
-    """A rectangle in the vehicle frame, half-open on both axes, or a polygon.
+    """Rectangle in the vehicle frame, half-open on both axes, or polygon.
 
-    By area, a point belongs to it by its own place; over known cells, a cell belongs to it if its centre does.
+    Averages over area assign points to regions by their position; averages over cells, by the center of the cell.
 
     Args:
-        name: What tables and loggers call it.
-        x_m: Lower and upper bound forward, in metres.
-        y_m: Lower and upper bound to the left, in metres.
-        corners_m: Corners x, y of a polygon, in either direction, which has these bounds; see `Region.polygon`.
-        bands: Names of the height bands that tables show of it; all if empty.
+        name: Name in tables and loggers.
+        x_m: Lower and upper bound along x (forward) in meters.
+        y_m: Lower and upper bound along y (left) in meters.
+        corners_m: Corners x, y of a polygon with these bounds, clockwise or counterclockwise; see `Region.from_corners`.
+        bands: Names of the height bands for which tables have a row; all bands if empty.
 
     Raises:
-        ValueError: No name, bounds that are inverted or not finite, a polygon that crosses or touches itself, or has
+        ValueError: The name is empty, bounds are inverted or not finite, or a polygon crosses or touches itself or has
             other bounds.
 
     Example:
@@ -55,14 +53,14 @@ class Region:
 
     @classmethod
     def from_corners(cls, name: str, corners_m: Sequence[tuple[float, float]]) -> "Region":
-        """The region within some corners.
+        """Create a polygon.
 
         Args:
-            name: What tables and loggers call it.
-            corners_m: Three or more corners x, y in metres, one after the other around it.
+            name: Name in tables and loggers.
+            corners_m: Three or more corners x, y in meters, in order around the polygon.
 
         Raises:
-            ValueError: Fewer corners, one that is not finite, edges that cross or touch each other.
+            ValueError: There are fewer than three different corners, one is not finite, or edges cross or touch.
 
         Example:
             >>> corner = Region.from_corners("corner", [(2.0, 1.0), (5.0, 1.0), (2.0, 4.0)])
@@ -70,8 +68,8 @@ class Region:
             ((2.0, 5.0), tensor(3))
         """
         corners = tuple((float(x), float(y)) for x, y in corners_m)
-        if not all(math.isfinite(number) for corner in corners for number in corner):
-            raise ValueError(f"region {name!r}: corners need finite coordinates in metres; got {corners}")
+        if not all(math.isfinite(x) and math.isfinite(y) for x, y in corners):
+            raise ValueError(f"region {name!r}: corners need finite coordinates in meters; got {corners}")
         if len(set(corners)) < 3:
             raise ValueError(f"region {name!r}: three different corners or more are needed; got {len(set(corners))}")
         x, y = zip(*corners, strict=True)
@@ -86,23 +84,22 @@ class Region:
                 f"region {self.name!r}: its edges cross or touch each other ({shapely.is_valid_reason(polygon)}); give "
                 "the corners one after the other around it"
             )
-        (x_low, y_low, x_high, y_high), bounds = polygon.bounds, (self.x_m[0], self.y_m[0], self.x_m[1], self.y_m[1])
-        if (x_low, y_low, x_high, y_high) != bounds:
+        if polygon.bounds != (self.x_m[0], self.y_m[0], self.x_m[1], self.y_m[1]):
             raise ValueError(f"region {self.name!r}: its corners have other bounds than x = {self.x_m}, y = {self.y_m}")
 
     @run_with_float64
     def mask_points(self, x_m: Tensor, y_m: Tensor) -> Tensor:
-        """Which places belong to it: the one function that decides, of points as of the centres of cells.
+        """Test which positions lie in the region; reference points and cell centers are tested alike.
 
-        A polygon holds a place if an odd number of its edges lie further along x: of two regions that share an edge,
-        one has it, the one further along x and y.
+        A polygon contains a position if an odd number of its edges lie at larger x (ray casting). A position on an edge
+        that two regions share belongs to one of them, the region at larger x and y.
 
         Args:
-            x_m: Metres forward, any floating-point type.
-            y_m: Metres to the left; of a shape that goes with that of x.
+            x_m: x in meters, any floating-point type.
+            y_m: y in meters, of a shape that broadcasts with that of `x_m`.
 
         Returns:
-            bool of the shape that both have together.
+            bool of the broadcast shape.
 
         Example:
             >>> lane = Region("lane", x_m=(0.0, 20.0), y_m=(-1.5, 1.5))
@@ -110,71 +107,92 @@ class Region:
             tensor([ True, False, False])
         """
         x_m, y_m = x_m.double(), y_m.double()
-        within = (x_m >= self.x_m[0]) & (x_m < self.x_m[1]) & (y_m >= self.y_m[0]) & (y_m < self.y_m[1])
+        is_in_bounds = (x_m >= self.x_m[0]) & (x_m < self.x_m[1]) & (y_m >= self.y_m[0]) & (y_m < self.y_m[1])
         if not self.corners_m:
-            return within
-        x_m, y_m = (each.expand(within.shape)[within] for each in (x_m, y_m))
+            return is_in_bounds
+        x_m, y_m = x_m.expand(is_in_bounds.shape)[is_in_bounds], y_m.expand(is_in_bounds.shape)[is_in_bounds]
         corners = torch.tensor(self.corners_m, dtype=torch.float64, device=x_m.device)
-        following = corners.roll(-1, 0)
-        # From below in either direction, so that two regions round alike.
-        upwards = (corners[:, 1] <= following[:, 1])[:, None]
-        low, high = torch.where(upwards, corners, following), torch.where(upwards, following, corners)
-        # In order of y, the places beside an edge are a range.
-        ordered, order = y_m.sort()
-        first, past = (torch.searchsorted(ordered, end[:, 1].contiguous()) for end in (low, high))
-        edge = torch.repeat_interleave(past - first)
-        before = (past - first).cumsum(0) - past
-        place = order[torch.arange(len(edge), device=x_m.device) - before[edge]]
-        low, along = low[edge], (high - low)[edge]
-        share = (y_m[place] - low[:, 1]) / along[:, 1]
-        inside = torch.bincount(place[x_m[place] < low[:, 0] + share * along[:, 0]], minlength=len(x_m)) % 2 == 1
-        return within.masked_scatter(within, inside)
+        next_corners = corners.roll(-1, 0)
+        # Edges run upwards, so that an edge of two regions rounds alike in both.
+        is_upwards = (corners[:, 1] <= next_corners[:, 1])[:, None]
+        low, high = torch.where(is_upwards, corners, next_corners), torch.where(is_upwards, next_corners, corners)
+        # In order of y, the positions in the y range of an edge are contiguous.
+        sorted_y, order = y_m.sort()
+        start = torch.searchsorted(sorted_y, low[:, 1].contiguous())
+        end = torch.searchsorted(sorted_y, high[:, 1].contiguous())
+        edge = torch.repeat_interleave(end - start)
+        offset = (end - start).cumsum(0) - end
+        position = order[torch.arange(len(edge), device=x_m.device) - offset[edge]]
+        edge_start, edge_vector = low[edge], (high - low)[edge]
+        edge_share = (y_m[position] - edge_start[:, 1]) / edge_vector[:, 1]
+        is_left_of_edge = x_m[position] < edge_start[:, 0] + edge_share * edge_vector[:, 0]
+        is_inside = torch.bincount(position[is_left_of_edge], minlength=len(x_m)) % 2 == 1
+        return is_in_bounds.masked_scatter(is_in_bounds, is_inside)
 
     def is_within(self, grid: BevGrid) -> bool:
-        """Whether it lies within the grid.
+        """Return whether the region lies within the extents of a grid.
+
+        Args:
+            grid: Grid; only its bounds along x and y matter.
 
         Example:
             >>> Region("far", (0.0, 90.0), (-1.0, 1.0)).is_within(BevGrid(x_m=(0.0, 80.0), y_m=(-20.0, 20.0)))
             False
         """
-        return all(
-            bounds[0] <= low and high <= bounds[1]
-            for (low, high), bounds in ((self.x_m, grid.x_m), (self.y_m, grid.y_m))
-        )
+        return _is_between(self.x_m, grid.x_m) and _is_between(self.y_m, grid.y_m)
 
     def mask_cells(self, grid: BevGrid) -> Tensor:
-        """(Y, X) bool: the cells of the grid that belong to the region.
+        """Test which cells have their center in the region.
+
+        Args:
+            grid: Cells.
+
+        Returns:
+            (Y, X) bool.
 
         Raises:
-            ValueError: The region reaches beyond the grid, so that its number would be about something smaller.
+            ValueError: The region reaches beyond the grid, so that its number would describe a smaller region.
         """
-        if not self.is_within(grid):
-            axis, region, bounds = next(
-                side
-                for side in (("x", self.x_m, grid.x_m), ("y", self.y_m, grid.y_m))
-                if side[1][0] < side[2][0] or side[1][1] > side[2][1]
-            )
-            raise ValueError(
-                f"region {self.name!r} spans {axis} = {region[0]:g} to {region[1]:g} m, beyond the grid's "
-                f"{bounds[0]:g} to {bounds[1]:g} m; enlarge the grid or leave the region out"
-            )
+        for axis, bounds, grid_bounds in (("x", self.x_m, grid.x_m), ("y", self.y_m, grid.y_m)):
+            if not _is_between(bounds, grid_bounds):
+                raise ValueError(
+                    f"region {self.name!r} spans {axis} = {bounds[0]:g} to {bounds[1]:g} m, beyond the grid's "
+                    f"{grid_bounds[0]:g} to {grid_bounds[1]:g} m; enlarge the grid or leave the region out"
+                )
         return self.mask_points(grid.x_centers_m[None, :], grid.y_centers_m[:, None])
 
     def has_whole_cells(self, grid: BevGrid) -> bool:
-        """Whether its bounds are edges of cells, so that the points in its cells are those that belong to it.
+        """Return whether all bounds are cell edges, so that the points in its cells are the points in the region.
+
+        Args:
+            grid: Cells.
 
         Example:
             >>> grid = BevGrid(x_m=(0.0, 4.0), y_m=(0.0, 1.0), cell_m=0.5)
             >>> [Region("ahead", (0.0, far), (0.0, 1.0)).has_whole_cells(grid) for far in (2.5, 2.6)]
             [True, False]
         """
-        sides = ((self.x_m, grid.x_edges_m), (self.y_m, grid.y_edges_m))
-        off = [float((edges - bound).abs().min()) for bounds, edges in sides for bound in bounds]
-        return not self.corners_m and max(off) <= ON_AN_EDGE * grid.cell_m
+        if self.corners_m:
+            return False
+        tolerance_m = 1e-6 * grid.cell_m  # bounds and edges are both written in decimals
+        for bounds, edges in ((self.x_m, grid.x_edges_m), (self.y_m, grid.y_edges_m)):
+            for bound in bounds:
+                if float((edges - bound).abs().min()) > tolerance_m:
+                    return False
+        return True
+
+
+def _is_between(bounds: tuple[float, float], limits: tuple[float, float]) -> bool:
+    return limits[0] <= bounds[0] and bounds[1] <= limits[1]
 
 
 class RegionBands:
-    """The P places of a grid that numbers are given for: each region in each band, region by region."""
+    """Pairs of a region and a height band, ordered by region, then by band.
+
+    Args:
+        regions: R regions.
+        grid: Grid with H bands; there are R * H pairs.
+    """
 
     def __init__(self, regions: Sequence[Region], grid: BevGrid) -> None:
         self.regions = tuple(regions)
@@ -182,46 +200,72 @@ class RegionBands:
         self.num_region_bands = len(self.regions) * len(grid.heights)
 
     def find_index(self, region: Region, band: str) -> int | None:
-        """Which place a region and a band are; None if they are none."""
+        """Find the index of a pair.
+
+        Args:
+            region: Region.
+            band: Name of a band of the grid.
+
+        Returns:
+            Index, or None if the region is not among the regions.
+        """
         if region not in self.regions:
             return None
         return self.regions.index(region) * len(self.grid.heights) + list(self.grid.heights).index(band)
 
     def assign_points(self, points: Tensor, cell_indices: Tensor) -> tuple[Tensor, Tensor]:
-        """For each place that a point lies in, (K,) the place and (K,) which point; a point may lie in several.
+        """Find the regions of points; a point may lie in several.
 
-        Its band is that of its cell, (N,) int64.
+        Args:
+            points: (N, 3) points in meters.
+            cell_indices: (N,) int64 cell of each point, which determines its band.
+
+        Returns:
+            (K,) int64 index of the region and band, and (K,) int64 index of the point.
         """
         band = cell_indices // math.prod(self.grid.shape[1:])
         x, y = points[:, 0].double(), points[:, 1].double()
-        place, point = [band[:0]], [band[:0]]
-        for number, region in enumerate(self.regions):
-            point.append(region.mask_points(x, y).nonzero().squeeze(1))
-            place.append(number * len(self.grid.heights) + band[point[-1]])
-        return torch.cat(place), torch.cat(point)
+        region_bands, point_indices = [band[:0]], [band[:0]]
+        for region_index, region in enumerate(self.regions):
+            inside = region.mask_points(x, y).nonzero().squeeze(1)
+            point_indices.append(inside)
+            region_bands.append(region_index * len(self.grid.heights) + band[inside])
+        return torch.cat(region_bands), torch.cat(point_indices)
 
 
 def check_regions(regions: Sequence[Region], grid: BevGrid) -> None:
-    """Refuse regions that no number of a grid can be given for.
+    """Check that a grid can give a number for each region.
+
+    Args:
+        regions: Regions of interest.
+        grid: Cells.
 
     Raises:
-        ValueError: One reaches beyond the grid, or holds no cell centre; two have one name.
+        ValueError: A region reaches beyond the grid or contains no cell center, or two regions have the same name.
     """
     names = [region.name for region in regions]
-    if twice := sorted({name for name in names if names.count(name) > 1}):
-        raise ValueError(f"regions: each name may be given once; got {', '.join(map(repr, twice))} again")
+    if repeated := sorted({name for name in names if names.count(name) > 1}):
+        raise ValueError(f"regions: each name may be given once; got {', '.join(map(repr, repeated))} again")
     for region in regions:
         if not region.mask_cells(grid).any():
-            raise ValueError(f"region {region.name!r} holds no cell centre; use smaller cells than {grid.cell_m:g} m")
+            raise ValueError(f"region {region.name!r} holds no cell center; use smaller cells than {grid.cell_m:g} m")
 
 
 def list_region_bands(regions: Sequence[Region], grid: BevGrid) -> list[tuple[Region, str]]:
-    """The regions, each with the height bands that tables show of it."""
+    """List each region with the height bands for which tables have a row.
+
+    Args:
+        regions: Regions of interest; their `bands` select bands.
+        grid: Grid with the bands.
+    """
     return [(region, band) for region in regions for band in grid.heights if not region.bands or band in region.bands]
 
 
 def get_paper_regions(grid: BevGrid) -> tuple[Region, ...]:
-    """Those of the paper's regions that the grid holds.
+    """Return the regions of the paper that lie within a grid.
+
+    Args:
+        grid: Grid; regions that reach beyond it are excluded.
 
     Example:
         >>> [region.name for region in get_paper_regions(BevGrid(x_m=(0.0, 100.0), y_m=(-40.0, 40.0)))]
@@ -231,47 +275,47 @@ def get_paper_regions(grid: BevGrid) -> tuple[Region, ...]:
 
 
 def forward_regions(ranges: Sequence[float] = (20.0, 80.0, 160.0)) -> tuple[Region, ...]:
-    """The paper's regions in front of the vehicle: x in [0, R), y in [-R/4, R/4).
+    """Build the regions of the paper in front of the vehicle: x in [0, R), y in [-R/4, R/4).
 
     Args:
-        ranges: R of each region in metres.
+        ranges: R of each region in meters.
 
     Returns:
-        One region a range, named after it: "20m", "80m", ...
+        One region per range, named after it: "20m", "80m", ...
 
     Example:
         >>> forward_regions((20,))
         (Region(name='20m', x_m=(0.0, 20.0), y_m=(-5.0, 5.0), corners_m=()),)
     """
-    return tuple(Region(f"{reach:g}m", (0.0, float(reach)), (-reach / 4, reach / 4)) for reach in ranges)
+    return tuple(Region(f"{range_m:g}m", (0.0, float(range_m)), (-range_m / 4, range_m / 4)) for range_m in ranges)
 
 
 def build_near_field_regions(
     x_m: tuple[float, float], y_m: tuple[float, float], distance_m: float = NEAR_FIELD_M
 ) -> tuple[Region, ...]:
-    """The near field on the four sides of a vehicle; those in front and at the rear have the corners.
+    """Build the near field on the four sides of a vehicle; front and rear include the corners.
 
     Args:
-        x_m: Rear and front end of the vehicle, in metres.
-        y_m: Right and left side.
-        distance_m: How far the regions reach from it.
+        x_m: Rear and front end of the vehicle in meters.
+        y_m: Right and left side of the vehicle in meters.
+        distance_m: Width of the regions in meters.
 
     Returns:
         Four regions that do not overlap: "front_3m", "rear_3m", "left_3m", "right_3m".
 
     Example:
-        >>> [(each.name, each.x_m, each.y_m) for each in build_near_field_regions((-0.5, 0.5), (-0.4, 0.4))][1:3]
+        >>> [(region.name, region.x_m, region.y_m) for region in build_near_field_regions((-0.5, 0.5), (-0.4, 0.4))][1:3]
         [('rear_3m', (-3.5, -0.5), (-3.4, 3.4)), ('left_3m', (-0.5, 0.5), (0.4, 3.4))]
     """
-    across = y_m[0] - distance_m, y_m[1] + distance_m
-    sides = {
-        "front": ((x_m[1], x_m[1] + distance_m), across),
-        "rear": ((x_m[0] - distance_m, x_m[0]), across),
-        "left": (x_m, (y_m[1], across[1])),
-        "right": (x_m, (across[0], y_m[0])),
+    full_width_m = y_m[0] - distance_m, y_m[1] + distance_m
+    bounds_by_side = {
+        "front": ((x_m[1], x_m[1] + distance_m), full_width_m),
+        "rear": ((x_m[0] - distance_m, x_m[0]), full_width_m),
+        "left": (x_m, (y_m[1], full_width_m[1])),
+        "right": (x_m, (full_width_m[0], y_m[0])),
     }
-    return tuple(Region(f"{side}_{distance_m:g}m", *bounds) for side, bounds in sides.items())
+    return tuple(Region(f"{side}_{distance_m:g}m", *bounds) for side, bounds in bounds_by_side.items())
 
 
-# `torch.load` gives them back with weights_only=True, its default.
+# Allows `torch.load` with weights_only=True, its default.
 torch.serialization.add_safe_globals([Region])

@@ -1,4 +1,4 @@
-"""The result: maps over the grid, and one number a region."""
+"""Result of a coverage metric: maps over the grid and numbers of regions."""
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -39,30 +39,28 @@ if TYPE_CHECKING:
 
 
 class Coverage:
-    """Coverage maps of a run: what `CoverageMetric.compute` returns.
+    """Coverage maps and numbers of a run, the result of `CoverageMetric.compute`.
 
-    It is kept of the K known cells, which a reference point has probed; arrays over all cells have the grid's shape
-    (H, Y, X), are made when they are asked for, and are NaN with count 0 where nothing is known.
+    The result stores the K observed cells, which contained reference points. Arrays over all cells have the shape
+    (H, Y, X) of the grid, are created on access, and are NaN with count 0 in unobserved cells.
 
     Args:
         grid: Cells and height bands.
-        thresholds_m: Detection thresholds in metres.
-        max_radius_m: Saturation of the radius in metres.
-        observed_cells: The known cells, with their steps and points.
-        layers: What was measured of them, (K,) each: the mean radius, the detection at each threshold, then those of
-            other aggregations.
-        counts: What happened on the way, one number for each name in `COUNTS`.
-        block_sums: The sums in blocks of contiguous steps, if errors were asked for.
-        area_sums: The sums over the visible surface, if the reference points had square metres.
-        regions: What `summary` gives numbers for, unless it is told others; the paper's `forward_regions()` that fit
-            the grid if not given.
-        region_sums: The sums by area over `regions`, point by point; None if the reference points had no square metres.
-        aggregated_numbers: What other aggregations than the mean of means say of `regions`, if there were any.
-        redundancy: What each sensor of the rig adds, if the metric was told of the sensors.
-        target_sums: What the rig sees of bodies that were put beside the vehicle, if any were.
+        thresholds_m: Detection thresholds in meters.
+        max_radius_m: Radius in meters at which r saturates.
+        observed_cells: Observed cells with their numbers of frames and points.
+        layers: (K,) layers: the mean radius, the detection at each threshold, then those of other aggregations.
+        counts: Numbers of frames and points by the names in `COUNTS`.
+        block_sums: Sums in blocks of contiguous frames, for errors; None without blocks.
+        area_sums: Sums over the visible surface; None without area weights.
+        regions: Regions of `summary`; by default the regions of `forward_regions()` that fit the grid.
+        region_sums: Sums over area in `regions`, by the position of each point; None without area weights.
+        aggregated_numbers: Numbers of other aggregations in `regions`; None without them.
+        redundancy: Coverage without each sensor; None if the metric does not distinguish sensors.
+        target_sums: Visibility of test targets; None without them.
 
     Attributes:
-        sparse_layers: The layers over the known cells, by the key of their quantity.
+        sparse_layers: (K,) layers by the key of their quantity.
     """
 
     COUNTS: ClassVar[tuple[str, ...]] = (
@@ -108,24 +106,22 @@ class Coverage:
         self._estimates: dict[tuple[Region, str, Average], Estimate] = {}
 
     def __repr__(self) -> str:
-        known = f"{len(self.observed_cells.cell_indices) / self.grid.num_cells:.1%} of the cells known"
-        return f"Coverage({self.grid.shape} cells, {self.counts['num_frames']} steps, {known})"
+        observed_share = len(self.observed_cells.cell_indices) / self.grid.num_cells
+        num_frames = self.counts["num_frames"]
+        return f"Coverage({self.grid.shape} cells, {num_frames} frames, {observed_share:.1%} of the cells observed)"
 
     def _repr_html_(self) -> str:
         return build_result_html([repr(self)], self.plot())
 
     def plot(self, quantity_key: str | None = None, band: str | None = None) -> "Figure":
-        """One layer in one height band, seen from above.
+        """Plot one layer in one height band in bird's-eye view, in a new figure that pyplot does not manage.
 
         Args:
-            quantity_key: A key of `layers`; the detection at the first threshold if not given.
-            band: Name of the band; the first if not given.
-
-        Returns:
-            A figure of its own, outside pyplot.
+            quantity_key: Key of `layers`; by default the detection at the first threshold.
+            band: Name of the height band; by default the first.
 
         Raises:
-            ValueError: There is no such layer or band.
+            ValueError: The layer or the band does not exist.
         """
         from matplotlib.figure import Figure
 
@@ -136,166 +132,180 @@ class Coverage:
         return figure
 
     def to_dataframe(self, regions: Sequence[Region] | None = None) -> "pandas.DataFrame":
-        """The numbers of `scalars`, a row for each region of `summary` and height band, or body beside the vehicle.
+        """Convert the numbers of `scalars` to a table with one row per region and height band or test target.
+
+        Args:
+            regions: As in `summary`.
 
         Raises:
-            ModuleNotFoundError: pandas is not there.
+            ModuleNotFoundError: pandas is not installed.
         """
-        rows, errors = self._rows(regions), self.block_sums is not None
-        return build_dataframe(
-            {"region": row.region, "band": row.band, **row.to_dict(include_errors=errors)} for row in rows
-        )
+        records = []
+        for row in self._list_rows(regions):
+            values = row.to_dict(include_errors=self.block_sums is not None)
+            records.append({"region": row.region, "band": row.band, **values})
+        return build_dataframe(records)
 
     def to_xarray(self) -> "xarray.Dataset":
-        """The maps: each layer, its standard error as `KEY_error`, `points` and `observed_frames`.
+        """Convert the maps to a data set: layers, standard errors as `KEY_error`, `point_counts`, `observed_frames`.
 
         Returns:
-            Over `height`, names of bands, and `y_m` and `x_m`, the middles of the cells; NaN where nothing is known.
+            Data set over `band`, names of height bands, and `y_m` and `x_m`, cell centers; NaN in unobserved cells.
 
         Raises:
-            ModuleNotFoundError: xarray is not there.
+            ModuleNotFoundError: xarray is not installed.
         """
         maps = {key: layer.values for key, layer in self.layers.items()}
         maps |= {f"{key}_error": values for key, values in self.errors.items()}
         maps |= {"point_counts": self.point_counts, "observed_frames": self.observed_frames}
-        of_cells = {"y_m": self.grid.y_centers_m.numpy(), "x_m": self.grid.x_centers_m.numpy()}
-        arrays = {key: values.cpu().numpy() for key, values in maps.items()}
-        return build_xarray_dataset(arrays, {"band": list(self.grid.heights), **of_cells})
+        axes = {
+            "band": list(self.grid.heights),
+            "y_m": self.grid.y_centers_m.numpy(),
+            "x_m": self.grid.x_centers_m.numpy(),
+        }
+        return build_xarray_dataset({key: values.cpu().numpy() for key, values in maps.items()}, axes)
 
     @property
     def layers(self) -> Mapping[str, Layer]:
-        """(H, Y, X) each, by the key of their quantity: `coverage.layers["radius_m"].values`."""
+        """(H, Y, X) layers by the key of their quantity: `coverage.layers["radius_m"].values`."""
         return expand_layers(self.sparse_layers, self.observed_cells)
 
     @property
     def observed_frames(self) -> Tensor:
-        """(H, Y, X) int64 steps that had a reference point in the cell."""
+        """(H, Y, X) int64 number of frames with a reference point in the cell."""
         return self.observed_cells.expand_to_grid(self.observed_cells.observed_frames, 0)
 
     @property
     def point_counts(self) -> Tensor:
-        """(H, Y, X) int64 reference points in the cell."""
+        """(H, Y, X) int64 number of reference points in the cell."""
         return self.observed_cells.expand_to_grid(self.observed_cells.point_counts, 0)
 
     @property
     def quantities(self) -> tuple[Quantity, ...]:
-        """What there is one number of for each region: the mean radius, then the detection at each threshold."""
+        """Quantities with a number for each region: the mean radius, then the detection at each threshold."""
         return MeanOfMeans(self.thresholds_m).quantities
 
     @property
     def band_frame(self) -> BandFrame:
-        """What the height bands are over: "ground", the local ground, or "vehicle", z of the vehicle frame."""
+        """Zero of the height bands: "ground" for the local ground, or "vehicle" for z of the vehicle frame."""
         return self.grid.band_frame
 
     @property
     def radius(self) -> Tensor:
-        """(H, Y, X) float64 mean blind spot radius in metres."""
+        """(H, Y, X) float64 mean blind spot radius in meters."""
         return self.layers[RADIUS.key].values
 
     @property
     def detection(self) -> Tensor:
-        """(T, H, Y, X) float64 detection probability at each threshold."""
-        each = [
-            self.observed_cells.expand_to_grid(self.sparse_layers[quantity.key].values)
-            for quantity in self.quantities[1:]
-        ]
-        return torch.stack(each) if each else self.radius.new_empty((0, *self.grid.shape))
+        """(T, H, Y, X) float64 detection rate at each threshold."""
+        detections = [self.layers[quantity.key].values for quantity in self.quantities[1:]]
+        return torch.stack(detections) if detections else self.radius.new_empty((0, *self.grid.shape))
 
     @property
     def errors(self) -> Mapping[str, Tensor]:
-        """Key of a quantity -> (H, Y, X) standard errors; NaN where too few blocks probed, empty without blocks."""
+        """(H, Y, X) standard errors by key; NaN where fewer than 8 blocks observed the cell; empty without blocks."""
         return LazyMaps(self.sparse_errors, self.observed_cells.expand_to_grid)
 
     @cached_property
     def sparse_errors(self) -> Mapping[str, Tensor]:
-        """Key of a quantity -> (K,) standard errors in the known cells."""
+        """(K,) standard errors in the observed cells by the key of their quantity."""
         if self.block_sums is None:
             return {}
         errors = estimate_cell_errors(self.quantities, self.observed_cells, self.block_sums)
         if self.area_sums is not None:
-            each = estimate_cell_errors(self.quantities, self.observed_cells, self.area_sums)
-            errors |= {make_area_quantity(one).key: each[one.key] for one in self.quantities}
+            area_errors = estimate_cell_errors(self.quantities, self.observed_cells, self.area_sums)
+            for quantity in self.quantities:
+                errors[make_area_quantity(quantity).key] = area_errors[quantity.key]
         return errors
 
     def summary(self, regions: Sequence[Region] | None = None) -> list[RegionSummary]:
-        """One row for each region and height band that tables show of it.
+        """Summarize each region in each height band.
 
         Args:
-            regions: Regions within the grid; `self.regions` if not given.
+            regions: Regions within the grid; by default `self.regions`.
 
         Returns:
-            Rows in the order of the regions, then of the bands.
+            Rows ordered by region, then by band; a region with `bands` has rows for these bands only.
 
         Raises:
-            ValueError: A region reaches beyond the grid, or holds no cell centre.
+            ValueError: A region reaches beyond the grid, or contains no cell center.
         """
-        wanted = self.regions if regions is None else regions
-        return [summarize_region(self, *place) for place in list_region_bands(wanted, self.grid)]
+        region_bands = list_region_bands(self.regions if regions is None else regions, self.grid)
+        return [summarize_region(self, region, band) for region, band in region_bands]
 
     @property
     def average(self) -> Average:
-        """What its numbers are means over: "area" if the reference points had square metres, else "cells"."""
+        """Average of the numbers: "area" for means over the visible surface, else "cells"."""
         return "cells" if self.area_sums is None else "area"
 
     def estimate(self, region: Region, band: str, average: Average | None = None) -> Estimate:
-        """The numbers of one region in one band with what they become without each block, for errors of differences.
+        """Estimate the numbers of one region in one band, with jackknife values for errors of differences.
 
         Args:
-            region: A region within the grid.
-            band: Name of the band.
-            average: "area", the mean over the visible surface (`torchcover.coverage.averages.sum_area_by_block`), or
-                "cells", the paper's unweighted mean over the known cells. Not given: that of this result.
+            region: Region within the grid.
+            band: Name of the height band.
+            average: "area" for the mean over the visible surface (`torchcover.coverage.averages.sum_area_by_block`), or
+                "cells" for the unweighted mean of the paper over observed cells; by default that of this result.
 
         Returns:
-            That of `quantities`.
+            Estimate of `quantities`.
 
         Raises:
-            ValueError: A region that reaches beyond the grid, or holds no cell centre; no such band; "area" of points
-                without square metres, or of a region that was not asked for and whose edges are not those of cells.
+            ValueError: The region reaches beyond the grid or contains no cell center, the band does not exist, or the
+                average is "area" without area weights, or for a region that the metric did not sum and whose bounds
+                are not cell edges.
         """
         key = region, band, average or self.average
         if key not in self._estimates:
             check_regions([region], self.grid)
-            of_measure = estimate_area_average if key[2] == "area" else estimate_cell_average
-            self._estimates[key] = of_measure(self, region, band)
+            estimate_average = estimate_area_average if key[2] == "area" else estimate_cell_average
+            self._estimates[key] = estimate_average(self, region, band)
         return self._estimates[key]
 
     def estimate_aggregated(self, region: Region, band: str) -> Estimate:
-        """The numbers of other aggregations in one region and band; unknown where the metric was not told of it."""
-        if self.aggregated_numbers is None:
-            return self.estimate(region, band)[:0]
-        quantities, value, left_out = self.aggregated_numbers
-        place = self.find_region_band(region, band)
-        if place is None or self.block_sums is None:
-            return Estimate.from_values(
-                quantities, torch.full_like(value[0], math.nan) if place is None else value[place]
-            )
-        used = self.block_sums.frame_counts > 0
-        return Estimate(quantities, value[place], left_out[used, place], self.block_sums.frame_counts[used])
-
-    def estimate_number(self, quantity_key: str, region: Region, band: str) -> Estimate:
-        """Any one number, by the name of its column in `summary.csv`.
+        """Estimate the numbers of other aggregations than the mean of means in one region and band.
 
         Args:
-            quantity_key: "radius_m", "detection_0.4m"; "cells_detection_0.4m" over the known cells of a result by area;
+            region: Region within the grid.
+            band: Name of the height band.
+
+        Returns:
+            Estimate without numbers if there is no other aggregation; NaN for regions that the metric did not sum.
+        """
+        if self.aggregated_numbers is None:
+            return self.estimate(region, band)[:0]
+        quantities, values, jackknife_values = self.aggregated_numbers
+        index = self.find_region_band(region, band)
+        if index is None:
+            return Estimate.from_values(quantities, torch.full_like(values[0], math.nan))
+        if self.block_sums is None:
+            return Estimate.from_values(quantities, values[index])
+        used = self.block_sums.frame_counts > 0
+        return Estimate(quantities, values[index], jackknife_values[used, index], self.block_sums.frame_counts[used])
+
+    def estimate_number(self, quantity_key: str, region: Region, band: str) -> Estimate:
+        """Estimate a single number by its column name in `summary.csv`.
+
+        Args:
+            quantity_key: "radius_m" or "detection_0.4m"; "cells_detection_0.4m" over observed cells in a result by area;
                 "radius_maximum_m" of an aggregation; "radius_m_without_roof" and "detected_by_two_0.4m" of redundancy.
-            region: A region within the grid.
-            band: Name of the band.
+            region: Region within the grid.
+            band: Name of the height band.
 
         Raises:
-            ValueError: There is no such number; as `estimate`.
+            ValueError: The number does not exist, or as in `estimate`.
         """
         for quantities, estimate in self._estimators.items():
-            for at, quantity in enumerate(quantities):
+            for index, quantity in enumerate(quantities):
                 if quantity.key == quantity_key:
-                    return replace(estimate(region, band)[at : at + 1], quantities=(quantity,))
-        there = [quantity.key for quantity in self.all_quantities]
-        nearest = get_close_matches(quantity_key, there, n=1) or there
-        raise ValueError(f"{quantity_key}: the result has no such number; it has {', '.join(nearest)}")
+                    return replace(estimate(region, band)[index : index + 1], quantities=(quantity,))
+        available = [quantity.key for quantity in self.all_quantities]
+        suggestions = get_close_matches(quantity_key, available, n=1) or available
+        raise ValueError(f"{quantity_key}: the result has no such number; it has {', '.join(suggestions)}")
 
     @property
     def all_quantities(self) -> tuple[Quantity, ...]:
-        """All that `estimate_number` has a number of."""
+        """Quantities of all numbers that `estimate_number` can estimate."""
         return tuple(quantity for quantities in self._estimators for quantity in quantities)
 
     @property
@@ -304,67 +314,78 @@ class Coverage:
         if self.aggregated_numbers is not None:
             estimators[self.aggregated_numbers.quantities] = self.estimate_aggregated
         if self.average == "area":
-            estimators[tuple(map(make_cells_quantity, self.quantities))] = partial(self.estimate, average="cells")
+            cells_quantities = tuple(make_cells_quantity(quantity) for quantity in self.quantities)
+            estimators[cells_quantities] = partial(self.estimate, average="cells")
         if self.redundancy is not None:
-            own = list_redundancy_quantities(self.redundancy.sensor_names, self.thresholds_m)
-            estimators[own] = lambda *place: estimate_redundancy(self, *place)[len(self.quantities) :]
+            quantities = list_redundancy_quantities(self.redundancy.sensor_names, self.thresholds_m)
+            estimators[quantities] = self._estimate_redundancy
         return estimators
 
+    def _estimate_redundancy(self, region: Region, band: str) -> Estimate:
+        return estimate_redundancy(self, region, band)[len(self.quantities) :]
+
     def scalars(self, regions: Sequence[Region] | None = None) -> dict[str, float]:
-        """The summary as a flat dict for a logger, of the regions that `summary` takes.
+        """Convert the summary to a flat dict for a logger.
+
+        Args:
+            regions: As in `summary`.
 
         Returns:
             `"radius_m/20m/ground"`, `"detection_0.4m/20m/ground"`, `"observed_share/20m/ground"` and so on, and
-            `"visible_m2/20m/ground"` if the reference points had square metres.
+            `"visible_m2/20m/ground"` with area weights.
         """
-        rows = self._rows(regions)
-        return {
-            key: value
-            for row in rows
-            for key, value in row.to_scalars(include_errors=self.block_sums is not None).items()
-        }
+        values = {}
+        for row in self._list_rows(regions):
+            values |= row.to_scalars(include_errors=self.block_sums is not None)
+        return values
 
-    def _rows(self, regions: Sequence[Region] | None) -> list[RegionSummary]:
+    def _list_rows(self, regions: Sequence[Region] | None) -> list[RegionSummary]:
         return [*self.summary(regions), *(self.target_sums.summarize() if self.target_sums else ())]
 
     def save(self, path: str | Path) -> None:
-        """Write everything to one `.npz` file, which NumPy reads too: lists over the known cells, and the blocks.
+        """Write the result to one `.npz` file, which NumPy can read: lists over observed cells, and the blocks.
 
-        What `load` gives back has the same numbers, errors and differences to the last bit.
+        `load` restores numbers, errors and differences to the last bit.
+
+        Args:
+            path: File; it is replaced atomically.
         """
         write_atomically(Path(path), partial(write_coverage, self))
 
     @classmethod
     def load(cls, path: str | Path) -> "Coverage":
-        """Read what `save` wrote.
+        """Read a file that `save` wrote.
+
+        Args:
+            path: File.
 
         Raises:
-            FileNotFoundError: No such file.
-            IsADirectoryError: A folder.
-            BadFileError: Not a coverage file, a damaged one, one of another version, or too large a one.
+            FileNotFoundError: The file does not exist.
+            IsADirectoryError: The path is a folder.
+            BadFileError: The file is not a coverage file, damaged, of another version, or too large.
         """
         return cls(**read_coverage(path))
 
     def find_region_band(self, region: Region, band: str) -> int | None:
-        """Which of `regions` and bands it is, region by region; None if it is none."""
+        """Find the index of a pair of region and band as `RegionBands.find_index`; ValueError without such a band."""
         self.get_band_index(band)
         return RegionBands(self.regions, self.grid).find_index(region, band)
 
     def get_cell_mask(self, region: Region) -> Tensor:
-        """(Y, X) bool: the cells of a region."""
+        """Return the (Y, X) bool cells of a region within the grid, on the device of the result."""
         return region.mask_cells(self.grid).to(self.observed_cells.cell_indices.device)
 
     def mask_observed_cells(self, region: Region, band: str) -> Tensor:
-        """(K,) bool: which of the known cells lie in a region in a band."""
+        """Return a (K,) bool mask of the observed cells of a region in a band."""
         return self.observed_cells.mask_cells(self.get_cell_mask(region), self.get_band_index(band))
 
     def get_band_index(self, band: str) -> int:
-        """The number of a band; ValueError if there is none of this name."""
+        """Return the index of a height band; ValueError if it does not exist."""
         if band not in self.grid.heights:
             raise ValueError(f"height {band!r}: the grid has {', '.join(self.grid.heights)}")
         return list(self.grid.heights).index(band)
 
 
-# `torch.load` gives them back with weights_only=True, its default.
+# Allows `torch.load` with weights_only=True, its default.
 torch.serialization.add_safe_globals([Coverage, BlockSums, ObservedCells, AggregatedNumbers, RegionSums])
 torch.serialization.add_safe_globals([Layer, Quantity, Redundancy])

@@ -1,9 +1,8 @@
-"""The numbers of a region, as tables and loggers take them."""
+"""Numbers of a region for tables and loggers."""
 
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import TYPE_CHECKING
 
 from torchcover.coverage.aggregations import MeanOfMeans
@@ -19,15 +18,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RegionRedundancy:
-    """By how many sensors one region is seen in one height band, and what is lost with each.
+    """Number of sensors that detect points of a region in a height band, and the effect of the failure of each sensor.
 
     Args:
-        detecting_sensors: Key of the quantity, `"sensors_0.4m"`: mean number of sensors that see a point within the threshold,
-            or `"detected_by_two_0.4m"`: share that two or more see -> its number. By one or more: the detection.
-        failure_numbers: Name of the sensor -> key of the quantity, as in `RegionSummary.numbers` -> its number without it.
-        failure_effects: The same less the number with all sensors; of detection at most 0, of the radius at least 0.
-        most_critical_sensor: The sensor without which most is lost: of the detection at the first threshold, or of the radius
-            where there is no threshold; None where no sensor's failure changes a number, or nothing is known.
+        detecting_sensors: Numbers by key: `"sensors_0.4m"`, the mean number of sensors that detect a point within the
+            threshold, and `"detected_by_two_0.4m"`, the share of points that two or more sensors detect.
+        failure_numbers: For each sensor, the numbers of the rig without it, by key as in `RegionSummary.numbers`.
+        failure_effects: For each sensor, the rig without it minus the whole rig: at most 0 for detection rates, at least
+            0 for the radius.
+        most_critical_sensor: Sensor whose failure costs most, in the detection rate at the first threshold, or in the
+            radius without thresholds; None if no failure changes a number, or nothing is known.
     """
 
     detecting_sensors: Mapping[str, Number]
@@ -38,22 +38,22 @@ class RegionRedundancy:
 
 @dataclass(frozen=True)
 class RegionSummary:
-    """The numbers of one region in one height band.
+    """Numbers of one region in one height band.
 
     Args:
         region: Name of the region.
         band: Name of the height band.
         num_cells: Number of cells in the region.
-        observed_cells: How many of them a reference point has probed.
-        average: What `numbers` are means over: "area", the visible surface, "cells", the known cells, or "target_positions" of a
-            body, which is then the `band`, the places that were tried the cells, and the free ones the known ones.
-        numbers: Key of the quantity, such as `"radius_m"` or `"detection_0.4m"` -> its number, those of other
-            aggregations last; the error is NaN if it was not asked for, or if there are not enough steps.
-        cell_averages: Radius and detections over the known cells, every cell weighing the same; as in `numbers` if that is its
-            measure.
-        visible_m2: Mean over the steps of the square metres of the region's surface that the reference sees; NaN where
-            its points have none.
-        redundancy: What each sensor adds; None if that was not asked for.
+        observed_cells: Number of them that contained a reference point.
+        average: "area" for means over the visible surface, "cells" over observed cells, or "target_positions" of a test
+            target. In the last case `band` is the name of the target, `num_cells` the number of tried positions and
+            `observed_cells` the number of free ones.
+        numbers: Numbers by key, such as `"radius_m"` or `"detection_0.4m"`, those of other aggregations last. Errors are
+            NaN without blocks, or with too few frames.
+        cell_averages: Radius and detection rates over observed cells; equal to `numbers` if that is their average.
+        visible_m2: Mean over frames of the area of the region that the reference sensor observes, in square meters; NaN
+            without area weights.
+        redundancy: Effect of each sensor; None if the metric does not distinguish sensors.
     """
 
     region: str
@@ -68,73 +68,109 @@ class RegionSummary:
 
     @property
     def observed_share(self) -> float:
-        """Share of the region's cells that are known. `known` is about this share, and biased when it is low."""
+        """Share of the region's cells that are observed. Averages over cells are biased if it is low."""
         return self.observed_cells / self.num_cells if self.num_cells else math.nan
 
     def to_scalars(self, *, include_errors: bool) -> dict[str, float]:
-        """As `Coverage.scalars` has them, with or without errors."""
-        return {
-            f"{key}/{self.region}/{self.band}": value
-            for key, value in self.to_dict(include_errors=include_errors).items()
-        }
+        """Convert to entries of `Coverage.scalars`, with region and band in the keys.
+
+        Args:
+            include_errors: Add standard errors.
+        """
+        values = self.to_dict(include_errors=include_errors)
+        return {f"{key}/{self.region}/{self.band}": value for key, value in values.items()}
 
     def to_dict(self, *, include_errors: bool) -> dict[str, float]:
-        """The same without the names of the region and the band."""
-        flat = {}
+        """Convert to values by key, without the names of region and band.
+
+        Args:
+            include_errors: Add standard errors, with keys that end in `_error`.
+        """
+        values = {}
         for key, number in self.numbers.items():
-            flat[key] = number.value
+            values[key] = number.value
             if include_errors:
-                flat[f"{key}_error"] = number.error
-        flat["observed_share"] = self.observed_share
+                values[f"{key}_error"] = number.error
+        values["observed_share"] = self.observed_share
         if self.average == "area":
-            flat["visible_m2"] = self.visible_m2
-        return flat
+            values["visible_m2"] = self.visible_m2
+        return values
 
 
 def summarize_region(coverage: "Coverage", region: Region, band: str) -> RegionSummary:
-    """The numbers of one region in one band."""
-    cells, observed_cells = (
-        int(each.sum()) for each in (coverage.get_cell_mask(region), coverage.mask_observed_cells(region, band))
-    )
-    numbers = partial(Estimate.to_numbers, count=observed_cells, counted_items="known cells")
-    by_area, steps = coverage.average == "area", coverage.counts["num_frames"]
-    redundancy = None  # by area it is known of the regions only that the metric was told of
-    if coverage.redundancy is not None and (not by_area or region in coverage.regions):
+    """Compute the numbers of one region in one height band.
+
+    Args:
+        coverage: Result of a metric.
+        region: Region within the grid.
+        band: Name of the height band.
+    """
+    observed_cells = int(coverage.mask_observed_cells(region, band).sum())
+    is_by_area, num_frames = coverage.average == "area", coverage.counts["num_frames"]
+    redundancy = None  # by area it is known only for the regions that the metric summed
+    if coverage.redundancy is not None and (not is_by_area or region in coverage.regions):
         estimate = estimate_redundancy(coverage, region, band)
         redundancy = summarize_redundancy(coverage.redundancy.sensor_names, coverage.thresholds_m, estimate)
+    visible_m2 = math.nan
+    if is_by_area and num_frames:
+        visible_m2 = float(sum_area_by_block(coverage, region, band)[1][:, 0].sum()) / num_frames
+    estimates = (
+        coverage.estimate(region, band),
+        coverage.estimate_aggregated(region, band),
+        coverage.estimate(region, band, "cells"),
+    )
+    numbers, aggregated_numbers, cell_averages = convert_to_cell_numbers(estimates, observed_cells)
     return RegionSummary(
         region=region.name,
         band=band,
-        num_cells=cells,
+        num_cells=int(coverage.get_cell_mask(region).sum()),
         observed_cells=observed_cells,
         average=coverage.average,
-        numbers=numbers(coverage.estimate(region, band)) | numbers(coverage.estimate_aggregated(region, band)),
-        cell_averages=numbers(coverage.estimate(region, band, "cells")),
-        visible_m2=float(sum_area_by_block(coverage, region, band)[1][:, 0].sum()) / steps
-        if by_area and steps
-        else math.nan,
+        numbers=numbers | aggregated_numbers,
+        cell_averages=cell_averages,
+        visible_m2=visible_m2,
         redundancy=redundancy,
     )
+
+
+def convert_to_cell_numbers(estimates: Sequence[Estimate], observed_cells: int) -> list[dict[str, Number]]:
+    """Convert estimates of a region to numbers that name the count of observed cells.
+
+    Args:
+        estimates: Estimates of one region.
+        observed_cells: Number of its observed cells.
+    """
+    return [estimate.to_numbers(count=observed_cells, counted_items="observed cells") for estimate in estimates]
 
 
 def summarize_redundancy(
     sensor_names: Sequence[str], thresholds_m: tuple[float, ...], estimate: Estimate
 ) -> RegionRedundancy:
-    """The numbers of a region without each sensor, from what `estimate_redundancy` gives."""
-    single, several = MeanOfMeans(tuple(thresholds_m)).quantities, list_redundancy_quantities((), thresholds_m)
-    numbers, count = estimate.to_numbers(), len(single)
-    each, change = {}, {}
-    for at, sensor in enumerate(sensor_names):
-        start = count + len(several) + at * count
-        own = estimate[start : start + count]
-        each[sensor] = {quantity.key: numbers[make_failure_quantity(sensor, quantity).key] for quantity in single}
-        change[sensor] = replace(own, quantities=single).compute_differences(estimate[:count])
-    decisive = single[min(1, count - 1)]
-    losses = {sensor: _loss(changes[decisive.key].improvement) for sensor, changes in change.items()}
-    worst = max(losses, key=losses.__getitem__)
-    seen_by = {quantity.key: numbers[quantity.key] for quantity in several}
-    return RegionRedundancy(seen_by, each, change, worst if losses[worst] > 0 else None)
+    """Compute the effect of the failure of each sensor on the numbers of a region.
 
-
-def _loss(gain: float) -> float:
-    return 0.0 if math.isnan(gain) else -gain
+    Args:
+        sensor_names: Names of the sensors.
+        thresholds_m: Detection thresholds in meters.
+        estimate: Result of `estimate_redundancy`.
+    """
+    rig_quantities = MeanOfMeans(tuple(thresholds_m)).quantities
+    count_quantities = list_redundancy_quantities((), thresholds_m)
+    numbers, count = estimate.to_numbers(), len(rig_quantities)
+    failure_numbers, failure_effects, losses = {}, {}, {}
+    deciding_quantity = rig_quantities[min(1, count - 1)]
+    for sensor_index, sensor in enumerate(sensor_names):
+        start = count + len(count_quantities) + sensor_index * count
+        without_sensor = replace(estimate[start : start + count], quantities=rig_quantities)
+        failure_numbers[sensor] = {
+            quantity.key: numbers[make_failure_quantity(sensor, quantity).key] for quantity in rig_quantities
+        }
+        failure_effects[sensor] = without_sensor.compute_differences(estimate[:count])
+        improvement = failure_effects[sensor][deciding_quantity.key].improvement
+        losses[sensor] = 0.0 if math.isnan(improvement) else -improvement
+    most_critical = max(losses, key=losses.__getitem__)
+    return RegionRedundancy(
+        detecting_sensors={quantity.key: numbers[quantity.key] for quantity in count_quantities},
+        failure_numbers=failure_numbers,
+        failure_effects=failure_effects,
+        most_critical_sensor=most_critical if losses[most_critical] > 0 else None,
+    )

@@ -1,4 +1,4 @@
-"""How sums over steps and worlds become numbers: quantities, estimates, standard errors, intervals, differences."""
+"""Estimation: quantities, standard errors, confidence intervals and paired differences from sums in blocks."""
 
 import lazy_loader
 

@@ -1,5 +1,4 @@
 from .errors import MIN_BLOCKS as MIN_BLOCKS
-from .errors import MIN_BLOCKS_OF_A_CELL as MIN_BLOCKS_OF_A_CELL
 from .errors import ROUND_OFF as ROUND_OFF
 from .errors import ErrorModel as ErrorModel
 from .errors import Quantity as Quantity

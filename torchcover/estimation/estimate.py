@@ -1,4 +1,4 @@
-"""Estimates from sums in blocks, and the numbers and differences that are read from them."""
+"""Estimates from sums in blocks, and the numbers and differences that they give."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -23,18 +23,18 @@ from torchcover.estimation.errors import (
 
 
 class Number(NamedTuple):
-    """A number of a rig, with all that decides it; NaN where something is unknown.
+    """Number of a rig with the conditions under which it was measured; NaN where a part is unknown.
 
     Args:
-        quantity: What it is.
-        value: In the unit of the quantity; NaN if it is unknown.
-        error: Its standard error, over blocks of contiguous steps or worlds.
-        low: Lower end of its 95 % interval, as from `torchcover.estimation.interval95`.
+        quantity: Meaning of the number.
+        value: In the unit of the quantity; NaN if unknown.
+        error: Standard error over blocks of contiguous frames or over scenes.
+        low: Lower end of the 95 % confidence interval (`torchcover.estimation.compute_interval95`).
         high: Upper end.
-        count: How many it is over.
-        counted_items: What these are: "known cells", "objects", "voxels", ...
-        parameters: What else it was computed with.
-        warning: What makes it unfit for a comparison, in words.
+        count: Number of items that the number averages.
+        counted_items: Name of these items: "observed cells", "objects", "voxels", ...
+        parameters: Further parameters of the computation.
+        warning: Reason why the number is not suited for comparisons, as a sentence.
 
     Example:
         >>> number = Number(Quantity("k_cover", "seen by two sensors", "share", lower_is_better=False), 0.25, count=12)
@@ -54,24 +54,24 @@ class Number(NamedTuple):
 
     @property
     def has_value(self) -> bool:
-        """Whether it has a value."""
+        """Whether the value is known."""
         return not math.isnan(self.value)
 
 
 class Difference(NamedTuple):
-    """What a rig has more than another one, in the same steps and against the same reference points.
+    """Difference of a rig to a baseline rig over the same frames and reference points.
 
     Args:
-        quantity: What the two numbers are.
-        value: In its unit, a share in [-1, 1]; NaN if unknown.
-        error: Standard error of `value` itself, which is less than that of the two numbers: what makes a step easy or
-            hard for both rigs cancels out. NaN if there are not enough blocks.
-        low: Lower end of its 95 % interval, as from `torchcover.estimation.interval95`.
+        quantity: Meaning of both numbers.
+        value: Rig minus baseline, in the unit of the quantity; of shares in [-1, 1]; NaN if unknown.
+        error: Standard error of `value`; smaller than those of the two numbers, since the difficulty of a frame affects
+            both rigs and cancels out. NaN if there are not enough blocks.
+        low: Lower end of the 95 % confidence interval (`torchcover.estimation.compute_interval95`).
         high: Upper end.
-        is_significant: Whether the difference is more than chance, by Student's t at 95 %; None if that is unknown.
-        p_value: Probability of a t at least as large to either side if there were no difference.
-        block_count: Blocks of contiguous steps, or worlds, that it comes from.
-        better_count: In how many of them the rig is better than the other.
+        is_significant: Result of Student's t-test at 95 %; None if unknown.
+        p_value: Two-sided p-value.
+        block_count: Number of blocks of contiguous frames, or of scenes.
+        better_count: Number of blocks in which the rig is better than the baseline.
     """
 
     quantity: Quantity
@@ -86,36 +86,39 @@ class Difference(NamedTuple):
 
     @property
     def improvement(self) -> float:
-        """The difference with the sign turned so that more is better."""
+        """Difference with the sign chosen so that positive is better."""
         return self.quantity.compute_improvement(self.value)
 
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    """Several numbers at once, with what they become without one block of steps, or one world, after the other.
+    """Several numbers with their jackknife values: the numbers without each block of frames, or without each scene.
 
     Args:
-        quantities: What the Q numbers are.
-        value: (Q,) float64 from all steps; NaN where unknown.
-        jackknife_values: (g, Q) without each block.
-        frame_counts: (g,) int64 steps in these blocks, each above 0.
-        recompute: From (R, g) how often each block comes to (R, Q) what the numbers were then; None if that is unknown.
-        effective_blocks: (Q,) how many blocks of equal weight would say as much: Kish's (sum of w)^2 / sum of w^2 over what is
-            divided by in each. With fewer than 8 there is no interval. The number of blocks if not given.
-        strata: Of a mixture, the weights, which sum to 1, and what is mixed; empty of all else.
+        quantities: Meaning of the Q numbers.
+        value: (Q,) float64 from all frames; NaN where unknown.
+        jackknife_values: (g, Q) numbers without each block.
+        frame_counts: (g,) int64 frames in these blocks, each above 0.
+        recompute: Function from (R, g) block weights to the (R, Q) numbers if each block occurs as often as its weight;
+            None if unknown.
+        effective_blocks: (Q,) number of equally weighted blocks with the same information: Kish's
+            (sum of w)^2 / sum of w^2 over the denominators w of the blocks. With fewer than 8 there is no interval. By
+            default the number of blocks.
+        strata: Weights that sum to 1, and estimates, of a mixture; empty otherwise.
 
     Example:
         >>> detection = Quantity("detection_0.4m", "detection within 0.4 m", "share", lower_is_better=False)
-        >>> m2 = torch.full((8,), 10.0, dtype=torch.float64)
-        >>> seen, more = (torch.arange(8.0, dtype=torch.float64)[:, None] + shift for shift in (0.0, 0.5))
-        >>> one, other = (Estimate.from_ratios((detection,), m2, each, torch.ones(8)) for each in (seen, more))
-        >>> number, = one.to_numbers().values()
+        >>> m2, frames = torch.full((8,), 10.0, dtype=torch.float64), torch.ones(8)
+        >>> detected_m2 = torch.arange(8.0, dtype=torch.float64)[:, None]
+        >>> baseline = Estimate.from_ratios((detection,), m2, detected_m2, frames)
+        >>> rig = Estimate.from_ratios((detection,), m2, detected_m2 + 0.5, frames)
+        >>> number, = baseline.to_numbers().values()
         >>> round(number.value, 3), round(number.error, 3)
         (0.35, 0.087)
-        >>> difference, = other.compute_differences(one).values()
+        >>> difference, = rig.compute_differences(baseline).values()
         >>> round(difference.value, 3), difference.block_count, difference.better_count
         (0.05, 8, 8)
-        >>> one.resample(torch.tensor([[1.0] * 8, [1.0] + [0.0] * 7]))
+        >>> baseline.resample(torch.tensor([[1.0] * 8, [1.0] + [0.0] * 7]))
         tensor([[0.3500],
                 [0.0000]], dtype=torch.float64)
     """
@@ -125,7 +128,7 @@ class Estimate:
     jackknife_values: Tensor
     frame_counts: Tensor
     recompute: Callable[[Tensor], Tensor] | None = None
-    effective_blocks: Tensor = None  # type: ignore[assignment]  # until the next line
+    effective_blocks: Tensor = None  # type: ignore[assignment]  # set in __post_init__
     strata: tuple[tuple[float, "Estimate"], ...] = ()
 
     def __post_init__(self) -> None:
@@ -134,48 +137,46 @@ class Estimate:
 
     @classmethod
     def from_values(cls, quantities: Sequence[Quantity], value: Tensor) -> "Estimate":
-        """Of numbers (Q,) that no block is known of, and so no error."""
+        """Create an estimate of numbers without blocks, and so without errors.
+
+        Args:
+            quantities: Meaning of the numbers.
+            value: (Q,) numbers.
+        """
         return cls(tuple(quantities), value, value.new_empty((0, len(value))), value.new_empty(0, dtype=torch.int64))
 
     @classmethod
     def from_ratios(
         cls, quantities: Sequence[Quantity], denominators: Tensor, numerators: Tensor, frame_counts: Tensor
     ) -> "Estimate":
-        """Ratios of sums in blocks, and what they become without each block.
+        """Estimate ratios of sums over blocks.
 
         Args:
-            quantities: What they are.
-            denominators: (B,) what is divided by; or (B, Q), of each.
-            numerators: (B, Q) sums.
-            frame_counts: (B,) steps in each block; 0 in blocks that are not in use.
+            quantities: Meaning of the ratios.
+            denominators: (B,) denominators of all quantities, or (B, Q) of each.
+            numerators: (B, Q) numerators.
+            frame_counts: (B,) frames in each block; 0 in unused blocks.
         """
-        whole = numerators.sum(dim=0) / denominators.sum(dim=0)
+        value = numerators.sum(dim=0) / denominators.sum(dim=0)
         used = frame_counts.nonzero().flatten() if len(frame_counts) > 1 else frame_counts[:0]
-        denominators, numerators = (
-            (denominators if denominators.dim() == 2 else denominators[:, None])[used],
-            numerators[used],
-        )
-        without = _without_each(numerators) / _without_each(denominators)
-        effective = (denominators.sum(dim=0) ** 2 / denominators.square().sum(dim=0)).expand(len(whole))
-        return cls(
-            tuple(quantities),
-            whole,
-            without,
-            frame_counts[used],
-            partial(_ratios_again, denominators, numerators),
-            effective,
-        )
+        denominators, numerators = denominators[used], numerators[used]
+        if denominators.dim() == 1:
+            denominators = denominators[:, None]
+        jackknife_values = _sum_without_each(numerators) / _sum_without_each(denominators)
+        effective_blocks = (denominators.sum(dim=0) ** 2 / denominators.square().sum(dim=0)).expand(len(value))
+        recompute = partial(_recompute_ratios, denominators, numerators)
+        return cls(tuple(quantities), value, jackknife_values, frame_counts[used], recompute, effective_blocks)
 
     @classmethod
     def from_blocks(
         cls, quantities: Sequence[Quantity], recompute: Callable[[Tensor], Tensor], frame_counts: Tensor
     ) -> "Estimate":
-        """Of numbers that say for themselves what they become if blocks come more or less often.
+        """Estimate numbers that a function computes from block weights.
 
         Args:
-            quantities: What they are.
+            quantities: Meaning of the numbers.
             recompute: As in `Estimate`; float64.
-            frame_counts: (g,) steps in each block, all above 0.
+            frame_counts: (g,) frames in each block, all above 0.
         """
         once = torch.ones(1, len(frame_counts), dtype=torch.float64, device=frame_counts.device)
         values = recompute(torch.cat([once, 1.0 - torch.diag(once[0])]))
@@ -183,62 +184,62 @@ class Estimate:
 
     @classmethod
     def from_strata(cls, strata: Sequence[tuple[float, "Estimate"]]) -> "Estimate":
-        """The weighted mean of the same numbers of several strata, which are given and not drawn.
+        """Combine estimates of fixed strata, such as kinds of scene, to their weighted mean.
 
-        Its variance is the sum of theirs, times the squares of the weights; that has as many degrees of freedom as
-        Welch and Satterthwaite say. No stratum makes up for the blocks that another one lacks.
+        The variance is the sum of the variances of the strata times the squared weights; its degrees of freedom follow
+        Welch and Satterthwaite. Each stratum needs enough blocks of its own.
 
         Args:
-            strata: Weights above 0 that sum to 1, and the numbers.
+            strata: Weights above 0 that sum to 1, and estimates of the same quantities.
 
         Example:
             >>> radius = Quantity("radius_m", "mean blind spot radius", "m", lower_is_better=True)
-            >>> m2, metres = torch.ones(16, dtype=torch.float64), torch.arange(16.0, dtype=torch.float64)[:, None]
-            >>> low, high = (Estimate.from_ratios((radius,), m2, metres + more, m2) for more in (0.0, 10.0))
+            >>> m2, radius_m = torch.ones(16, dtype=torch.float64), torch.arange(16.0, dtype=torch.float64)[:, None]
+            >>> low, high = (Estimate.from_ratios((radius,), m2, radius_m + offset, m2) for offset in (0.0, 10.0))
             >>> mean, = Estimate.from_strata([(0.5, low), (0.5, high)]).to_numbers().values()
             >>> bool(mean.value == 12.5), round(mean.error / low.error.item(), 3)
             (True, 0.707)
         """
-        each = [one for _, one in strata]
-        value = torch.stack([weight * one.value for weight, one in strata]).sum(dim=0)
-        effective = torch.stack([one.effective_blocks for one in each]).amin(dim=0)
-        steps, left_out = (
-            torch.cat([one.frame_counts for one in each]),
-            torch.cat([one.jackknife_values for one in each]),
-        )
-        return cls(each[0].quantities, value, left_out, steps, None, effective, tuple(strata))
+        estimates = [estimate for _, estimate in strata]
+        value = torch.stack([weight * estimate.value for weight, estimate in strata]).sum(dim=0)
+        effective_blocks = torch.stack([estimate.effective_blocks for estimate in estimates]).amin(dim=0)
+        frame_counts = torch.cat([estimate.frame_counts for estimate in estimates])
+        jackknife_values = torch.cat([estimate.jackknife_values for estimate in estimates])
+        quantities = estimates[0].quantities
+        return cls(quantities, value, jackknife_values, frame_counts, None, effective_blocks, tuple(strata))
 
-    def __getitem__(self, which: slice) -> "Estimate":
-        """Some of the numbers."""
+    def __getitem__(self, columns: slice) -> "Estimate":
+        """Select some of the numbers."""
         if self.strata:
-            return Estimate.from_strata([(weight, one[which]) for weight, one in self.strata])
-        again = None if self.recompute is None else partial(_some_again, self.recompute, which)
-        some = (
-            self.value[which],
-            self.jackknife_values[:, which],
+            return Estimate.from_strata([(weight, stratum[columns]) for weight, stratum in self.strata])
+        return Estimate(
+            self.quantities[columns],
+            self.value[columns],
+            self.jackknife_values[:, columns],
             self.frame_counts,
-            again,
-            self.effective_blocks[which],
+            None if self.recompute is None else partial(_recompute_columns, self.recompute, columns),
+            self.effective_blocks[columns],
         )
-        return Estimate(self.quantities[which], *some)
 
     def truncate_blocks(self, num_blocks: int) -> "Estimate":
-        """What it was after the first blocks alone."""
-        again = self.recompute
-        assert again is not None  # known of all that is a ratio of sums
-        rest = len(self.frame_counts) - num_blocks
-        return Estimate.from_blocks(
-            self.quantities, lambda some: again(pad(some, (0, rest))), self.frame_counts[:num_blocks]
-        )
-
-    def resample(self, block_weights: Tensor) -> Tensor | None:
-        """What the numbers were if other worlds had come, for intervals of what is made from numbers of several rigs.
+        """Return the estimate from the first blocks alone.
 
         Args:
-            block_weights: (R, g) how often each block comes, in each of R draws.
+            num_blocks: Number of blocks that are kept. Requires `recompute`, which all ratios of sums have.
+        """
+        assert self.recompute is not None
+        omitted_blocks = len(self.frame_counts) - num_blocks
+        recompute = partial(_recompute_padded, self.recompute, omitted_blocks)
+        return Estimate.from_blocks(self.quantities, recompute, self.frame_counts[:num_blocks])
+
+    def resample(self, block_weights: Tensor) -> Tensor | None:
+        """Recompute the numbers for resampled blocks (bootstrap).
+
+        Args:
+            block_weights: (R, g) how often each block occurs in each of R samples.
 
         Returns:
-            (R, Q) float64; None if it is unknown.
+            (R, Q) float64; None if the numbers cannot be recomputed.
         """
         return None if self.recompute is None else self.recompute(block_weights.to(self.value))
 
@@ -248,102 +249,134 @@ class Estimate:
         return self.compute_errors()
 
     def compute_errors(self, min_blocks: int = MIN_BLOCKS) -> Tensor:
-        """(Q,) standard errors by the block jackknife.
+        """Compute the standard errors by the block jackknife.
 
         Args:
-            min_blocks: Fewer blocks than these give none. Errors that are shown need 8; who only races rigs against each
-                other is content with 3 worlds.
+            min_blocks: Smallest number of blocks with an error: 8 for reported errors, 3 for early stopping of a search.
+
+        Returns:
+            (Q,) standard errors; NaN for too few blocks.
         """
         if self.strata:
-            return (
-                torch.stack([(weight * one.compute_errors(min_blocks)) ** 2 for weight, one in self.strata])
-                .sum(dim=0)
-                .sqrt()
-            )
+            variances = [(weight * stratum.compute_errors(min_blocks)) ** 2 for weight, stratum in self.strata]
+            return torch.stack(variances).sum(dim=0).sqrt()
         return compute_jackknife_error(self.jackknife_values, self.value, self.frame_counts, min_blocks)
 
     @property
     def degrees_of_freedom(self) -> list[int]:
-        """(Q,) degrees of freedom of the errors: the blocks less one, or in a mixture what they come to."""
+        """(Q,) degrees of freedom of the errors: blocks minus one, or by Welch and Satterthwaite in a mixture."""
         if not self.strata:
             return [len(self.frame_counts) - 1] * len(self.value)
-        variances = torch.stack([(weight * one.error) ** 2 for weight, one in self.strata])
-        most = torch.tensor([one.degrees_of_freedom for _, one in self.strata], device="cpu").to(variances)
-        # As shares, as fourth powers of errors may vanish.
-        found = 1 / ((variances / variances.sum(dim=0)) ** 2 / most).sum(dim=0)
-        return [int(each + 1e-9) for each in found.where(found.isfinite(), most.amin(dim=0)).tolist()]
+        variances = torch.stack([(weight * stratum.error) ** 2 for weight, stratum in self.strata])
+        stratum_degrees = torch.tensor([stratum.degrees_of_freedom for _, stratum in self.strata], device="cpu")
+        stratum_degrees = stratum_degrees.to(variances)
+        # Computed from shares of the variance, since fourth powers of errors may underflow.
+        degrees = 1 / ((variances / variances.sum(dim=0)) ** 2 / stratum_degrees).sum(dim=0)
+        degrees = degrees.where(degrees.isfinite(), stratum_degrees.amin(dim=0))
+        return [int(degree + 1e-9) for degree in degrees.tolist()]
 
     @property
     def has_intervals(self) -> list[bool]:
-        """Whether 8 blocks or more are in effect, of each number."""
-        enough: list[bool] = (self.effective_blocks > MIN_BLOCKS - ROUND_OFF).tolist()
-        return enough
+        """Whether each number has at least 8 effective blocks."""
+        result: list[bool] = (self.effective_blocks > MIN_BLOCKS - ROUND_OFF).tolist()
+        return result
 
     def to_numbers(self, *, count: int = 0, counted_items: str = "") -> dict[str, Number]:
-        """The numbers by the keys of their quantities; of fewer than 8 blocks in effect without intervals.
+        """Convert to numbers by the key of their quantity; without intervals for fewer than 8 effective blocks.
 
         Args:
-            count: How many they are over.
-            counted_items: What these are.
+            count: Number of items that the numbers average.
+            counted_items: Name of these items.
         """
-        # Blocks, in a mixture those of each stratum, that all say the same prove nothing.
-        each = [one.error > ROUND_OFF for _, one in self.strata] or [self.error > ROUND_OFF]
-        found, varies = {}, torch.stack(each).all(dim=0).tolist()
-        errors = [error if known else math.nan for error, known in zip(self.error.tolist(), varies, strict=True)]
-        numbers = self.quantities, self.value.tolist(), errors, self.has_intervals, self.degrees_of_freedom
-        for quantity, value, error, has_interval, freedom in zip(*numbers, strict=True):
-            ends = compute_interval95(value, error if has_interval else math.nan, freedom, quantity)
-            found[quantity.key] = Number(quantity, value, error, *ends, count, counted_items)
-        return found
+        # Equal blocks, in a mixture equal blocks of any stratum, prove nothing about other blocks.
+        strata = [stratum for _, stratum in self.strata] or [self]
+        has_errors = torch.stack([stratum.error > ROUND_OFF for stratum in strata]).all(dim=0).tolist()
+        values, errors = self.value.tolist(), self.error.tolist()
+        has_intervals, all_degrees = self.has_intervals, self.degrees_of_freedom
+        numbers = {}
+        for index, quantity in enumerate(self.quantities):
+            error = errors[index] if has_errors[index] else math.nan
+            interval_error = error if has_intervals[index] else math.nan
+            low, high = compute_interval95(values[index], interval_error, all_degrees[index], quantity)
+            numbers[quantity.key] = Number(quantity, values[index], error, low, high, count, counted_items)
+        return numbers
 
     def subtract(self, baseline: "Estimate") -> "Estimate":
-        """The difference to another rig over the same steps: what both share cancels out, block by block."""
+        """Estimate the difference to a baseline over the same frames; shared variation cancels out in each block.
+
+        Args:
+            baseline: Estimate of the same quantities in the same blocks.
+        """
         if self.strata:
-            pairs = zip(self.strata, baseline.strata, strict=True)
-            return Estimate.from_strata([(weight, one.subtract(against)) for (weight, one), (_, against) in pairs])
-        both = self.value - baseline.value, self.jackknife_values - baseline.jackknife_values, self.frame_counts, None
-        return Estimate(self.quantities, *both, torch.minimum(self.effective_blocks, baseline.effective_blocks))
+            differences = []
+            for (weight, stratum), (_, baseline_stratum) in zip(self.strata, baseline.strata, strict=True):
+                differences.append((weight, stratum.subtract(baseline_stratum)))
+            return Estimate.from_strata(differences)
+        return Estimate(
+            self.quantities,
+            self.value - baseline.value,
+            self.jackknife_values - baseline.jackknife_values,
+            self.frame_counts,
+            effective_blocks=torch.minimum(self.effective_blocks, baseline.effective_blocks),
+        )
 
     def compute_differences(self, baseline: "Estimate") -> dict[str, Difference]:
-        """The differences to the same numbers of another rig over the same steps, by the keys of the quantities.
+        """Compare with a baseline over the same frames.
 
-        What is from fewer than 8 blocks in effect has no interval, and is neither significant nor chance.
+        Args:
+            baseline: Estimate of the same quantities in the same blocks.
+
+        Returns:
+            Difference by the key of its quantity. With fewer than 8 effective blocks it has no interval, and its
+            significance is unknown.
         """
         # Two infinite numbers are equal; their difference would be NaN, which means unknown.
-        values = (self.value - baseline.value).where(self.value != baseline.value, 0.0)
-        between, blocks = self.subtract(baseline), len(self.frame_counts)
-        parts = [one for _, one in between.strata] or [between]
-        each = torch.cat([compute_pseudo_values(one.jackknife_values, one.value, one.frame_counts) for one in parts])
-        found = {}
-        numbers = self.quantities, values.tolist(), between.error.tolist(), between.degrees_of_freedom
-        for at, (quantity, value, error, freedom) in enumerate(zip(*numbers, strict=True)):
-            judged = error if between.has_intervals[at] else math.nan
-            low, high = compute_interval95(value, judged, freedom, quantity, is_difference=True)
-            found[quantity.key] = Difference(
+        values = (self.value - baseline.value).where(self.value != baseline.value, 0.0).tolist()
+        estimate = self.subtract(baseline)
+        pseudo_values = []
+        for stratum in [stratum for _, stratum in estimate.strata] or [estimate]:
+            pseudo_values.append(compute_pseudo_values(stratum.jackknife_values, stratum.value, stratum.frame_counts))
+        block_differences = torch.cat(pseudo_values)
+        errors, all_degrees, has_intervals = (
+            estimate.error.tolist(),
+            estimate.degrees_of_freedom,
+            estimate.has_intervals,
+        )
+        differences = {}
+        for index, quantity in enumerate(self.quantities):
+            value, degrees = values[index], all_degrees[index]
+            error = errors[index] if has_intervals[index] else math.nan
+            low, high = compute_interval95(value, error, degrees, quantity, is_difference=True)
+            sign = -1 if quantity.lower_is_better else 1
+            differences[quantity.key] = Difference(
                 quantity=quantity,
                 value=value,
-                error=error,
+                error=errors[index],
                 low=low,
                 high=high,
-                is_significant=is_significant(value, judged, freedom),
-                p_value=compute_student_p(value / judged, freedom) if judged > ROUND_OFF else math.nan,
-                block_count=blocks,
-                better_count=int((-each[:, at] if quantity.lower_is_better else each[:, at]).gt(ROUND_OFF).sum()),
+                is_significant=is_significant(value, error, degrees),
+                p_value=compute_student_p(value / error, degrees) if error > ROUND_OFF else math.nan,
+                block_count=len(self.frame_counts),
+                better_count=int((sign * block_differences[:, index]).gt(ROUND_OFF).sum()),
             )
-        return found
+        return differences
 
 
-def _without_each(sums: Tensor) -> Tensor:
-    """(g, ...) what all blocks but each add up to; not by a difference, which infinite radii would not survive."""
-    none = sums.new_zeros((1, *sums.shape[1:]))
-    before = torch.cat([none, sums])[:-1].cumsum(dim=0)
-    after = torch.cat([sums, none])[1:].flip(0).cumsum(dim=0).flip(0)
+def _sum_without_each(sums: Tensor) -> Tensor:
+    """Compute (g, ...) sums over all blocks except each; not by subtraction, which infinite radii would turn to NaN."""
+    zero = sums.new_zeros((1, *sums.shape[1:]))
+    before = torch.cat([zero, sums])[:-1].cumsum(dim=0)
+    after = torch.cat([sums, zero])[1:].flip(0).cumsum(dim=0).flip(0)
     return before + after
 
 
-def _ratios_again(base: Tensor, sums: Tensor, weights: Tensor) -> Tensor:
-    return (weights @ sums) / (weights @ base.to(sums))
+def _recompute_ratios(denominators: Tensor, numerators: Tensor, weights: Tensor) -> Tensor:
+    return (weights @ numerators) / (weights @ denominators.to(numerators))
 
 
-def _some_again(again: Callable[[Tensor], Tensor], which: slice, weights: Tensor) -> Tensor:
-    return again(weights)[:, which]
+def _recompute_columns(recompute: Callable[[Tensor], Tensor], columns: slice, weights: Tensor) -> Tensor:
+    return recompute(weights)[:, columns]
+
+
+def _recompute_padded(recompute: Callable[[Tensor], Tensor], omitted_blocks: int, weights: Tensor) -> Tensor:
+    return recompute(pad(weights, (0, omitted_blocks)))

@@ -1,4 +1,4 @@
-"""Rigid transforms, boxes, height fields, and rays through voxels. Knows no other part of the house."""
+"""Geometry: rigid transforms, trajectories, boxes and height fields; independent of all other packages."""
 
 import lazy_loader
 

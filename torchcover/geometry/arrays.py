@@ -1,4 +1,4 @@
-"""Types of NumPy arrays, by what they hold."""
+"""NumPy array types by dtype."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -1,4 +1,4 @@
-"""Heights over a plane: a raster of them, and one that is fitted to scattered places of which some are wrong."""
+"""Height fields: heights on a raster, also fitted to scattered positions with outliers."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -7,25 +7,18 @@ import numpy as np
 
 from torchcover.geometry.arrays import Bools, Float64
 
-# The next but one corner has this share of a place, which counts for nothing where any other has one.
-VERGE_SHARE = 1e-3
-ROUNDS = 4
-# A place farther above what is all about it than this share of a scale's square, or below, counts for nothing: it is on
-# a bridge, a roof or stairs, or wrong. No street is so steep.
-STEEPEST = 0.15
-# What a corner of the raster needs, in places that lie there, to be believed by half.
-DOUBT = 0.01
-# A plane through places that are hardly wider than this may not lean to their side.
-NARROW_M = 3.0
+# Weight of a position for corners that are one cell farther away than the corners of its cell. It only matters at
+# corners without any closer position, such as those at the verges of a street.
+VERGE_WEIGHT = 1e-3
 
 
 class HeightField(NamedTuple):
-    """Heights at the corners of a raster; two triangles are between four of them.
+    """Heights at the corners of a raster, interpolated over two triangles per cell.
 
     Args:
-        origin_m: (2,) the first corner.
-        corner_heights_m: (rows, columns) heights, rows along y.
-        cell_m: Side of a square.
+        origin_m: (2,) x, y of the first corner in meters.
+        corner_heights_m: (rows, columns) heights in meters, rows along y.
+        cell_m: Side length of a cell in meters.
 
     Example:
         >>> field = HeightField(np.zeros(2), np.array([[0.0, 1.0], [2.0, 3.0]]), 10.0)
@@ -39,62 +32,74 @@ class HeightField(NamedTuple):
 
     @property
     def corner_positions_m(self) -> Float64:
-        """(rows x columns, 2) of the corners."""
+        """(rows * columns, 2) positions of the corners."""
         rows, columns = self.corner_heights_m.shape
         y, x = np.indices((rows, columns)).reshape(2, -1)
         return self.origin_m + self.cell_m * np.stack([x, y], axis=1)
 
     def add_base(self, base_height_m: Callable[[Float64], Float64]) -> "HeightField":
-        """The same above heights that are not 0."""
-        return self._replace(
-            corner_heights_m=self.corner_heights_m
-            + base_height_m(self.corner_positions_m).reshape(self.corner_heights_m.shape)
-        )
+        """Add a base surface to the heights.
+
+        Args:
+            base_height_m: Function from (N, 2) positions to (N,) heights of the base in meters.
+        """
+        base_m = base_height_m(self.corner_positions_m).reshape(self.corner_heights_m.shape)
+        return self._replace(corner_heights_m=self.corner_heights_m + base_m)
 
     def compute_heights_m(self, positions_m: Float64) -> Float64:
-        """(N,) at (N, 2) places; beyond its border those of the border."""
+        """Interpolate heights.
+
+        Args:
+            positions_m: (N, 2) positions in meters; positions outside have the height of the nearest border.
+
+        Returns:
+            (N,) heights in meters.
+        """
         cells = (positions_m - self.origin_m) / self.cell_m
         rows, columns = self.corner_heights_m.shape
         low = np.clip(cells.astype(np.int64), 0, [columns - 2, rows - 2])
         x, y = np.clip(cells - low, 0.0, 1.0).T
-        corners_m, here = self.corner_heights_m.ravel(), low[:, 1] * columns + low[:, 0]
-        first, across = corners_m[here], corners_m[here + columns + 1]
-        # The triangles share the diagonal from the first to the one across: below it lies the right corner.
-        right = x >= y
-        side = corners_m[np.where(right, here + 1, here + columns)]
-        far, near = np.maximum(x, y), np.minimum(x, y)
-        return np.asarray(first + far * (side - first) + near * (across - side))
+        heights_m, corner = self.corner_heights_m.ravel(), low[:, 1] * columns + low[:, 0]
+        first_m, opposite_m = heights_m[corner], heights_m[corner + columns + 1]
+        # The triangles share the diagonal from the first corner to the opposite one; the right triangle is below it.
+        is_right = x >= y
+        side_m = heights_m[np.where(is_right, corner + 1, corner + columns)]
+        return np.asarray(first_m + np.maximum(x, y) * (side_m - first_m) + np.minimum(x, y) * (opposite_m - side_m))
 
 
 def accumulate_heights(
     cell_positions: Float64, heights_m: Float64, num_rows: int, num_columns: int, weights: Float64 | float = 1.0
 ) -> tuple[Float64, Float64]:
-    """(rows, columns) sums of weighted heights, and of weights, of (N, 2) places for the corners around each.
+    """Accumulate weighted heights at the corners around each position.
 
-    The next but one have a share, too, that counts for nothing where anything else does: the verges of a street.
+    Weights are bilinear within a cell. Corners one cell farther away get `VERGE_WEIGHT` times as much.
 
     Args:
-        cell_positions: (N, 2) the places, counted in squares from the first corner.
-        heights_m: (N,) their heights.
-        num_rows: Of the raster's corners.
-        num_columns: Likewise.
-        weights: (N,) of each place, or of all.
+        cell_positions: (N, 2) positions x, y in cells from the first corner.
+        heights_m: (N,) heights in meters.
+        num_rows: Number of corners along y.
+        num_columns: Number of corners along x.
+        weights: (N,) weight of each position, or one weight of all.
+
+    Returns:
+        (rows, columns) sums of weighted heights, and (rows, columns) sums of weights.
     """
     low = np.floor(cell_positions).astype(np.int64)
-    inside = ((low >= 0) & (low < [num_columns - 1, num_rows - 1])).all(axis=1)
-    weights = np.broadcast_to(weights, len(cell_positions))[inside]
-    low, (x, y), heights_m = low[inside], (cell_positions[inside] - low[inside]).T, heights_m[inside]
+    is_inside = ((low >= 0) & (low < [num_columns - 1, num_rows - 1])).all(axis=1)
+    weights = np.broadcast_to(weights, len(cell_positions))[is_inside]
+    low, (x, y), heights_m = low[is_inside], (cell_positions[is_inside] - low[is_inside]).T, heights_m[is_inside]
     sums = np.zeros((2, num_rows * num_columns))
-    for right, along in ((0, 1 - x), (1, x)):
-        for above, across in ((0, 1 - y), (1, y)):
-            share = along * across * weights
-            corner = (low[:, 1] + above) * num_columns + low[:, 0] + right
-            sums[0] += np.bincount(corner, share * heights_m, num_rows * num_columns)
-            sums[1] += np.bincount(corner, share, num_rows * num_columns)
-    around = np.pad(sums.reshape(2, num_rows, num_columns), ((0, 0), (1, 1), (1, 1)))
-    beside = around[:, :-2] + around[:, 1:-1] + around[:, 2:]
-    total, weight = around[:, 1:-1, 1:-1] + VERGE_SHARE * (beside[..., :-2] + beside[..., 1:-1] + beside[..., 2:])
-    return total, weight
+    for column_offset, x_weight in ((0, 1 - x), (1, x)):
+        for row_offset, y_weight in ((0, 1 - y), (1, y)):
+            corner_weights = x_weight * y_weight * weights
+            corner = (low[:, 1] + row_offset) * num_columns + low[:, 0] + column_offset
+            sums[0] += np.bincount(corner, corner_weights * heights_m, num_rows * num_columns)
+            sums[1] += np.bincount(corner, corner_weights, num_rows * num_columns)
+    padded = np.pad(sums.reshape(2, num_rows, num_columns), ((0, 0), (1, 1), (1, 1)))
+    row_sums = padded[:, :-2] + padded[:, 1:-1] + padded[:, 2:]
+    neighborhood_sums = row_sums[..., :-2] + row_sums[..., 1:-1] + row_sums[..., 2:]
+    height_sums, weight_sums = padded[:, 1:-1, 1:-1] + VERGE_WEIGHT * neighborhood_sums
+    return height_sums, weight_sums
 
 
 def fit_height_field(
@@ -107,66 +112,83 @@ def fit_height_field(
     above_weight: float = 0.5,
     base_field: HeightField | None = None,
 ) -> HeightField:
-    """Heights everywhere, through most of (N, 2) places.
+    """Fit a height field to scattered positions of which some are outliers.
 
-    A plane that goes on level beyond the places, and on it, from coarse to fine, what is left over: at each scale a
-    raster of its means, weighted by Tukey's biweight (`STEEPEST`), some rounds. Where nobody stands a scale adds
-    nothing.
+    The result is the sum of a plane, level outside of the positions, and of one raster per scale, from coarse to fine,
+    which averages the residuals of the scale before. All are reweighted iteratively with Tukey's biweight. A scale adds
+    nothing where there are no positions.
 
     Args:
-        positions_m: The places.
-        heights_m: (N,) their heights.
-        extent_m: (2,) how far the raster reaches from 0.
-        cell_sizes_m: Sides of the rasters' squares; each is half of the one before.
-        trusted_mask: (N,) which ones are right for sure; none if not given.
-        above_weight: What a place counts that lies too high; one that lies too low counts the rest of 1. With less than a
-            half, the heights are those of the lowest.
-        base_field: Instead of a plane; its squares are twice as large as the first.
+        positions_m: (N, 2) positions x, y in meters.
+        heights_m: (N,) heights in meters.
+        extent_m: (2,) largest x, y of the raster in meters.
+        cell_sizes_m: Cell size of each scale in meters; each is half of the one before.
+        trusted_mask: (N,) positions that are no outliers; by default none.
+        above_weight: Weight of positions above the surface; those below weigh 1 minus this. With less than 0.5 the
+            surface follows the lowest positions.
+        base_field: Surface instead of a plane; its cells are twice as large as those of the first scale.
 
     Returns:
-        The heights on the raster of the last scale, which begins two squares before 0.
+        Heights on the raster of the last scale, which begins two cells before 0.
     """
     trusted_mask = np.zeros(len(heights_m), dtype=np.bool_) if trusted_mask is None else trusted_mask
-    weights = np.ones(len(heights_m))
-    base = _plane(positions_m, heights_m, weights) if base_field is None else base_field.compute_heights_m
-    for _ in range(ROUNDS if base_field is None else 0):
-        weights = _weights(heights_m - base(positions_m), trusted_mask, 2 * cell_sizes_m[0], above_weight)
-        base = _plane(positions_m, heights_m, weights)
-    left_m, layers = heights_m - base(positions_m), HeightField(np.zeros(2), np.zeros((2, 2)), 1.0)
-    for scale_m in cell_sizes_m:
-        weights = _weights(left_m, trusted_mask, scale_m, above_weight)
-        for _ in range(ROUNDS):
-            layer = _layer(positions_m, left_m, weights, scale_m, extent_m)
-            over_m = left_m - layer.compute_heights_m(positions_m)
-            weights = _weights(over_m, trusted_mask, scale_m, above_weight)
-        left_m = over_m
-        # The triangles of a scale lie within those of the one before: nothing is lost.
-        layers = layer.add_base(layers.compute_heights_m)
-    return layers.add_base(base)
+    num_rounds = 4
+    if base_field is not None:
+        compute_base_m = base_field.compute_heights_m
+    else:
+        compute_base_m = _fit_plane(positions_m, heights_m, np.ones(len(heights_m)))
+        for _ in range(num_rounds):
+            residuals_m = heights_m - compute_base_m(positions_m)
+            weights = _compute_weights(residuals_m, trusted_mask, 2 * cell_sizes_m[0], above_weight)
+            compute_base_m = _fit_plane(positions_m, heights_m, weights)
+    residuals_m = heights_m - compute_base_m(positions_m)
+    total = HeightField(np.zeros(2), np.zeros((2, 2)), 1.0)
+    for cell_m in cell_sizes_m:
+        weights = _compute_weights(residuals_m, trusted_mask, cell_m, above_weight)
+        for _ in range(num_rounds):
+            layer = _fit_layer(positions_m, residuals_m, weights, cell_m, extent_m)
+            layer_residuals_m = residuals_m - layer.compute_heights_m(positions_m)
+            weights = _compute_weights(layer_residuals_m, trusted_mask, cell_m, above_weight)
+        residuals_m = layer_residuals_m
+        # The triangles of a scale lie within those of the scale before, so that the sum is exact.
+        total = layer.add_base(total.compute_heights_m)
+    return total.add_base(compute_base_m)
 
 
-def _weights(left_m: Float64, trusted: Bools, scale_m: float, beneath: float) -> Float64:
-    """Tukey's: (N,) 1 for whom nothing is left over, 0 for whom it is too much; fewer for those above if so asked."""
-    weights = np.clip(1.0 - (left_m / (STEEPEST * scale_m)) ** 2, 0.0, 1.0) ** 2
-    weights *= np.where(left_m > 0, 2 * beneath, 2 * (1 - beneath))
-    weights[trusted] = 1.0
+def _compute_weights(residuals_m: Float64, trusted_mask: Bools, cell_m: float, above_weight: float) -> Float64:
+    """Compute (N,) weights by Tukey's biweight: 1 without residual, 0 for outliers."""
+    # Steeper than any street over one cell: bridges, roofs, stairs or wrong heights.
+    cutoff_m = 0.15 * cell_m
+    weights = np.clip(1.0 - (residuals_m / cutoff_m) ** 2, 0.0, 1.0) ** 2
+    weights *= np.where(residuals_m > 0, 2 * above_weight, 2 * (1 - above_weight))
+    weights[trusted_mask] = 1.0
     return weights
 
 
-def _plane(across_m: Float64, heights_m: Float64, weights: Float64) -> Callable[[Float64], Float64]:
-    """Least squares; level beyond the places."""
-    middle_m = np.average(across_m, axis=0, weights=weights)
-    height_m = float(np.average(heights_m, weights=weights))
-    apart_m = across_m - middle_m
-    spread_m2 = (weights[:, None] * apart_m).T @ apart_m / weights.sum() + NARROW_M**2 * np.eye(2)
-    slope = np.linalg.solve(spread_m2, (weights * (heights_m - height_m)) @ apart_m / weights.sum())
-    lower_m, upper_m = across_m.min(axis=0), across_m.max(axis=0)
-    return lambda places_m: height_m + (np.clip(places_m, lower_m, upper_m) - middle_m) @ slope
+def _fit_plane(positions_m: Float64, heights_m: Float64, weights: Float64) -> Callable[[Float64], Float64]:
+    """Fit a plane by weighted least squares; it is level outside of the bounds of the positions."""
+    center_m = np.average(positions_m, axis=0, weights=weights)
+    center_height_m = float(np.average(heights_m, weights=weights))
+    offsets_m = positions_m - center_m
+    # Regularization for positions along a line: over a width of a few meters the slope across is not determined.
+    regularization_m2 = 3.0**2 * np.eye(2)
+    covariance_m2 = (weights[:, None] * offsets_m).T @ offsets_m / weights.sum() + regularization_m2
+    slope = np.linalg.solve(covariance_m2, (weights * (heights_m - center_height_m)) @ offsets_m / weights.sum())
+    lower_m, upper_m = positions_m.min(axis=0), positions_m.max(axis=0)
+
+    def compute_plane_heights_m(query_m: Float64) -> Float64:
+        return np.asarray(center_height_m + (np.clip(query_m, lower_m, upper_m) - center_m) @ slope)
+
+    return compute_plane_heights_m
 
 
-def _layer(across_m: Float64, left_m: Float64, weights: Float64, scale_m: float, size_m: Float64) -> HeightField:
-    """The raster of one scale: 0 where nobody stands."""
-    first_m = np.full(2, -2 * scale_m)
-    columns, rows = (np.ceil(size_m / scale_m).astype(np.int64) + 5).tolist()
-    total, weight = accumulate_heights((across_m - first_m) / scale_m, left_m, rows, columns, weights)
-    return HeightField(first_m, total / (weight + DOUBT), scale_m)
+def _fit_layer(
+    positions_m: Float64, residuals_m: Float64, weights: Float64, cell_m: float, extent_m: Float64
+) -> HeightField:
+    """Fit the raster of one scale; its heights are 0 at corners without positions."""
+    origin_m = np.full(2, -2 * cell_m)
+    columns, rows = (np.ceil(extent_m / cell_m).astype(np.int64) + 5).tolist()
+    cell_positions = (positions_m - origin_m) / cell_m
+    height_sums, weight_sums = accumulate_heights(cell_positions, residuals_m, rows, columns, weights)
+    prior_weight = 0.01  # weight of positions at which a corner takes half of their mean height
+    return HeightField(origin_m, height_sums / (weight_sums + prior_weight), cell_m)

@@ -9,21 +9,19 @@ from numpy.typing import ArrayLike, NDArray
 
 Matrix = NDArray[np.float64]
 
-# A calibration printed with four decimals passes; a scaled, sheared or mirrored matrix does not.
+# Accepts calibrations that were printed with four decimals, and rejects scaled, sheared and mirrored matrices.
 RIGID_TOLERANCE = 1e-3
-# So many points stay in the cache from one step of a calculation to the next.
-POINTS_AT_ONCE = 4096
 
 
 def build_transform(rotation: ArrayLike, translation_m: ArrayLike) -> Matrix:
-    """Assemble a transform from a rotation and a translation, or many of them.
+    """Build transforms from rotations and translations.
 
     Args:
-        rotation: (..., 3, 3) rotation matrix.
-        translation_m: (..., 3) position of the source frame's origin in the destination frame, in metres.
+        rotation: (..., 3, 3) rotation matrices.
+        translation_m: (..., 3) origin of the source frame in the destination frame, in meters.
 
     Returns:
-        (..., 4, 4) float64 matrix.
+        (..., 4, 4) float64 matrices.
 
     Example:
         >>> build_transform(np.eye(3), [1.0, 2.0, 3.0])[:3, 3]
@@ -37,7 +35,13 @@ def build_transform(rotation: ArrayLike, translation_m: ArrayLike) -> Matrix:
 
 
 def invert(destination_T_source: Matrix) -> Matrix:
-    """Invert a rigid transform, or each of (..., 4, 4): `source_T_destination`, by transposing the rotation.
+    """Invert rigid transforms by transposing their rotation.
+
+    Args:
+        destination_T_source: (..., 4, 4) rigid transforms.
+
+    Returns:
+        (..., 4, 4) `source_T_destination`.
 
     Example:
         >>> world_T_vehicle = build_transform(convert_euler_to_rotation(90.0, 0.0, 0.0), [5.0, 0.0, 0.0])
@@ -49,10 +53,18 @@ def invert(destination_T_source: Matrix) -> Matrix:
 
 
 def convert_euler_to_rotation(yaw_deg: ArrayLike, pitch_deg: ArrayLike, roll_deg: ArrayLike) -> Matrix:
-    """Rotation by roll about x, then pitch about y, then yaw about z (all axes fixed): R = Rz(yaw) Ry(pitch) Rx(roll).
+    """Convert yaw, pitch and roll to rotation matrices: R = Rz(yaw) Ry(pitch) Rx(roll), about fixed axes.
 
-    In a frame with x forward, y left, z up a positive yaw turns left, a positive pitch turns the nose DOWN
-    (right-handed about y) and a positive roll lowers the right side. Of (...) angles the rotations are (..., 3, 3).
+    In a frame with x forward, y left, z up, a positive yaw turns left, a positive pitch turns the nose DOWN
+    (right-handed about y), and a positive roll lowers the right side.
+
+    Args:
+        yaw_deg: (...) rotation about z in degrees.
+        pitch_deg: (...) rotation about y in degrees.
+        roll_deg: (...) rotation about x in degrees, applied first.
+
+    Returns:
+        (..., 3, 3) rotation matrices.
 
     Example:
         >>> convert_euler_to_rotation(90.0, 0.0, 0.0).round(6) @ [1.0, 0.0, 0.0]
@@ -71,33 +83,40 @@ def convert_euler_to_rotation(yaw_deg: ArrayLike, pitch_deg: ArrayLike, roll_deg
 
 
 def convert_rotation_to_euler(rotation: Matrix) -> Matrix:
-    """Yaw, pitch and roll in degrees: the inverse of `convert_euler_to_rotation`. Straight up or down, the roll is 0.
+    """Convert rotation matrices to yaw, pitch and roll; the inverse of `convert_euler_to_rotation`.
 
     Args:
         rotation: (..., 3, 3) rotation matrices.
 
     Returns:
-        (..., 3) yaw, pitch, roll.
+        (..., 3) yaw, pitch, roll in degrees; the roll is 0 at a pitch of +-90 degrees.
 
     Example:
         >>> convert_rotation_to_euler(convert_euler_to_rotation(30.0, -20.0, 10.0)).round(9)
         array([ 30., -20.,  10.])
     """
     r = rotation
-    horizontal = np.hypot(r[..., 0, 0], r[..., 1, 0])
-    upright = horizontal < 1e-9
-    yaw = np.where(upright, np.arctan2(-r[..., 0, 1], r[..., 1, 1]), np.arctan2(r[..., 1, 0], r[..., 0, 0]))
-    # Near the vertical yaw and roll are each uncertain. With the roll taken from what this very yaw leaves of the
-    # rotation, their errors cancel.
-    cosine, sine = np.cos(yaw), np.sin(yaw)
-    left = sine * r[..., 0, 2] - cosine * r[..., 1, 2], cosine * r[..., 1, 1] - sine * r[..., 0, 1]
-    roll = np.where(upright, 0.0, np.arctan2(*left))
-    pitch = np.arctan2(-r[..., 2, 0], horizontal)
+    cos_pitch = np.hypot(r[..., 0, 0], r[..., 1, 0])
+    is_vertical = cos_pitch < 1e-9
+    yaw = np.where(is_vertical, np.arctan2(-r[..., 0, 1], r[..., 1, 1]), np.arctan2(r[..., 1, 0], r[..., 0, 0]))
+    # Near the vertical, yaw and roll are each uncertain. Computed from the rotation without this yaw, the roll has an
+    # error that cancels with that of the yaw.
+    cos_yaw, sin_yaw = np.cos(yaw), np.sin(yaw)
+    sin_roll = sin_yaw * r[..., 0, 2] - cos_yaw * r[..., 1, 2]
+    cos_roll = cos_yaw * r[..., 1, 1] - sin_yaw * r[..., 0, 1]
+    roll = np.where(is_vertical, 0.0, np.arctan2(sin_roll, cos_roll))
+    pitch = np.arctan2(-r[..., 2, 0], cos_pitch)
     return np.asarray(np.rad2deg(np.stack([yaw, pitch, roll], axis=-1)))
 
 
 def convert_quaternion_to_rotation(wxyz: ArrayLike) -> Matrix:
-    """(..., 3, 3) rotation matrices of quaternions (..., 4), each w, x, y, z, which are normalised first.
+    """Convert quaternions to rotation matrices.
+
+    Args:
+        wxyz: (..., 4) quaternions w, x, y, z of any norm above 0.
+
+    Returns:
+        (..., 3, 3) rotation matrices.
 
     Raises:
         ValueError: A quaternion is not four finite numbers, or its norm is 0.
@@ -112,7 +131,7 @@ def convert_quaternion_to_rotation(wxyz: ArrayLike) -> Matrix:
     largest = np.abs(quaternion).max(axis=-1, keepdims=True)
     if not largest.all():
         raise ValueError("a quaternion of norm 0 is no rotation; the identity is [1, 0, 0, 0] (w, x, y, z)")
-    scaled = quaternion / largest  # whose square neither overflows nor vanishes
+    scaled = quaternion / largest  # so that squares neither overflow nor underflow
     w, x, y, z = np.moveaxis(scaled / np.linalg.norm(scaled, axis=-1, keepdims=True), -1, 0)
     rotation = np.array(
         [
@@ -125,10 +144,16 @@ def convert_quaternion_to_rotation(wxyz: ArrayLike) -> Matrix:
 
 
 def convert_rotation_to_quaternion(rotation: Matrix) -> Matrix:
-    """(w, x, y, z) of a rotation matrix, w not negative; the inverse of `convert_quaternion_to_rotation`.
+    """Convert a rotation matrix to a quaternion; the inverse of `convert_quaternion_to_rotation`.
 
-    Of the symmetric matrix that a rotation makes of its quaternion it is the eigenvector with the largest eigenvalue
-    (Bar-Itzhack 2000), which no rotation makes inexact.
+    The quaternion is the eigenvector with the largest eigenvalue of a symmetric matrix (Bar-Itzhack 2000), which is
+    exact for all rotations.
+
+    Args:
+        rotation: (3, 3) rotation matrix.
+
+    Returns:
+        (4,) unit quaternion w, x, y, z with w >= 0.
 
     Example:
         >>> convert_rotation_to_quaternion(convert_euler_to_rotation(90.0, 0.0, 0.0)).round(6)
@@ -148,31 +173,39 @@ def convert_rotation_to_quaternion(rotation: Matrix) -> Matrix:
 
 
 def interpolate_quaternions(first_wxyz: Matrix, second_wxyz: Matrix, fraction: Matrix) -> Matrix:
-    """(N, 4) unit quaternions at (N, 1) shares of the shorter way between two of (N, 4) each, at an even rate."""
+    """Interpolate between unit quaternions along the shorter arc at constant angular velocity (slerp).
+
+    Args:
+        first_wxyz: (N, 4) unit quaternions at fraction 0.
+        second_wxyz: (N, 4) unit quaternions at fraction 1.
+        fraction: (N, 1) fractions in [0, 1].
+
+    Returns:
+        (N, 4) unit quaternions.
+    """
     cosine = (first_wxyz * second_wxyz).sum(axis=1, keepdims=True)
     second_wxyz, cosine = np.where(cosine < 0, -second_wxyz, second_wxyz), np.abs(cosine).clip(max=1.0)
     angle = np.arccos(cosine)
-    straight = angle < 1e-6
-    sine = np.where(straight, 1.0, np.sin(angle))
-    of_first = np.where(straight, 1 - fraction, np.sin((1 - fraction) * angle) / sine)
-    of_second = np.where(straight, fraction, np.sin(fraction * angle) / sine)
-    return np.asarray(of_first * first_wxyz + of_second * second_wxyz)
+    is_linear = angle < 1e-6
+    sine = np.where(is_linear, 1.0, np.sin(angle))
+    first_weight = np.where(is_linear, 1 - fraction, np.sin((1 - fraction) * angle) / sine)
+    second_weight = np.where(is_linear, fraction, np.sin(fraction * angle) / sine)
+    return np.asarray(first_weight * first_wxyz + second_weight * second_wxyz)
 
 
 def check_rigid(matrix: ArrayLike, name: str) -> Matrix:
-    """Return `matrix` as float64 if it is a rigid transform, else say by how much it is not.
+    """Check that a matrix is a rigid transform, and orthonormalize its rotation.
 
     Args:
-        matrix: (4, 4) transform as it came from outside.
-        name: What the user calls it, for the message.
+        matrix: (4, 4) transform from a file or a user.
+        name: Name of the matrix in messages.
 
     Returns:
-        (4, 4) float64 copy whose rotation is orthonormal to the last bits (the nearest rotation to a matrix that
-        was printed with a few decimals).
+        (4, 4) float64 copy with the nearest exact rotation, for matrices that were printed with a few decimals.
 
     Raises:
-        ValueError: Not 4x4, not finite, last row not 0 0 0 1, or the 3x3 part deviates from a rotation by more
-            than 1e-3 (scaled, sheared or mirrored).
+        ValueError: The matrix is not 4x4 or not finite, its last row is not 0 0 0 1, or its 3x3 part deviates from a
+            rotation by more than 1e-3 (scaled, sheared or mirrored).
     """
     try:
         array = np.array(matrix, dtype=np.float64)
@@ -201,69 +234,73 @@ def check_rigid(matrix: ArrayLike, name: str) -> Matrix:
 
 
 def transform_points(destination_T_source: Matrix, points_m: NDArray[np.floating]) -> Matrix:
-    """Transform points, in float64 whatever their type, so that UTM-sized coordinates keep their millimetres.
+    """Transform points in float64, so that coordinates of UTM size keep their millimeters.
 
     Args:
         destination_T_source: (4, 4) rigid transform.
-        points_m: (N, 3) points in the source frame.
+        points_m: (N, 3) points in the source frame in meters, any floating-point dtype.
 
     Returns:
-        (N, 3) float64 points in the destination frame.
+        (N, 3) float64 points in the destination frame in meters.
 
     Example:
         >>> transform_points(build_transform(np.eye(3), [0.0, 0.0, 1.7]), np.zeros((1, 3)))
         array([[0. , 0. , 1.7]])
     """
     rotation, translation = destination_T_source[:3, :3], destination_T_source[:3, 3]
-    # R (p - R^T (-t)): the large numbers of a world frame cancel in the subtraction, before anything is multiplied.
+    # R (p - R^T (-t)): the large coordinates of a world frame cancel in the subtraction, before the multiplication.
     shift = rotation.T @ translation
-    moved = np.empty(points_m.shape)
+    transformed = np.empty(points_m.shape)
     for rows in iterate_blocks(len(points_m)):
-        np.matmul(points_m[rows].astype(np.float64, copy=False) + shift, rotation.T, out=moved[rows])
-    return moved
+        np.matmul(points_m[rows].astype(np.float64, copy=False) + shift, rotation.T, out=transformed[rows])
+    return transformed
 
 
 def iterate_blocks(num_points: int) -> Iterator[slice]:
-    """Parts of a cloud, one after the other, for which memory is fast.
+    """Yield slices of a cloud that fit into the CPU cache.
+
+    Args:
+        num_points: Number of points.
 
     Example:
         >>> [(rows.start, rows.stop) for rows in iterate_blocks(5000)]
         [(0, 4096), (4096, 5000)]
     """
-    start = 0
+    block_size, start = 4096, 0
     while start < num_points:
-        # A last point alone goes with the others: by itself it would be rounded another way.
-        stop = num_points if num_points - start <= POINTS_AT_ONCE + 1 else start + POINTS_AT_ONCE
+        # A single last point joins the block before, since NumPy multiplies single rows with other rounding.
+        stop = num_points if num_points - start <= block_size + 1 else start + block_size
         yield slice(start, stop)
         start = stop
 
 
-# Steps of round angles in degrees -> decimals from which a number that equals them in radians is no chance.
-ROUND_DEG = {90: 2, 15: 3, 5: 4}
+# By step of round angles in degrees: number of decimals from which their value in radians is no coincidence.
+DECIMALS_BY_STEP_DEG = {90: 2, 15: 3, 5: 4}
 
 
 def warn_about_radians(angles_deg: Mapping[str, float | Iterable[float]]) -> None:
-    """Warn of angles in degrees that are round angles in radians, such as 1.5708 or 3.14.
+    """Warn about angles in degrees that look like round angles in radians, such as 1.5708 or 3.14.
 
-    Angles of one document have one unit: nothing is said if any of them is more than a full turn in radians.
+    All angles of a document have the same unit: there is no warning if any exceeds a full turn in radians.
 
     Args:
-        angles_deg: Name of each angle, or of several -> what was given for degrees.
+        angles_deg: Angle, or several, in degrees by name.
 
     Warns:
-        UserWarning: One looks like radians.
+        UserWarning: An angle looks like radians.
 
     Example:
         >>> import pytest
         >>> with pytest.warns(UserWarning, match="yaw_deg: 1.5708 looks like 90 degrees in radians"):
         ...     warn_about_radians({"yaw_deg": 1.5708})
     """
-    named = []
+    named_angles: list[tuple[str, float]] = []
     for name, value in angles_deg.items():
-        named += [(name, float(angle)) for angle in ([value] if isinstance(value, int | float) else value)]
-    if any(abs(angle) > 2 * math.pi + 0.01 for _, angle in named):
+        for angle in [value] if isinstance(value, int | float) else value:
+            named_angles.append((name, float(angle)))
+    if any(abs(angle) > 2 * math.pi + 0.01 for _, angle in named_angles):
         return
-    for name, angle in named:
+    for name, angle in named_angles:
         round_deg = find_round_degrees(angle)
         if round_deg is not None:
             warnings.warn(
@@ -273,15 +310,21 @@ def warn_about_radians(angles_deg: Mapping[str, float | Iterable[float]]) -> Non
 
 
 def find_round_degrees(angle_rad: float) -> float | None:
-    """Return the round angle in degrees that a number is in radians, to all of its decimals; None if it is none.
+    """Find the round angle in degrees that equals an angle in radians in all of its decimals.
+
+    Args:
+        angle_rad: Angle in radians, as it was written.
+
+    Returns:
+        Degrees; None if no round angle matches.
 
     Example:
         >>> find_round_degrees(-0.7854), find_round_degrees(1.57), find_round_degrees(0.2)
         (-45, 90, None)
     """
     decimals = len(repr(angle_rad).partition(".")[2])
-    for step_deg, least in ROUND_DEG.items():
+    for step_deg, min_decimals in DECIMALS_BY_STEP_DEG.items():
         degrees = step_deg * round(math.degrees(angle_rad) / step_deg)
-        if degrees and decimals >= least and abs(math.radians(degrees) - angle_rad) <= 10.0**-decimals + 1e-15:
+        if degrees and decimals >= min_decimals and abs(math.radians(degrees) - angle_rad) <= 10.0**-decimals + 1e-15:
             return degrees
     return None

@@ -5,8 +5,6 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from torchcover.coverage import (
-    OF_BODIES,
-    PARTS,
     BevGrid,
     Coverage,
     CoverageMixture,
@@ -17,7 +15,7 @@ from torchcover.coverage import (
     list_region_bands,
 )
 from torchcover.coverage.averages import Average
-from torchcover.coverage.paired import EstimatorGetters, find_leaders
+from torchcover.coverage.paired import find_leaders
 from torchcover.estimation import MIN_BLOCKS, ROUND_OFF, Difference, Quantity
 
 
@@ -125,7 +123,7 @@ class CoverageTable:
         if first.target_sums:
             target_sums = {rig: coverage.target_sums for rig, coverage in coverages.items() if coverage.target_sums}
             target_summaries = {rig: sums.summarize() for rig, sums in target_sums.items()}
-            target_rows = _build_rows(coverages, first.target_sums.region_targets, target_summaries, OF_BODIES)
+            target_rows = _build_rows(coverages, first.target_sums.region_targets, target_summaries, is_target=True)
         return cls(
             quantities=(*first.quantities, *(first.aggregated_numbers.quantities if first.aggregated_numbers else ())),
             grid=first.grid,
@@ -176,13 +174,16 @@ def _build_rows(
     coverages: Mapping[str, Coverage | CoverageMixture],
     region_bands: Sequence[tuple[Region, str]],
     summaries: Mapping[str, Sequence[RegionSummary]],
-    parts: EstimatorGetters = PARTS,
+    *,
+    is_target: bool = False,
 ) -> list[dict[str, Row]]:
     """Build the rows of each region and band (or test target), by rig."""
     rows = []
     for (region, band), rig_summaries in zip(region_bands, zip(*summaries.values(), strict=True), strict=True):
-        differences = compute_differences(coverages, region, band, parts) if len(coverages) > 1 else {}
-        leaders = find_leaders(coverages, region, band, parts)
+        differences: dict[str, dict[str, Difference]] = {}
+        if len(coverages) > 1:
+            differences = compute_differences(coverages, region, band, is_target=is_target)
+        leaders = find_leaders(coverages, region, band, is_target=is_target)
         row = {}
         for rig, summary in zip(coverages, rig_summaries, strict=True):
             leading_keys = frozenset(key for key, leader in leaders.items() if leader == rig)

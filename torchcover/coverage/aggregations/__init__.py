@@ -1,4 +1,4 @@
-"""Aggregations: how radii become maps and numbers of regions. A new one is a class and a line here."""
+"""Aggregations of radii to maps and numbers of regions. A new aggregation is a class and an entry in `AGGREGATIONS`."""
 
 from torchcover.coverage.aggregations.aggregation import Aggregation as Aggregation
 from torchcover.coverage.aggregations.aggregation import BinnedFrame as BinnedFrame
@@ -11,26 +11,29 @@ from torchcover.coverage.aggregations.means import PooledMean as PooledMean
 from torchcover.coverage.aggregations.quantiles import FrameQuantiles as FrameQuantiles
 from torchcover.coverage.aggregations.quantiles import Quantiles as Quantiles
 
-# Those that a metric may have besides the mean of means.
+# Aggregations that a metric may have in addition to the mean of means.
 AGGREGATIONS: tuple[type[Aggregation], ...] = (Maximum, Quantiles, FrameQuantiles, PooledMean)
 
 
 def parse_aggregation(text: str) -> Aggregation:
-    """One of `AGGREGATIONS` by its name, with its parameters behind a colon.
+    """Create an aggregation from its name, with its parameters after a colon.
+
+    Args:
+        text: Name, or name:parameters, such as "quantiles:0.5,0.9".
 
     Raises:
-        ValueError: There is none of this name; parameters that it does not take, or lacks.
+        ValueError: No aggregation has this name, or the parameters are invalid or missing.
 
     Example:
         >>> parse_aggregation("maximum"), parse_aggregation("quantiles:0.5,0.9")
         (Maximum(), Quantiles(levels=(0.5, 0.9)))
     """
     name, _, parameters = text.partition(":")
-    kind = next((kind for kind in AGGREGATIONS if kind.name == name), None)
-    if kind is None:
-        forms = (f"{kind.name}{':' * bool(kind.example)}{kind.example}" for kind in AGGREGATIONS)
+    classes = {aggregation.name: aggregation for aggregation in AGGREGATIONS}
+    if name not in classes:
+        forms = [f"{kind.name}:{kind.example}" if kind.example else kind.name for kind in AGGREGATIONS]
         raise ValueError(f"aggregation {name}: one of {' or '.join(forms)} is needed")
     try:
-        return kind.parse(parameters)
+        return classes[name].parse(parameters)
     except ValueError as error:
         raise ValueError(f"aggregation {text}: {error}") from error

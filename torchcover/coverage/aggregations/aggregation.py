@@ -1,4 +1,4 @@
-"""What an aggregation is: its sums, how a step enters them, and the layers that they make."""
+"""Interface of aggregations: sums, their update by a frame, and the layers that they give."""
 
 import math
 from abc import ABC, abstractmethod
@@ -15,12 +15,12 @@ from torchcover.estimation import Quantity
 
 
 class Layer(NamedTuple):
-    """One quantity over the grid.
+    """Map of one quantity.
 
     Args:
-        quantity: What the values are.
-        values: (H, Y, X) float64 in the quantity's unit, or (C,) before it has the shape of the grid; NaN in a
-            cell that no reference point ever probed.
+        quantity: Meaning of the values.
+        values: (H, Y, X) float64 in the unit of the quantity, or (C,) before expansion to the grid; NaN in unobserved
+            cells.
     """
 
     quantity: Quantity
@@ -28,11 +28,11 @@ class Layer(NamedTuple):
 
 
 class SumState(NamedTuple):
-    """A sum of an aggregation.
+    """Sum of an aggregation.
 
     Args:
-        initial: (..., C) what it is before the first step; float64 or int64.
-        reduction: How two of them become one: added up, or the larger of each entry.
+        initial: (..., C) value before the first frame; float64 or int64.
+        reduction: Merge of two sums: addition, or the larger of each entry.
     """
 
     initial: Tensor
@@ -40,14 +40,14 @@ class SumState(NamedTuple):
 
 
 class BinnedFrame(NamedTuple):
-    """The reference points of one step, in those C cells that they lie in.
+    """Reference points of one frame in the C cells that contain them.
 
     Args:
-        cell_indices: (N,) int64 which of the C cells each point lies in.
-        values: (V, N) float64 of each point: its `radius`, then 1 for each threshold that it is within, or 0; then what
-            there is to say of the sensors, if the metric knows them.
-        weights: (N,) weight of each point; None if all weigh the same.
-        cell_means: Of each value over the points of each cell.
+        cell_indices: (N,) int64 position of the cell of each point among the C cells.
+        values: (V, N) float64 values of each point: its `radius`, then 1 for each threshold that the radius does not
+            exceed, or 0; then values of redundancy if the metric distinguishes sensors.
+        weights: (N,) weight of each point; None if all points weigh the same.
+        cell_means: Mean of each value over the points of each cell.
     """
 
     cell_indices: Tensor
@@ -57,22 +57,23 @@ class BinnedFrame(NamedTuple):
 
     @property
     def radius(self) -> Tensor:
-        """(N,) float64 blind spot radius in metres, at most `max_radius`."""
+        """(N,) float64 blind spot radius in meters, at most the maximum radius."""
         return self.values[0]
 
 
 @dataclass(frozen=True)
 class Aggregation(ABC):
-    """How the radii of a cell, point by point and step by step, become one number, or a few.
+    """Reduction of the radii of a cell, over points and frames, to one or a few numbers.
 
-    It gives maps, and numbers of regions: a region in a height band is one large cell. The numbers have errors where
-    all its states are added up. An aggregation is a frozen dataclass: its fields are part of what the sums of a metric
-    mean. A new one is a class and a line in `AGGREGATIONS`; one with fields reads them in `parse` and `from_keys`.
+    An aggregation gives maps, and numbers of regions, since a region in a height band is one large cell. The numbers
+    have errors if all its sums are additive. An aggregation is a frozen dataclass whose fields define the meaning of the
+    sums of a metric. A new one is a class and an entry in `AGGREGATIONS`; with fields, it overrides `parse` and
+    `from_keys`.
 
     Attributes:
-        name: Tells it from the others; its states begin with it.
-        description: What it gives, in the plural, for what a run says that it left out.
-        example: Its parameters as they are written behind its name; empty if it has none.
+        name: Unique name, the prefix of its sums.
+        description: Plural noun for its results, for messages about omissions.
+        example: Example of its parameters after the colon; empty without parameters.
     """
 
     name: ClassVar[str]
@@ -81,10 +82,13 @@ class Aggregation(ABC):
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """The one with these parameters, which are written as in `example`.
+        """Create the aggregation from its parameters.
+
+        Args:
+            text: Parameters in the format of `example`.
 
         Raises:
-            ValueError: Others than it takes.
+            ValueError: The parameters are invalid.
         """
         if text:
             raise ValueError(f"{cls.name} takes no parameters; leave out what is behind the colon")
@@ -92,35 +96,54 @@ class Aggregation(ABC):
 
     @classmethod
     def from_keys(cls, keys: AbstractSet[str]) -> Self | None:
-        """The one that gives those of some numbers that this kind can give; None if there are none."""
-        one = cls.parse("")
-        return None if keys.isdisjoint(quantity.key for quantity in one.quantities) else one
+        """Create the aggregation that gives some numbers.
+
+        Args:
+            keys: Keys of numbers; keys of other aggregations are ignored.
+
+        Returns:
+            None if no key belongs to this class.
+        """
+        aggregation = cls.parse("")
+        own_keys = {quantity.key for quantity in aggregation.quantities}
+        return None if keys.isdisjoint(own_keys) else aggregation
 
     @property
     def quantities(self) -> tuple[Quantity, ...]:
-        """What it gives a map, and a number of each region of, whatever it has seen."""
-        empty = {name: state.initial.clone() for name, state in self.create_states(1).items()}
-        nothing = torch.zeros(1, dtype=torch.int64, device="cpu")
-        return tuple(layer.quantity for layer in self.compute_layers(empty, nothing, math.inf))
+        """Quantities of its layers and of the numbers of each region."""
+        sums = {name: state.initial.clone() for name, state in self.create_states(1).items()}
+        observed_frames = torch.zeros(1, dtype=torch.int64, device="cpu")
+        return tuple(layer.quantity for layer in self.compute_layers(sums, observed_frames, math.inf))
 
     @abstractmethod
     def create_states(self, num_cells: int) -> dict[str, SumState]:
-        """The empty sums over so many cells, by name."""
+        """Create the initial sums.
+
+        Args:
+            num_cells: Number C of cells.
+
+        Returns:
+            Sums by name.
+        """
 
     @abstractmethod
     def update(self, sums: Mapping[str, Tensor], frame: BinnedFrame) -> None:
-        """Add a step to the empty sums over its cells, in place."""
+        """Add a frame to initial sums over its cells, in place.
+
+        Args:
+            sums: (..., C) sums by name.
+            frame: Points of the frame in C cells.
+        """
 
     @abstractmethod
     def compute_layers(self, sums: Mapping[str, Tensor], observed_frames: Tensor, max_radius_m: float) -> list[Layer]:
-        """What the sums say.
+        """Compute the layers from the sums.
 
         Args:
-            sums: The sums.
-            observed_frames: (C,) steps that had a reference point in each cell.
-            max_radius_m: Saturation of the radius in metres.
+            sums: (..., C) sums by name.
+            observed_frames: (C,) number of frames with a reference point in each cell.
+            max_radius_m: Radius in meters at which r saturates.
 
         Returns:
-            Layers of (C,) values, which the metric gives the shape of the grid, or reads as the numbers of C regions;
-            the same quantities whatever the sums.
+            Layers of (C,) values over cells or regions; their quantities do not depend on the sums.
         """

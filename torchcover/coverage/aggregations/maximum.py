@@ -1,4 +1,4 @@
-"""The maximum: the worst case of a cell."""
+"""Maximum: worst case of a cell."""
 
 import math
 from collections.abc import Mapping
@@ -14,21 +14,20 @@ from torchcover.coverage.quantities import make_radius_quantity
 
 @dataclass(frozen=True)
 class Maximum(Aggregation):
-    """The largest radius of any point of any step."""
+    """Largest radius of any point in any frame."""
 
     name: ClassVar[str] = "maximum"
     description: ClassVar[str] = "maxima"
 
     def create_states(self, num_cells: int) -> dict[str, SumState]:
-        """`radius` (C,): the largest so far, minus infinity before the first."""
-        return {
-            "radius": SumState(torch.full((num_cells,), -math.inf, dtype=torch.float64, device="cpu"), reduction="max")
-        }
+        """Create `radius` (C,): largest radius, minus infinity before the first point."""
+        initial = torch.full((num_cells,), -math.inf, dtype=torch.float64, device="cpu")
+        return {"radius": SumState(initial, reduction="max")}
 
     def update(self, sums: Mapping[str, Tensor], frame: BinnedFrame) -> None:
-        """Keep what is larger."""
+        """Update the largest radius of each cell."""
         sums["radius"].scatter_reduce_(0, frame.cell_indices, frame.radius, "amax")
 
     def compute_layers(self, sums: Mapping[str, Tensor], observed_frames: Tensor, max_radius_m: float) -> list[Layer]:
-        """The largest radius."""
+        """Compute the layer of the largest radius; NaN in unobserved cells."""
         return [Layer(make_radius_quantity("maximum", "largest"), sums["radius"].where(observed_frames > 0, math.nan))]

@@ -1,4 +1,4 @@
-"""Quantiles over points and over steps, from histograms, whose size does not grow with the steps."""
+"""Quantiles over points and over frames, from histograms of fixed size."""
 
 import math
 import re
@@ -14,56 +14,84 @@ from torchcover.coverage.aggregations.aggregation import Aggregation, BinnedFram
 from torchcover.coverage.quantities import make_radius_quantity
 from torchcover.estimation import Quantity
 
-# A sum of weights that misses its target by rounding has reached it: 0.1 + 0.2 + 0.3 is half of 1.2.
-ROUNDED_DOWN = 1 - 1e-9
-# Bins of radii: 20 a decade from 1 cm to 100 m, and one beyond each end.
+# Bins of radii: 20 per decade from 1 cm to 100 m, and one beyond each end.
 RADIUS_EDGES_M = torch.cat(
     [torch.tensor([0.0], device="cpu"), torch.logspace(-2, 2, 81, device="cpu"), torch.tensor([math.inf], device="cpu")]
 ).double()
 
 
 def find_bins(values: Tensor, edges: Tensor) -> Tensor:
-    """(N,) int64 which half-open bin [edges[i], edges[i + 1]) each value is in, -1 outside; of equal edges none is."""
+    """Find the half-open bin [edges[i], edges[i + 1]) of each value.
+
+    Args:
+        values: (N,) values.
+        edges: (B + 1,) ascending edges; a bin between equal edges is always empty.
+
+    Returns:
+        (N,) int64 bins, -1 outside.
+    """
     index = torch.bucketize(values, edges.to(values.device), right=True) - 1
     return index.where(index < len(edges) - 1, -1)
 
 
 def compute_histogram_quantiles(histogram: Tensor, edges: Tensor, levels: Sequence[float]) -> Tensor:
-    """(Q, C) quantiles from (B, C) weights in bins between (B + 1,) ascending edges, linear within a bin.
+    """Compute quantiles from histograms, interpolated linearly within a bin.
 
-    The last edge may be infinite, and then are the quantiles in that bin; NaN in a column without weight.
+    Args:
+        histogram: (B, C) weights in B bins of C cells.
+        edges: (B + 1,) ascending edges; the last may be infinite, and then so are quantiles in the last bin.
+        levels: Q levels in [0, 1].
+
+    Returns:
+        (Q, C) quantiles; NaN in cells without weight.
     """
     edges, cumulative = edges.to(histogram.device), histogram.cumsum(dim=0)
     total = cumulative[-1]
-    rows = []
+    quantiles = []
     for level in levels:
         target = total * level
-        # The second condition matters at level 0: the least value lies in the first bin that has any weight.
-        at = ((cumulative < target * ROUNDED_DOWN) | (cumulative == 0)).sum(dim=0).clamp(max=len(histogram) - 1)
-        weight = histogram.gather(0, at[None])[0]
-        below = cumulative.gather(0, at[None])[0] - weight
-        share = ((target - below) / weight).nan_to_num(0.0).clamp(0, 1)
-        low, high = edges[at], edges[at + 1]
+        # A sum of weights that misses its target by rounding has reached it: 0.1 + 0.2 + 0.3 is half of 1.2.
+        is_below = cumulative < target * (1 - 1e-9)
+        # Level 0 needs the second condition: the smallest value lies in the first bin with any weight.
+        bin_index = (is_below | (cumulative == 0)).sum(dim=0).clamp(max=len(histogram) - 1)
+        weight = histogram.gather(0, bin_index[None])[0]
+        weight_below = cumulative.gather(0, bin_index[None])[0] - weight
+        share = ((target - weight_below) / weight).nan_to_num(0.0).clamp(0, 1)
+        low, high = edges[bin_index], edges[bin_index + 1]
         value = torch.where(high.isinf(), high, low + share * (high - low))
-        rows.append(value.where(total > 0, math.nan))
-    return torch.stack(rows)
+        quantiles.append(value.where(total > 0, math.nan))
+    return torch.stack(quantiles)
 
 
 def check_levels(levels: Sequence[float]) -> tuple[float, ...]:
-    """The levels of quantiles as plain floats."""
+    """Check the levels of quantiles and convert them to plain floats.
+
+    Args:
+        levels: Levels in [0, 1], different in the format of keys.
+
+    Raises:
+        ValueError: There is no level, one is outside [0, 1], or two are equal.
+    """
     checked = tuple(float(level) for level in levels)
-    distinct = {f"{level:g}" for level in checked}  # as the keys of their layers tell them apart
-    if not checked or len(distinct) != len(checked) or not all(0 <= level <= 1 for level in checked):
+    key_parts = {f"{level:g}" for level in checked}
+    if not checked or len(key_parts) != len(checked) or not all(0 <= level <= 1 for level in checked):
         raise ValueError(f"levels: different numbers in [0, 1] are needed; got {tuple(levels)}")
     return checked
 
 
 @dataclass(frozen=True)
 class QuantileAggregation(Aggregation):
-    """Quantiles at some levels, from a `histogram` (bins, C)."""
+    """Quantiles at some levels, from a `histogram` (bins, C).
+
+    Args:
+        levels: Levels in [0, 1].
+
+    Attributes:
+        key_prefix: Text before the level in keys.
+        title_prefix: Text after the level in titles.
+    """
 
     example: ClassVar[str] = "0.5,0.9"
-    # Of the keys and titles: what stands before a level, and behind it.
     key_prefix: ClassVar[str]
     title_prefix: ClassVar[str]
 
@@ -74,45 +102,47 @@ class QuantileAggregation(Aggregation):
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """That at levels with commas between them."""
+        """Create the aggregation from levels that are separated by commas."""
         try:
-            return cls(tuple(map(float, text.split(","))))
+            return cls(tuple(float(level) for level in text.split(",")))
         except ValueError as error:
             raise ValueError(f"levels are needed, as in {cls.name}:{cls.example} ({error})") from error
 
     @classmethod
     def from_keys(cls, keys: AbstractSet[str]) -> Self | None:
-        """That at the levels of the keys."""
-        found = (re.fullmatch(rf"radius_{cls.key_prefix}(0(?:\.\d+)?|1)_m", key) for key in keys)
-        levels = sorted({float(each[1]) for each in found if each})
-        return cls(tuple(levels)) if levels else None
+        """Create the aggregation with the levels in the keys."""
+        levels = set()
+        for key in keys:
+            if match := re.fullmatch(rf"radius_{cls.key_prefix}(0(?:\.\d+)?|1)_m", key):
+                levels.add(float(match[1]))
+        return cls(tuple(sorted(levels))) if levels else None
 
     @property
     def quantities(self) -> tuple[Quantity, ...]:
-        """One for each level."""
-        return tuple(
-            make_radius_quantity(f"{self.key_prefix}{level:g}", f"{level:g} {self.title_prefix}")
-            for level in self.levels
-        )
+        """Quantity of each level."""
+        quantities = []
+        for level in self.levels:
+            quantities.append(make_radius_quantity(f"{self.key_prefix}{level:g}", f"{level:g} {self.title_prefix}"))
+        return tuple(quantities)
 
     def compute_layers(self, sums: Mapping[str, Tensor], observed_frames: Tensor, max_radius_m: float) -> list[Layer]:
-        """A map for each level."""
+        """Compute a layer for each level."""
         values = compute_histogram_quantiles(sums["histogram"], RADIUS_EDGES_M, self.levels).clamp(max=max_radius_m)
-        return list(map(Layer, self.quantities, values))
+        return [Layer(quantity, row) for quantity, row in zip(self.quantities, values, strict=True)]
 
 
 @dataclass(frozen=True)
 class Quantiles(QuantileAggregation):
-    """Quantiles of r over the points of a cell, steps weighing the same, from a histogram whose size is fixed.
+    """Quantiles of r over the points of a cell, with equal weight of all frames, from a histogram of fixed size.
 
-    The histogram has 20 bins a decade from 1 cm to 100 m. The error is at most a bin: 12 % of the value, or 1 cm; a
-    quantile over 100 m is given as `max_radius`.
+    The histogram has 20 bins per decade from 1 cm to 100 m. The error is at most one bin: 12 % of the value, or 1 cm; a
+    quantile above 100 m is reported as `max_radius_m`.
 
     Args:
-        levels: Which, in [0, 1].
+        levels: Levels in [0, 1].
 
     Raises:
-        ValueError: No level, or one outside [0, 1].
+        ValueError: There is no level, or one is outside [0, 1].
 
     Example:
         >>> [quantity.key for quantity in Quantiles((0.5, 0.9)).quantities]
@@ -125,34 +155,31 @@ class Quantiles(QuantileAggregation):
     title_prefix: ClassVar[str] = "quantile of the"
 
     def create_states(self, num_cells: int) -> dict[str, SumState]:
-        """`histogram` (bins, C): for each step that has probed the cell, shares that add up to 1."""
-        return {
-            "histogram": SumState(torch.zeros(len(RADIUS_EDGES_M) - 1, num_cells, dtype=torch.float64, device="cpu"))
-        }
+        """Create `histogram` (bins, C): shares that add up to 1 for each frame that observed the cell."""
+        initial = torch.zeros(len(RADIUS_EDGES_M) - 1, num_cells, dtype=torch.float64, device="cpu")
+        return {"histogram": SumState(initial)}
 
     def update(self, sums: Mapping[str, Tensor], frame: BinnedFrame) -> None:
-        """Add the points of a step, each with its share of its cell."""
+        """Add the points of a frame, each with its share of its cell."""
         share = torch.ones_like(frame.radius) if frame.weights is None else frame.weights.double()
         share = share / frame.cell_means.weight_sums[frame.cell_indices]
-        bin_and_cell = (
-            find_bins(frame.radius.clamp(max=1e300), RADIUS_EDGES_M) * len(frame.cell_means.cell_indices)
-            + frame.cell_indices
-        )
-        sums["histogram"].view(-1).index_add_(0, bin_and_cell, share)
+        bins = find_bins(frame.radius.clamp(max=1e300), RADIUS_EDGES_M)
+        flat_indices = bins * len(frame.cell_means.cell_indices) + frame.cell_indices
+        sums["histogram"].view(-1).index_add_(0, flat_indices, share)
 
 
 @dataclass(frozen=True)
 class FrameQuantiles(QuantileAggregation):
-    """Quantiles over the steps that have probed a cell of the mean radius of its points in the step.
+    """Quantiles over the frames that observed a cell, of the mean radius of its points in the frame.
 
-    Where `Quantiles` asks for the bad points of a cell, this asks for its bad moments: at level 0.9, one step in ten
-    is worse. The histogram is that of `Quantiles`, and so is the error.
+    `Quantiles` describes the worst points of a cell, `FrameQuantiles` its worst frames: at level 0.9, one frame in ten
+    is worse. Histogram and error are those of `Quantiles`.
 
     Args:
-        levels: Which, in [0, 1].
+        levels: Levels in [0, 1].
 
     Raises:
-        ValueError: No level, or one outside [0, 1].
+        ValueError: There is no level, or one is outside [0, 1].
     """
 
     name: ClassVar[str] = "frame_quantiles"
@@ -161,10 +188,11 @@ class FrameQuantiles(QuantileAggregation):
     title_prefix: ClassVar[str] = "quantile over frames of the mean"
 
     def create_states(self, num_cells: int) -> dict[str, SumState]:
-        """`histogram` (bins, C): in how many steps the mean radius of the cell fell into each bin."""
-        return {"histogram": SumState(torch.zeros(len(RADIUS_EDGES_M) - 1, num_cells, dtype=torch.int64, device="cpu"))}
+        """Create `histogram` (bins, C): number of frames with the mean radius of the cell in each bin."""
+        initial = torch.zeros(len(RADIUS_EDGES_M) - 1, num_cells, dtype=torch.int64, device="cpu")
+        return {"histogram": SumState(initial)}
 
     def update(self, sums: Mapping[str, Tensor], frame: BinnedFrame) -> None:
-        """Count the step in every cell that it has probed."""
+        """Count the frame in every cell that it observed."""
         bins = find_bins(frame.cell_means.means[0].clamp(max=1e300), RADIUS_EDGES_M)
         sums["histogram"].scatter_(0, bins[None], 1)
