@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from torchcover.coverage import BevGrid
-from torchcover.coverage.target_sums import TRIED
+from torchcover.coverage.target_sums import TargetColumn
 from torchcover.data import SimulatedFrames
 from torchcover.geometry import build_transform
 from torchcover.simulation import PaperReference
@@ -105,7 +105,7 @@ def test_parts_and_other_processes_add_up_to_the_whole(tmp_path):
     first = pickle.loads(pickle.dumps(parts[0]))  # as ranks send them
     first.merge_state(pickle.loads(pickle.dumps(parts[1])))
     assert all(torch.equal(one, first.metric_state[name]) for name, one in whole.metric_state.items())
-    assert (int(whole.num_frames), int(whole.compute()[..., TRIED].sum())) == (5, 5 * 4 * 2)
+    assert (int(whole.num_frames), int(whole.compute()[..., TargetColumn.TRIED].sum())) == (5, 5 * 4 * 2)
     again = NearFieldObserver(frames.simulator, [Target.load("pole")], num_blocks=8)
     again.load_state_dict(whole.state_dict())
     assert torch.equal(again.compute(), whole.compute())

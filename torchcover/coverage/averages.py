@@ -68,9 +68,9 @@ def estimate_area_average(coverage: "Coverage", region: Region, band: str) -> Es
 def sum_area_by_block(coverage: "Coverage", region: Region, band: str) -> tuple[Tensor, Tensor]:
     """Sum over the visible surface of a region in each block of frames.
 
-    R = E[ sum of r dA ] / E[ sum of dA ] is a ratio of additive sums, which does not depend on the number of points, the
-    cell size or the share of observed cells. Either the metric assigned the points to the region by their position, or
-    the bounds of the region are cell edges, so that its cells contain the same points.
+    R = E[ sum of r dA ] / E[ sum of dA ] is a ratio of additive sums, which does not depend on the number of points,
+    the cell size or the share of observed cells. Either the metric assigned the points to the region by their position,
+    or the bounds of the region are cell edges, so that its cells contain the same points.
 
     Args:
         coverage: Result with area weights.

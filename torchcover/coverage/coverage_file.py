@@ -24,7 +24,7 @@ from torchcover.coverage.redundancy import Redundancy, list_redundancy_quantitie
 from torchcover.coverage.region_sums import AggregatedNumbers, RegionSums
 from torchcover.coverage.regions import Region
 from torchcover.coverage.sparse_sums import BlockSums, ObservedCells
-from torchcover.coverage.target_sums import COLUMNS, TargetSums
+from torchcover.coverage.target_sums import TargetColumn, TargetSums
 from torchcover.estimation import Quantity
 from torchcover.files import (
     TooLargeError,
@@ -179,7 +179,7 @@ def _parse_target_sums(record: dict[str, Any], arrays: Arrays) -> TargetSums:
     names = tuple(record.pop("target_names"))
     regions = tuple(_parse_region(region) for region in record.pop("regions"))
     frame_counts, sums, position_counts = (torch.from_numpy(arrays[name]) for name in TARGET_ARRAYS)
-    expected_shapes = (len(frame_counts), len(names), len(regions), len(COLUMNS)), (len(names), *grid.shape[1:], 2)
+    expected_shapes = (len(frame_counts), len(names), len(regions), len(TargetColumn)), (len(names), *grid.shape[1:], 2)
     shapes = tuple(sums.shape), tuple(position_counts.shape)
     if shapes != expected_shapes:
         raise ValueError(f"the sums of {len(names)} test targets have shapes {shapes}, not {expected_shapes}")

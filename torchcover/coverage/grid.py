@@ -174,8 +174,9 @@ class BevGrid:
         Example:
             >>> bands = {"dog": (0.05, 0.5), "child": (0.1, 1.1)}
             >>> grid = BevGrid(x_m=(0.0, 2.0), y_m=(0.0, 1.0), cell_m=1.0, heights=bands)
-            >>> grid.assign_cells(torch.tensor([[0.5, 0.5, 0.0], [0.5, 0.5, 0.3], [1.5, 0.5, 0.9]]))
-            CellAssignment(point_indices=tensor([1, 2]), point_positions=tensor([0, 0, 1]), cell_indices=tensor([0, 2, 3]))
+            >>> assignment = grid.assign_cells(torch.tensor([[0.5, 0.5, 0.0], [0.5, 0.5, 0.3], [1.5, 0.5, 0.9]]))
+            >>> assignment.point_indices, assignment.point_positions, assignment.cell_indices
+            (tensor([1, 2]), tensor([0, 0, 1]), tensor([0, 2, 3]))
         """
         cells = self._compute_cell_indices(points, heights_m)
         is_in_cell = cells >= 0

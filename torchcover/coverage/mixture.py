@@ -29,9 +29,7 @@ class CoverageMixture:
         (_, first), *others = self.weighted_coverages
         for attribute in ("band_frame", "grid", "thresholds_m", "max_radius_m", "average", "regions"):
             if any(getattr(coverage, attribute) != getattr(first, attribute) for _, coverage in others):
-                raise ValueError(
-                    f"scenarios cannot be mixed: they differ in their {attribute}; use the same setting in all scenarios"
-                )
+                raise ValueError(f"scenarios cannot be mixed: they differ in their {attribute}; use the same in all")
         self.grid, self.thresholds_m, self.max_radius_m = first.grid, first.thresholds_m, first.max_radius_m
         self.average, self.quantities = first.average, first.quantities
         self.aggregated_numbers = first.aggregated_numbers

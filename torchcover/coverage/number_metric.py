@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 class CoverageNumberMetric(CoverageMetric):
     """One number of `Coverage.summary`, for `torchmetrics.MetricTracker`, which needs a scalar and its direction.
 
-    Higher is better for detection rates, lower for the radius. In a `MetricCollection`, numbers with the same `grid` and
-    options share their sums, so that each frame is measured once.
+    Higher is better for detection rates, lower for the radius. In a `MetricCollection`, numbers with the same `grid`
+    and options share their sums, so that each frame is measured once.
 
     Args:
         quantity_key: "radius_m", or "detection_0.4m" with one of the thresholds.
@@ -37,7 +37,8 @@ class CoverageNumberMetric(CoverageMetric):
         >>> import torch
         >>> from torchmetrics.wrappers import MetricTracker
         >>> near = Region("near", x_m=(0.0, 2.0), y_m=(0.0, 1.0))
-        >>> tracker = MetricTracker(CoverageNumberMetric("radius_m", near, "ground", BevGrid(x_m=(0.0, 2.0), y_m=(0.0, 1.0))))
+        >>> grid = BevGrid(x_m=(0.0, 2.0), y_m=(0.0, 1.0))
+        >>> tracker = MetricTracker(CoverageNumberMetric("radius_m", near, "ground", grid))
         >>> for x_m in (1.0, 0.5, 1.5):
         ...     tracker.increment()
         ...     tracker.update(torch.zeros(1, 3), torch.tensor([[x_m, 0.0, 0.0]]))

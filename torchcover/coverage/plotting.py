@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 def plot_coverage(coverage: object, ax: "Axes", quantity_key: str | None, band: str | None) -> None:
     """Plot one layer in one height band in bird's-eye view: x to the right, y up, the vehicle at the origin.
 
-    Dark cells are blind, gray cells unobserved. Values beyond the color scale, such as an infinite radius, have its last
-    color.
+    Dark cells are blind, gray cells unobserved. Values beyond the color scale, such as an infinite radius, have its
+    last color.
 
     Args:
         coverage: Result of a `CoverageMetric`.

@@ -26,10 +26,10 @@ class Redundancy:
     Args:
         sensor_names: Names of the sensors.
         observed_cells: K observed cells.
-        sparse_layers: (K,) layers by the key of their quantity, means over area if the coverage is, else means of means:
-            for each threshold the number of sensors that detect a point ("sensors_0.4m") and the share of points that
-            two or more detect ("detected_by_two_0.4m"); for each sensor the radius and the detection rates without it
-            ("radius_m_without_roof").
+        sparse_layers: (K,) layers by the key of their quantity, means over area if the coverage is, else means of
+            means: for each threshold the number of sensors that detect a point ("sensors_0.4m") and the share of points
+            that two or more detect ("detected_by_two_0.4m"); for each sensor the radius and the detection rates without
+            it ("radius_m_without_roof").
     """
 
     sensor_names: tuple[str, ...]

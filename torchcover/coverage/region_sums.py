@@ -18,7 +18,8 @@ class AggregatedNumbers(NamedTuple):
     Args:
         quantities: Q quantities of all aggregations.
         values: (P, Q) float64; NaN where unknown.
-        jackknife_values: (B, P, Q) numbers without each block; NaN for aggregations without errors; B = 0 for one block.
+        jackknife_values: (B, P, Q) numbers without each block; NaN for aggregations without errors; B = 0 for one
+            block.
     """
 
     quantities: tuple[Quantity, ...]

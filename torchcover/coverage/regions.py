@@ -24,7 +24,8 @@ class Region:
         name: Name in tables and loggers.
         x_m: Lower and upper bound along x (forward) in meters.
         y_m: Lower and upper bound along y (left) in meters.
-        corners_m: Corners x, y of a polygon with these bounds, clockwise or counterclockwise; see `Region.from_corners`.
+        corners_m: Corners x, y of a polygon with these bounds, clockwise or counterclockwise; see
+            `Region.from_corners`.
         bands: Names of the height bands for which tables have a row; all bands if empty.
 
     Raises:
@@ -32,7 +33,8 @@ class Region:
             other bounds.
 
     Example:
-        >>> Region("rear", x_m=(-10.0, -2.5), y_m=(-2.5, 2.5)).mask_cells(BevGrid(x_m=(-10.0, 10.0), y_m=(-5.0, 5.0), cell_m=0.5)).sum()
+        >>> grid = BevGrid(x_m=(-10.0, 10.0), y_m=(-5.0, 5.0), cell_m=0.5)
+        >>> Region("rear", x_m=(-10.0, -2.5), y_m=(-2.5, 2.5)).mask_cells(grid).sum()
         tensor(150)
     """
 
@@ -304,8 +306,9 @@ def build_near_field_regions(
         Four regions that do not overlap: "front_3m", "rear_3m", "left_3m", "right_3m".
 
     Example:
-        >>> [(region.name, region.x_m, region.y_m) for region in build_near_field_regions((-0.5, 0.5), (-0.4, 0.4))][1:3]
-        [('rear_3m', (-3.5, -0.5), (-3.4, 3.4)), ('left_3m', (-0.5, 0.5), (0.4, 3.4))]
+        >>> rear = build_near_field_regions((-0.5, 0.5), (-0.4, 0.4))[1]
+        >>> rear.name, rear.x_m, rear.y_m
+        ('rear_3m', (-3.5, -0.5), (-3.4, 3.4))
     """
     full_width_m = y_m[0] - distance_m, y_m[1] + distance_m
     bounds_by_side = {

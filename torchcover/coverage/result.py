@@ -287,8 +287,9 @@ class Coverage:
         """Estimate a single number by its column name in `summary.csv`.
 
         Args:
-            quantity_key: "radius_m" or "detection_0.4m"; "cells_detection_0.4m" over observed cells in a result by area;
-                "radius_maximum_m" of an aggregation; "radius_m_without_roof" and "detected_by_two_0.4m" of redundancy.
+            quantity_key: "radius_m" or "detection_0.4m"; "cells_detection_0.4m" over observed cells in a result by
+                area; "radius_maximum_m" of an aggregation; "radius_m_without_roof" and "detected_by_two_0.4m" of
+                redundancy.
             region: Region within the grid.
             band: Name of the height band.
 

@@ -24,8 +24,8 @@ class RegionRedundancy:
         detecting_sensors: Numbers by key: `"sensors_0.4m"`, the mean number of sensors that detect a point within the
             threshold, and `"detected_by_two_0.4m"`, the share of points that two or more sensors detect.
         failure_numbers: For each sensor, the numbers of the rig without it, by key as in `RegionSummary.numbers`.
-        failure_effects: For each sensor, the rig without it minus the whole rig: at most 0 for detection rates, at least
-            0 for the radius.
+        failure_effects: For each sensor, the rig without it minus the whole rig: at most 0 for detection rates, at
+            least 0 for the radius.
         most_critical_sensor: Sensor whose failure costs most, in the detection rate at the first threshold, or in the
             radius without thresholds; None if no failure changes a number, or nothing is known.
     """
@@ -48,8 +48,8 @@ class RegionSummary:
         average: "area" for means over the visible surface, "cells" over observed cells, or "target_positions" of a test
             target. In the last case `band` is the name of the target, `num_cells` the number of tried positions and
             `observed_cells` the number of free ones.
-        numbers: Numbers by key, such as `"radius_m"` or `"detection_0.4m"`, those of other aggregations last. Errors are
-            NaN without blocks, or with too few frames.
+        numbers: Numbers by key, such as `"radius_m"` or `"detection_0.4m"`, those of other aggregations last. Errors
+            are NaN without blocks, or with too few frames.
         cell_averages: Radius and detection rates over observed cells; equal to `numbers` if that is their average.
         visible_m2: Mean over frames of the area of the region that the reference sensor observes, in square meters; NaN
             without area weights.

@@ -1,8 +1,9 @@
-"""Bodies beside the vehicle: in which share of the free places a rig sees them, and how much of them."""
+"""Visibility of test targets around the vehicle: shares of free positions and of surface with detection."""
 
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from enum import IntEnum
 from typing import Any, NamedTuple
 
 from torch import Tensor
@@ -12,24 +13,38 @@ from torchcover.coverage.regions import Region
 from torchcover.coverage.summary import RegionSummary
 from torchcover.estimation import Estimate, Quantity
 
-# Of a body in a region: places that were tried, those that were free, those of them where it was seen; square metres
-# of it that could be seen there, those of them that were.
-TRIED, FREE, SEEN, VISIBLE, NEAR = COLUMNS = range(5)
+
+class TargetColumn(IntEnum):
+    """Columns of the sums of a target in a region.
+
+    Attributes:
+        TRIED: Positions that were tried.
+        FREE: Positions that were free.
+        DETECTED: Free positions at which the target was detected.
+        VISIBLE_M2: Area of the target that the reference positions observed, in square meters.
+        DETECTED_M2: Area of it that was detected, in square meters.
+    """
+
+    TRIED = 0
+    FREE = 1
+    DETECTED = 2
+    VISIBLE_M2 = 3
+    DETECTED_M2 = 4
 
 
 @dataclass(frozen=True, eq=False)
 class TargetSums:
-    """Sums over the places where bodies were put, one at a time and seen by nothing else, in B fine blocks of steps.
+    """Sums over positions of test targets, which are placed one at a time, in B fine blocks of frames.
 
     Args:
-        target_names: Their names.
-        regions: Where their middles stood.
-        detection_points: How many points are enough to see one.
-        threshold_m: How near a point on it must be to its surface.
+        target_names: Names of the test targets.
+        regions: Regions that contain the centers of the targets.
+        detection_points: Smallest number of points with which a target counts as detected.
+        threshold_m: Largest distance in meters from the surface of a target to a point on it.
         grid: Cells of the maps.
-        frame_counts: (B,) int64 steps in each block at which bodies were put.
-        sums: (B, bodies, regions, 5) float64 of `TRIED`, `FREE`, `SEEN`, `VISIBLE`, `NEAR`.
-        position_counts: (bodies, Y, X, 2) float64 places that were free, and those where the body was seen.
+        frame_counts: (B,) int64 frames with targets in each block.
+        sums: (B, targets, regions, 5) float64 sums by `TargetColumn`.
+        position_counts: (targets, Y, X, 2) float64 free positions, and positions with detection.
     """
 
     target_names: tuple[str, ...]
@@ -43,60 +58,104 @@ class TargetSums:
 
     @property
     def quantities(self) -> tuple[Quantity, ...]:
-        """What there is a number of for each region and body: the share of places, and of surface."""
-        seen = f"free places with {self.detection_points} points or more"
-        near = f"surface within {self.threshold_m:g} m of a point"
+        """Quantities of each region and target: the share of positions and the share of surface."""
+        positions_title = f"free positions with {self.detection_points} points or more"
+        surface_title = f"surface within {self.threshold_m:g} m of a point"
+        positions_key = f"target_positions_{self.detection_points}_points"
+        surface_key = f"target_surface_{self.threshold_m:g}m"
         return (
-            Quantity(f"target_positions_{self.detection_points}_points", seen, "share", lower_is_better=False),
-            Quantity(f"target_surface_{self.threshold_m:g}m", near, "share", lower_is_better=False),
+            Quantity(positions_key, positions_title, "share", lower_is_better=False),
+            Quantity(surface_key, surface_title, "share", lower_is_better=False),
         )
 
     @property
     def region_targets(self) -> list[tuple[Region, str]]:
-        """The regions and bodies that there are numbers of."""
-        return [(region, body) for region in self.regions for body in self.target_names]
+        """Pairs of region and target with numbers."""
+        return [(region, target) for region in self.regions for target in self.target_names]
 
     def estimate(self, region: Region, target_name: str) -> Estimate:
-        """The numbers of a body in a region; NaN where no place was free, or nothing of it could be seen."""
-        own = self._of(region, target_name)
-        return Estimate.from_ratios(self.quantities, own[:, [FREE, VISIBLE]], own[:, [SEEN, NEAR]], self.frame_counts)
+        """Estimate the shares of a target in a region.
+
+        Args:
+            region: One of the regions.
+            target_name: One of the targets.
+
+        Returns:
+            NaN if no position was free, or no surface was visible.
+        """
+        sums = self._get_sums(region, target_name)
+        denominators = sums[:, [TargetColumn.FREE, TargetColumn.VISIBLE_M2]]
+        numerators = sums[:, [TargetColumn.DETECTED, TargetColumn.DETECTED_M2]]
+        return Estimate.from_ratios(self.quantities, denominators, numerators, self.frame_counts)
 
     def summarize(self) -> list[RegionSummary]:
-        """A row for each of `places`: its cells are places that were tried, the known ones those that were free."""
+        """Summarize each of `region_targets`; cells are tried positions, observed cells free ones."""
         rows = []
-        for region, body in self.region_targets:
-            tried, free, _, visible_m2, _ = self._of(region, body).sum(dim=0).tolist()
-            numbers = self.estimate(region, body).to_numbers(count=int(free), counted_items="free places")
-            m2 = visible_m2 / free if free else math.nan
-            rows.append(RegionSummary(region.name, body, int(tried), int(free), "target_positions", numbers, {}, m2))
+        for region, target in self.region_targets:
+            tried, free, _, visible_m2, _ = self._get_sums(region, target).sum(dim=0).tolist()
+            numbers = self.estimate(region, target).to_numbers(count=int(free), counted_items="free positions")
+            rows.append(
+                RegionSummary(
+                    region=region.name,
+                    band=target,
+                    num_cells=int(tried),
+                    observed_cells=int(free),
+                    average="target_positions",
+                    numbers=numbers,
+                    cell_averages={},
+                    visible_m2=visible_m2 / free if free else math.nan,
+                )
+            )
         return rows
 
     def to_record(self) -> dict[str, Any]:
-        """All but the tensors, for JSON."""
-        told = {name: getattr(self, name) for name in ("target_names", "detection_points", "threshold_m")}
-        extent = {"x_m": self.grid.x_m, "y_m": self.grid.y_m, "cell_m": self.grid.cell_m}
-        return {**told, "regions": [asdict(region) for region in self.regions], "grid": extent}
+        """Convert everything except the tensors to a JSON record."""
+        return {
+            "target_names": self.target_names,
+            "detection_points": self.detection_points,
+            "threshold_m": self.threshold_m,
+            "regions": [asdict(region) for region in self.regions],
+            "grid": {"x_m": self.grid.x_m, "y_m": self.grid.y_m, "cell_m": self.grid.cell_m},
+        }
 
-    def _of(self, region: Region, body: str) -> Tensor:
-        return self.sums[:, self.target_names.index(body), self.regions.index(region)]
+    def _get_sums(self, region: Region, target_name: str) -> Tensor:
+        return self.sums[:, self.target_names.index(target_name), self.regions.index(region)]
 
 
 class TargetMixture(NamedTuple):
-    """What `TargetSums` says of one kind of world, of a mixture: of the same `region_targets` in each, with weights."""
+    """Numbers of `TargetSums` as weighted means over scenarios with the same regions and targets.
+
+    Args:
+        parts: Weights that sum to 1, and sums of each scenario.
+        region_targets: Pairs of region and target.
+    """
 
     parts: Sequence[tuple[float, TargetSums]]
     region_targets: Sequence[tuple[Region, str]]
 
     def estimate(self, region: Region, target_name: str) -> Estimate:
-        """As `TargetSums.estimate`."""
-        return Estimate.from_strata([(weight, part.estimate(region, target_name)) for weight, part in self.parts])
+        """Estimate the weighted mean of `TargetSums.estimate`.
+
+        Args:
+            region: As in `TargetSums.estimate`.
+            target_name: As in `TargetSums.estimate`.
+        """
+        return Estimate.from_strata([(weight, sums.estimate(region, target_name)) for weight, sums in self.parts])
 
     def summarize(self) -> list[RegionSummary]:
-        """As `TargetSums.summary`; places are those of all kinds together."""
-        rows = []
-        for place, *each in zip(self.region_targets, *(part.summarize() for _, part in self.parts), strict=True):
-            tried, free = (sum(getattr(row, name) for row in each) for name in ("num_cells", "observed_cells"))
-            numbers = self.estimate(*place).to_numbers(count=free, counted_items="free places")
-            m2 = sum(weight * row.visible_m2 for (weight, _), row in zip(self.parts, each, strict=True))
-            rows.append(replace(each[0], num_cells=tried, observed_cells=free, numbers=numbers, visible_m2=m2))
-        return rows
+        """Summarize as `TargetSums.summarize`; counts of positions are sums over all scenarios."""
+        weights = [weight for weight, _ in self.parts]
+        scenario_rows = zip(*(sums.summarize() for _, sums in self.parts), strict=True)
+        mixed_rows = []
+        for (region, target), rows in zip(self.region_targets, scenario_rows, strict=True):
+            free = sum(row.observed_cells for row in rows)
+            mixed_rows.append(
+                replace(
+                    rows[0],
+                    num_cells=sum(row.num_cells for row in rows),
+                    observed_cells=free,
+                    numbers=self.estimate(region, target).to_numbers(count=free, counted_items="free positions"),
+                    visible_m2=sum(weight * row.visible_m2 for weight, row in zip(weights, rows, strict=True)),
+                )
+            )
+        return mixed_rows

@@ -6,16 +6,16 @@ from typing import NamedTuple, TypeAlias
 import torch
 from torch import Tensor
 
-# "m" for meters, "m2" for square meters, "sensors" for a count of sensors, "nats" for an entropy, ...; a "share" lies in
-# [0, 1], and tables and maps show it in percent.
+# "m" for meters, "m2" for square meters, "sensors" for a count of sensors, "nats" for an entropy, ...; a "share" lies
+# in [0, 1], and tables and maps show it in percent.
 Unit: TypeAlias = str
 
 # With fewer blocks, the error itself is off by more than a quarter: 1 / sqrt(2 (blocks - 1)).
 MIN_BLOCKS = 8
 # Smaller errors are rounding in sums of float64: the estimate does not depend on which block is left out.
 ROUND_OFF = 1e-12
-# Scenes in which a rig is nearly blind are rare and missing from most short runs: the true mean of a length lies on that
-# side more often than on the other, and intervals reach farther there (docs/measured/accuracy.md).
+# Scenes in which a rig is nearly blind are rare and missing from most short runs: the true mean of a length lies on
+# that side more often than on the other, and intervals reach farther there (docs/measured/accuracy.md).
 BLIND_SIDE_FACTOR = 1.25
 
 
@@ -129,9 +129,9 @@ def estimate_ratio_errors(denominators: Tensor, numerators: Tensor, unit: Unit) 
     For R = S / A, sums over blocks of s_j and of a_j, the variance is to first order that of the sum of s_j - R a_j,
     divided by A^2 (Cochran 1977, Sampling Techniques, section 6.4).
 
-    A few equal blocks do not prove that others would be equal. Therefore two pseudo-blocks are added, each with the mean
-    a_j of the observed blocks: in one the rig detects the whole cell, in the other almost nothing, as Agresti & Coull
-    (1998, The American Statistician 52, 119-126) add successes and failures. No error is 0.
+    A few equal blocks do not prove that others would be equal. Therefore two pseudo-blocks are added, each with the
+    mean a_j of the observed blocks: in one the rig detects the whole cell, in the other almost nothing, as Agresti &
+    Coull (1998, The American Statistician 52, 119-126) add successes and failures. No error is 0.
 
     Args:
         denominators: (B, ...) a_j: frames that observed the cell in each block, or square meters observed in it.

@@ -252,7 +252,8 @@ class Estimate:
         """Compute the standard errors by the block jackknife.
 
         Args:
-            min_blocks: Smallest number of blocks with an error: 8 for reported errors, 3 for early stopping of a search.
+            min_blocks: Smallest number of blocks with an error: 8 for reported errors, 3 for early stopping of a
+                search.
 
         Returns:
             (Q,) standard errors; NaN for too few blocks.

@@ -1,8 +1,8 @@
 """Rigid transforms of tensors.
 
 Importing this module initializes the math functions of torch in a single thread. On CPUs torch calls Intel MKL, which
-selects one of its variants at the first call; if several threads make that call together, some may get a much less exact
-variant (github.com/pytorch/pytorch/issues/188792), and the first rays of a camera would differ between processes.
+selects one of its variants at the first call; if several threads make that call together, some may get a much less
+exact variant (github.com/pytorch/pytorch/issues/188792), and the first rays of a camera would differ between processes.
 """
 
 import torch

@@ -21,9 +21,9 @@ from torchcover.geometry.rigid import Matrix
 class Trajectory:
     """Poses of a body at K times, interpolated in between.
 
-    Positions are interpolated linearly, and yaw, pitch and roll along the shorter rotation; above a pitch of 60 degrees,
-    where Euler angles are nearly singular, rotations are interpolated about one axis (slerp). Before the first and after
-    the last time the body stands still.
+    Positions are interpolated linearly, and yaw, pitch and roll along the shorter rotation; above a pitch of 60
+    degrees, where Euler angles are nearly singular, rotations are interpolated about one axis (slerp). Before the first
+    and after the last time the body stands still.
 
     Args:
         times_s: (K,) ascending times in seconds.

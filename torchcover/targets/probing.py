@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchcover.coverage import NEAR_FIELD_M, BevGrid, Region, TargetSums
-from torchcover.coverage.target_sums import COLUMNS, FREE, SEEN, TRIED
+from torchcover.coverage.target_sums import TargetColumn
 from torchcover.frames import Frame
 from torchcover.geometry import BoundingBox, find_overlaps
 from torchcover.geometry.arrays import Bools, Float64, Int64
@@ -143,7 +143,7 @@ class NearFieldObserver(BlockedSums):
         self.near_field_targets = [
             NearFieldTarget.from_target(target, vehicle_box, regions, self.grid) for target in targets
         ]
-        sums_shape = len(rig_names), len(targets), len(regions), len(COLUMNS)
+        sums_shape = len(rig_names), len(targets), len(regions), len(TargetColumn)
         self.define_block_sum("sums", sums_shape, is_fine=True)
         num_map_cells = self.grid.num_cells // len(self.grid.heights)
         self.define_sum("position_counts", (len(rig_names), len(targets), num_map_cells, 2))
@@ -183,7 +183,7 @@ class NearFieldObserver(BlockedSums):
             samples = near_field.sample_positions(self.positions_per_region, generator)
             poses = near_field.vehicle_T_target[samples]
             z_m, is_free = find_free_positions(instant, target, surface, poses)
-            np.add.at(sums[:, target_index, :, TRIED].T, near_field.region_indices[samples], 1.0)
+            np.add.at(sums[:, target_index, :, TargetColumn.TRIED].T, near_field.region_indices[samples], 1.0)
             is_free &= near_field.has_room[samples]
             samples, poses, z_m = samples[is_free], poses[is_free], z_m[is_free]
             visible_bits = surface.find_visible_samples(
@@ -206,7 +206,9 @@ class NearFieldObserver(BlockedSums):
                 rows = np.stack(columns, axis=1)
                 np.add.at(sums[rig_index, target_index], near_field.region_indices[samples], rows)
                 cells = near_field.cell_indices[samples]
-                np.add.at(position_counts[rig_index, target_index], cells, rows[:, [FREE, SEEN]])
+                np.add.at(
+                    position_counts[rig_index, target_index], cells, rows[:, [TargetColumn.FREE, TargetColumn.DETECTED]]
+                )
         block_index = simulator.get_block_index(index)
         return NearFieldFrameSums(block_index, torch.from_numpy(sums), torch.from_numpy(position_counts))
 

@@ -66,8 +66,8 @@ class Aggregation(ABC):
     """Reduction of the radii of a cell, over points and frames, to one or a few numbers.
 
     An aggregation gives maps, and numbers of regions, since a region in a height band is one large cell. The numbers
-    have errors if all its sums are additive. An aggregation is a frozen dataclass whose fields define the meaning of the
-    sums of a metric. A new one is a class and an entry in `AGGREGATIONS`; with fields, it overrides `parse` and
+    have errors if all its sums are additive. An aggregation is a frozen dataclass whose fields define the meaning of
+    the sums of a metric. A new one is a class and an entry in `AGGREGATIONS`; with fields, it overrides `parse` and
     `from_keys`.
 
     Attributes:
