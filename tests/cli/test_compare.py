@@ -145,7 +145,7 @@ def test_the_reference_sensor_is_the_one_that_was_asked_for_and_is_named(torchco
     assert ground.startswith("Ground: level faces under the ego")
     assert summary["reference"] == {"sensor": "paper", "rays_per_frame": 64 * 64, "frame_interval_s": 0.1}
     assert summary["frame_counts"]["reference_rays"] == 2 * 64 * 64
-    assert "Reference sensor: paper, 4,096 rays a step; a step every 0.1 s." in " ".join(printed.split())
+    assert "Reference sensor: paper, 4,096 rays per frame; frame interval 0.1 s." in " ".join(printed.split())
 
 
 @pytest.fixture
@@ -239,15 +239,15 @@ def test_pages_and_maps_of_many_rigs_are_announced_and_refused_where_they_do_not
     assert (code, "page and maps" in error) == (0, False)
     few = compare_saved(sorted((out / "coverage").glob("*.npz")))
     many = replace(few, coverages={str(number): few.coverages["low"] for number in range(200)})
-    assert many.estimate_pictures(FILES) == pytest.approx(100 * np.array(few.estimate_pictures(FILES)))
-    assert many.estimate_pictures(["numbers"]) == (0.0, 0.0)
-    assert "page and maps of 200 rigs take about" in many.announce_pictures("maps,page")
-    assert many.announce_pictures("numbers") == ""
+    assert many.estimate_rendering_cost(FILES) == pytest.approx(100 * np.array(few.estimate_rendering_cost(FILES)))
+    assert many.estimate_rendering_cost(["numbers"]) == (0.0, 0.0)
+    assert "page and maps of 200 rigs take about" in many.describe_rendering_cost("maps,page")
+    assert many.describe_rendering_cost("numbers") == ""
     for needed_bytes, expected in ((3e9, 0), (1e18, 2)):
-        monkeypatch.setattr(Result, "estimate_pictures", lambda *_, needed_bytes=needed_bytes: (needed_bytes, 120.0))
+        monkeypatch.setattr(Result, "estimate_rendering_cost", lambda *_, needed_bytes=needed_bytes: (needed_bytes, 120.0))
         code, _, error, out = compare(torchcover, worlds, "low", "both", out=str(expected))
         assert code == expected
         assert f"page and maps of 2 rigs take about {needed_bytes / 1e9:.2g} GB of memory and 2 min" in error
         assert (out / "coverage" / "low.npz").exists()
         assert (out / "report.html").exists() == (expected == 0)
-    assert "leave the others out by `--files numbers`" in error
+    assert "omit page and maps with `--files numbers`" in error

@@ -13,8 +13,8 @@ def test_a_scene_in_which_nothing_moves_reuses_its_scan(torchcover, worlds):
     options = ["--scenario", worlds / "yard.yaml", "--num-frames", "3", *RAYS, "--explain", "--out", worlds / "out"]
     code, text, complaints = torchcover("evaluate", worlds / "low.yaml", *options)
     assert code == 0, complaints
-    assert "Left out, for this run did not need it" in text
-    reused = whats(worlds / "out")["rays of sensors where nothing moves: cast once, for all steps"]
+    assert "Omissions that cannot change the result" in text
+    reused = whats(worlds / "out")["sensor rays in a static scene: cast once for all frames"]
     assert (reused["count"], reused["total"]) == (2 * 8 * 30, 3 * 8 * 30)  # the first step casts them
     once = [*options[:3], "1", *options[4:]]
     assert torchcover("evaluate", worlds / "low.yaml", *once)[0] == 0
@@ -25,5 +25,5 @@ def test_without_the_option_it_stands_in_the_summary_only(torchcover, worlds):
     options = ["--scenario", worlds / "yard.yaml", "--num-frames", "2", *RAYS, "--out", worlds / "out"]
     code, text, _ = torchcover("compare", worlds / "low.yaml", worlds / "both.yaml", *options)
     assert code == 0
-    assert "Left out" not in text
+    assert "Omissions" not in text
     assert whats(worlds / "out")

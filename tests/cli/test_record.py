@@ -23,7 +23,7 @@ def test_a_recording_has_the_numbers_of_the_simulation(torchcover, worlds, tmp_p
     )
     code, printed, _ = torchcover("evaluate", "--frames", recording, *cell, "--out", read)
     assert code == 0
-    assert "Bodies beside the vehicle: not for recordings" in " ".join(printed.split())
+    assert "No test targets in the near field: a recording" in " ".join(printed.split())
     code, _, told = torchcover("evaluate", "--frames", recording, "--set", "test_targets=child", "--out", read)
     assert (code, "test_targets: not for recordings" in told) == (2, True)
     first, second = (Coverage.load(folder / "coverage.npz") for folder in (measured, read))

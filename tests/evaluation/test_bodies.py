@@ -69,7 +69,7 @@ def test_rows_of_bodies_take_the_place_of_those_of_traffic_in_the_near_field(bot
     )
     text = RENDERERS["text"](both.table)
     assert "Free positions with 5 points or more (%)" in text
-    assert "Bodies: at 8 steps" in " ".join(text.split())
+    assert "Test targets: in 8 frames" in " ".join(text.split())
     assert "free positions" in evaluate(RIGS[0], yard("yard"), **{**SMALL, "num_frames": 1}).tables[1].headings
 
 

@@ -20,7 +20,7 @@ from torchcover import Coverage, RegionsOfInterest, Rig, Scenario
 from torchcover.coverage import Maximum, Quantiles
 from torchcover.data import DEFAULT_REFERENCE, BadFrameError, Frame, FrameDataset
 from torchcover.evaluation import Settings, TargetError, task
-from torchcover.evaluation.result_page import HEAVY
+from torchcover.evaluation.omissions import SLOW_PACKAGES
 from torchcover.evaluation.target_error import MIN_FRAMES, StoppingParams
 
 SMALL = {"num_frames": 2, "cell_m": 4.0, "num_rays": 1024, "test_targets": "pole"}
@@ -84,7 +84,7 @@ def test_one_rig(tmp_path):
     assert places[:6:2] == [("20m", "ground"), ("80m", "ground"), ("160m", "ground")]
     assert places[6:8] == [("left_3m", "ground"), ("right_3m", "ground")]
     assert places[8:] == [(f"{side}_3m", "pole_100cm") for side in ("front", "rear", "left", "right")]
-    assert "front_roof_32: 2 steps" in repr(result)
+    assert "front_roof_32: 2 frames" in repr(result)
     assert "mean blind spot" in str(result)
     stem, figure = next(iter(result.plot_maps()))
     assert (stem, isinstance(figure, Figure)) == ("radius_area_m_ground", True)
@@ -186,11 +186,11 @@ class Ending(PointCount):
     ],
 )
 def test_a_result_that_was_cut_short_says_so_wherever_its_numbers_stand(error, reason):
-    with pytest.warns(RuntimeWarning, match=f"The run was cut short after 3 steps: {re.escape(reason)}.") as told:
+    with pytest.warns(RuntimeWarning, match=f"The run was cut short after 3 frames: {re.escape(reason)}.") as told:
         result = torchcover.evaluate(frames=Single(), cell_m=4.0, observers={"ending": Ending(error)})
     assert [warning.filename for warning in told] == [__file__]
     # Of the frame that ended it, coverage has the step: it was fed before the other observer.
-    assert f"The run was cut short after 3 steps: {reason}." in result.table.notes
+    assert f"The run was cut short after 3 frames: {reason}." in result.table.notes
     assert reason in " ".join(str(result).split())
 
 
@@ -324,8 +324,8 @@ def test_aggregations_are_measured_drawn_and_saved(tmp_path):
     files = result.save(tmp_path)
     assert f"{quantity.key}_ground" in {path.stem for path in files}
     assert quantity.key in Coverage.load(tmp_path / "coverage.npz").layers
-    (kept_not,) = [omission.description for omission in result.omissions if "not kept" in omission.description]
-    assert Maximum.description not in kept_not
+    (unused,) = [omission.description for omission in result.omissions if "not computed" in omission.description]
+    assert Maximum.description not in unused
 
 
 def test_of_detections_alone_the_same_is_known_and_of_radii_nothing():
@@ -353,7 +353,7 @@ def test_of_detections_alone_the_same_is_known_and_of_radii_nothing():
 def test_what_a_run_left_out_is_told_as_it_was_at_its_end(monkeypatch):
     result = torchcover.evaluate(frames=Single(), cell_m=8.0, num_frames=1)
     before = result.record["omissions"]
-    for package in HEAVY:
+    for package in SLOW_PACKAGES:
         monkeypatch.setitem(sys.modules, package, sys)
     assert result.record["omissions"] == before
 

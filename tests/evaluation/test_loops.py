@@ -66,8 +66,8 @@ def test_going_round_again_makes_no_error_smaller(drive):
     assert np.median(errors(often)[known] / errors(once)[known]) > 0.75
     assert often.coverage.block_sums.frame_counts.tolist() == [4] * 8 + [0] * 8
     assert often.record["frame_counts"]["repeated_frames"] == 8 * 3
-    assert "8 different instants in 32 steps: the scenario was seen again, which intervals know." in often.table.notes
-    assert "seen again" not in " ".join(once.table.notes)
+    assert "32 frames show 8 distinct time steps: the scenario repeats, and confidence intervals account for this." in often.table.notes
+    assert "repeats" not in " ".join(once.table.notes)
 
 
 def test_a_target_error_does_not_go_round_and_round(drive):
@@ -88,17 +88,17 @@ def test_where_nothing_moves_errors_are_about_the_reference_and_say_so():
     result = torchcover.evaluate(RIG, "courtyard", num_frames=9, **FEW)
     assert (errors(result)[:2] > 0).all()
     assert (
-        "All 9 steps show the same instant: intervals are about the reference sensor's places only."
+        "All 9 frames show the same time step, so confidence intervals only cover the sampling of reference poses."
         in result.table.notes
     )
 
 
 def test_nothing_is_said_of_errors_where_there_are_none(drive):
     still = torchcover.evaluate(RIG, "courtyard", num_frames=7, **FEW)
-    assert "All 7 steps show the same instant." in still.table.notes
+    assert "All 7 frames show the same time step." in still.table.notes
     few = torchcover.evaluate(RIG, drive(3), num_frames=9, **FEW)
-    assert "3 different instants in 9 steps: the scenario was seen again." in few.table.notes
-    assert not any("interval" in note for note in (*still.table.notes, *few.table.notes))
+    assert "9 frames show 3 distinct time steps: the scenario repeats." in few.table.notes
+    assert not any("confidence interval" in note for note in (*still.table.notes, *few.table.notes))
 
 
 def test_the_steps_of_a_city_are_never_in_two_blocks():

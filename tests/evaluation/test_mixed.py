@@ -1,4 +1,4 @@
-"""Several kinds of world: each as if it were alone, and their mixture by the book."""
+"""Results of several scenarios, and the weighted mixture of their numbers."""
 
 import csv
 import json
@@ -9,14 +9,14 @@ import pytest
 from torchcover import RegionsOfInterest, Rig, compare, evaluate
 from torchcover.evaluation import Checkpoint, MixedResult, Settings
 
-ASKED = RegionsOfInterest.model_validate(
+REGIONS = RegionsOfInterest.model_validate(
     {
         "regions": {"ahead": {"x_m": [2, 22], "y_m": [-5, 5]}},
         "heights": {"ground": [-0.5, 0.5]},
         "grid": {"x_m": [0, 24], "y_m": [-8, 8]},
     }
 )
-SMALL = {"num_frames": 16, "cell_m": 1.0, "num_rays": 256, "regions": ASKED}
+SMALL = {"num_frames": 16, "cell_m": 1.0, "num_rays": 256, "regions": REGIONS}
 RIGS = [
     Rig.model_validate({
         "name": name,
@@ -36,7 +36,7 @@ bodies:
 
 @pytest.fixture(scope="module")
 def yards(tmp_path_factory):
-    """Paths of two worlds that differ in where a wall is."""
+    """Folder of two scenarios that differ in the position of a wall."""
     folder = tmp_path_factory.mktemp("yards")
     for name, wall_m in (("near", 8), ("far", 16)):
         (folder / f"{name}.yaml").write_text(YARD.format(name=name, wall_m=wall_m, height_m=1.5))
@@ -48,47 +48,47 @@ def mixed(yards):
     return evaluate(RIGS, {str(yards / "near.yaml"): 3, str(yards / "far.yaml"): 1.0}, **SMALL)
 
 
-def test_each_world_is_as_if_it_were_alone(mixed, yards):
+def test_each_scenario_has_its_own_result(mixed, yards):
     alone = evaluate(RIGS, yards / "far.yaml", **SMALL)
     assert mixed.scenario_results["far"].summary == alone.summary
     assert list(mixed.scenario_results) == ["near", "far"]
     assert mixed.weights == {"near": 0.75, "far": 0.25}
 
 
-def test_a_mixture_is_the_weighted_mean_and_its_variance_that_of_the_sum(mixed):
-    for at, row in enumerate(mixed.summary):
-        parts = [(mixed.weights[name], world.summary[at]) for name, world in mixed.scenario_results.items()]
+def test_a_mixture_is_the_weighted_mean(mixed):
+    for index, row in enumerate(mixed.summary):
+        parts = [(mixed.weights[name], result.summary[index]) for name, result in mixed.scenario_results.items()]
         assert all(part["rig"] == row["rig"] for _, part in parts)
         for key in NUMBERS:
             assert row[key] == pytest.approx(sum(weight * part[key] for weight, part in parts))
             error = math.sqrt(sum((weight * part[f"{key}_error"]) ** 2 for weight, part in parts))
             assert row[f"{key}_error"] == pytest.approx(error)
-        # From more blocks than one of the worlds has, an interval is shorter for the same error.
+        # The mixture has more blocks than each scenario, so its interval is shorter for the same error.
         assert row["radius_m_low"] < row["radius_m"] < row["radius_m_high"]
         assert row["blocks"] == sum(part["blocks"] for _, part in parts)
         assert row["visible_m2"] == pytest.approx(sum(weight * part["visible_m2"] for weight, part in parts))
 
 
-def test_marks_are_beyond_chance_in_the_mixture(mixed, yards):
+def test_marks_of_a_mixture_need_significance(mixed, yards):
     first, other = mixed.summary
     assert other["detection_0.4m_difference_significant"]
     assert first["detection_0.4m_best"] != other["detection_0.4m_best"]
-    few = evaluate(RIGS, [yards / "near.yaml", yards / "far.yaml"], **{**SMALL, "num_frames": 4})
-    assert not any(row["detection_0.4m_best"] for row in few.summary)
-    # Eight blocks in all are not eight in each.
-    assert all(row["detection_0.4m_low"] is None for row in few.summary)
-    assert "Not enough frames for confidence intervals in near: got 4 blocks" in " ".join(str(few).split())
+    short = evaluate(RIGS, [yards / "near.yaml", yards / "far.yaml"], **{**SMALL, "num_frames": 4})
+    assert not any(row["detection_0.4m_best"] for row in short.summary)
+    # Eight blocks in total are too few: each scenario needs them.
+    assert all(row["detection_0.4m_low"] is None for row in short.summary)
+    assert "Not enough frames for confidence intervals in near: got 4 blocks" in " ".join(str(short).split())
 
 
-def test_redundancy_is_mixed_by_the_book(yards):
+def test_redundancy_of_a_mixture_is_the_weighted_mean(yards):
     rig = RIGS[0].model_copy(
         update={"sensors": tuple(of.sensors[0].model_copy(update={"name": of.name}) for of in RIGS)}
     )
-    given = {str(yards / "near.yaml"): 3, str(yards / "far.yaml"): 1}
-    mixed = evaluate(rig, given, redundancy=True, **SMALL)
+    weights = {str(yards / "near.yaml"): 3, str(yards / "far.yaml"): 1}
+    mixed = evaluate(rig, weights, redundancy=True, **SMALL)
     (row,), parts = (
         mixed.summary,
-        [(mixed.weights[name], world.summary[0]) for name, world in mixed.scenario_results.items()],
+        [(mixed.weights[name], result.summary[0]) for name, result in mixed.scenario_results.items()],
     )
     assert row["most_critical_sensor"] == "high"
     for key in ("sensors_0.4m", "detection_0.4m_without_high", "detection_0.4m_without_high_change"):
@@ -97,7 +97,7 @@ def test_redundancy_is_mixed_by_the_book(yards):
         assert row[f"{key}_error"] == pytest.approx(error)
 
 
-def test_what_kinds_of_world_agree_in_is_said_once_and_else_of_each(mixed, yards, tmp_path):
+def test_common_notes_of_scenarios_appear_once(mixed, yards, tmp_path):
     foggy = yards / "foggy.yaml"
     foggy.write_text(YARD.format(name="foggy", wall_m=8, height_m=1.5) + "weather: {name: fog, visibility_m: 30}\n")
     other = evaluate(RIGS[0], [yards / "near.yaml", foggy], **{**SMALL, "num_frames": 2})
@@ -109,11 +109,11 @@ def test_what_kinds_of_world_agree_in_is_said_once_and_else_of_each(mixed, yards
         file for file in mixed.save(tmp_path, file_kinds="page") if file.parent == tmp_path and file.suffix == ".html"
     )
     text = page.read_text()
-    assert all(said in text for said in ("mixture: Mean blind spot radius", "far: Mean blind", "near 0.75, far 0.25"))
+    assert all(part in text for part in ("mixture: Mean blind spot radius", "far: Mean blind", "near 0.75, far 0.25"))
     assert len(text) < 100_000
 
 
-def test_all_weight_on_one_is_that_one(yards):
+def test_a_scenario_with_all_weight_is_the_mixture(yards):
     paths = [str(yards / f"{name}.yaml") for name in ("near", "far")]
     only = evaluate(RIGS, dict(zip(paths, (0.0, 2.0), strict=True)), **SMALL)
     for row, same in zip(only.summary, only.scenario_results["far"].summary, strict=True):
@@ -121,46 +121,46 @@ def test_all_weight_on_one_is_that_one(yards):
             assert row[key] == pytest.approx(same[key])
 
 
-def test_results_of_one_rig_each_are_compared_as_if_measured_together(mixed, yards):
-    given = {str(yards / "near.yaml"): 0.75, str(yards / "far.yaml"): 0.25}
-    each = [evaluate(rig, given, **SMALL) for rig in RIGS]
-    assert compare(each).summary == mixed.summary
+def test_compared_mixtures_equal_one_common_run(mixed, yards):
+    weights = {str(yards / "near.yaml"): 0.75, str(yards / "far.yaml"): 0.25}
+    results = [evaluate(rig, weights, **SMALL) for rig in RIGS]
+    assert compare(results).summary == mixed.summary
     with pytest.raises(ValueError, match="same scenarios with the same weights"):
-        compare([each[0], MixedResult.from_results(each[1].scenario_results, {"near": 0.5, "far": 0.5})])
+        compare([results[0], MixedResult.from_results(results[1].scenario_results, {"near": 0.5, "far": 0.5})])
     with pytest.raises(ValueError, match="same scenarios with the same weights"):
-        compare([each[0], each[1].scenario_results["far"]])
+        compare([results[0], results[1].scenario_results["far"]])
 
 
-def test_files_hold_every_world_and_the_mixture(mixed, tmp_path):
+def test_files_contain_every_scenario_and_the_mixture(mixed, tmp_path):
     files = mixed.save(tmp_path, file_kinds="numbers")
     assert all(file.is_file() for file in files)
     record = json.loads((tmp_path / "summary.json").read_text())
     assert record["rows"] == mixed.summary
     assert record["sensor_model"] == {"high": "ideal", "low": "ideal"}
-    assert {name: world["weight"] for name, world in record["scenarios"].items()} == mixed.weights
-    for name, world in mixed.scenario_results.items():
-        assert json.loads((tmp_path / name / "summary.json").read_text())["rows"] == world.summary
+    assert {name: scenario["weight"] for name, scenario in record["scenarios"].items()} == mixed.weights
+    for name, result in mixed.scenario_results.items():
+        assert json.loads((tmp_path / name / "summary.json").read_text())["rows"] == result.summary
     with (tmp_path / "summary.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [row["scenario"] for row in rows] == ["near"] * 2 + ["far"] * 2 + ["mixture"] * 2
     assert [float(row["radius_m"]) for row in rows[4:]] == [row["radius_m"] for row in mixed.summary]
     assert {(row["vehicle"], row["sensor_model"]) for row in rows} == {("box", "ideal")}
     assert [stem.split("/")[0] for stem, _ in mixed.plot_maps()][:: len(list(mixed.plot_maps())) - 1] == ["near", "far"]
-    with pytest.raises(ValueError, match=r"worlds\[name\]"):
+    with pytest.raises(ValueError, match=r"scenario_results\[name\]"):
         _ = mixed.coverage
 
 
-def test_each_world_has_a_checkpoint_of_its_own(mixed, yards, tmp_path):
-    given = {str(yards / "near.yaml"): 0.75, str(yards / "far.yaml"): 0.25}
+def test_each_scenario_has_its_own_checkpoint(mixed, yards, tmp_path):
+    weights = {str(yards / "near.yaml"): 0.75, str(yards / "far.yaml"): 0.25}
     checkpoint = Checkpoint(tmp_path / "checkpoint.npz", keep=False)
-    evaluate(RIGS, given, checkpoint=checkpoint, **{**SMALL, "num_frames": 8})
+    evaluate(RIGS, weights, checkpoint=checkpoint, **{**SMALL, "num_frames": 8})
     assert sorted(path.parent.name for path in tmp_path.glob("*/checkpoint.npz")) == ["far", "near"]
-    longer = evaluate(RIGS, given, checkpoint=checkpoint, **SMALL)
+    longer = evaluate(RIGS, weights, checkpoint=checkpoint, **SMALL)
     assert longer.summary == mixed.summary
 
 
 @pytest.mark.parametrize(
-    ("scenario", "says"),
+    ("scenario", "message"),
     [
         ("urban,highway,urban", "given twice"),
         (["near.yaml", "Near.yaml"], "called alike"),
@@ -177,18 +177,18 @@ def test_each_world_has_a_checkpoint_of_its_own(mixed, yards, tmp_path):
         (["urban", "."], "a folder; a recording is no scenario"),
     ],
 )
-def test_what_is_no_mixture_is_refused_before_anything_is_measured(scenario, says, monkeypatch):
+def test_invalid_mixtures_are_rejected_before_the_run(scenario, message, monkeypatch):
     monkeypatch.setattr("torchcover.evaluation.mixed_result.measure_coverage", None)
-    with pytest.raises((ValueError, FileNotFoundError), match=says):
+    with pytest.raises((ValueError, FileNotFoundError), match=message):
         evaluate(RIGS[0], scenario, **SMALL)
 
 
-def test_who_cannot_be_mixed_is_refused_before_anything_is_measured(yards, monkeypatch):
+def test_scenarios_with_different_regions_cannot_be_mixed(yards, monkeypatch):
     monkeypatch.setattr("torchcover.evaluation.mixed_result.measure_coverage", None)
     tall = yards / "tall.yaml"
     tall.write_text(YARD.format(name="tall", wall_m=8, height_m=1.5).replace("[4, 2, 1.5]", "[6, 2, 1.5]"))
     near = str(yards / "near.yaml")
-    with pytest.raises(ValueError, match="near, tall cannot be mixed: the regions around their egos differ"):
+    with pytest.raises(ValueError, match="near, tall cannot be mixed: the regions around their ego vehicles differ"):
         evaluate(RIGS[0], [near, tall], num_frames=1, cell_m=1.0, num_rays=64)
     with pytest.raises(TypeError, match="got int"):
         evaluate(RIGS[0], [near, 3], **SMALL)
@@ -200,7 +200,7 @@ def test_who_cannot_be_mixed_is_refused_before_anything_is_measured(yards, monke
         _ = Settings(RIGS[0], [near, "courtyard"]).single_scenario
 
 
-def test_who_needs_what_is_not_installed_is_refused_before_anything_is_measured(yards, monkeypatch):
+def test_missing_packages_are_reported_before_the_run(yards, monkeypatch):
     monkeypatch.setattr("torchcover.evaluation.mixed_result.measure_coverage", None)
     monkeypatch.setattr("torchcover.simulation.sumo.simulating.find_spec", lambda _: None)
     monkeypatch.setattr("torchcover.simulation.sumo.simulating.which", lambda _: None)
@@ -208,7 +208,7 @@ def test_who_needs_what_is_not_installed_is_refused_before_anything_is_measured(
         evaluate(RIGS[0], [str(yards / "near.yaml"), "sumo_random"], **SMALL)
 
 
-def test_a_file_whose_name_has_a_comma_is_one_scenario(yards, monkeypatch):
+def test_a_file_name_with_a_comma_is_one_scenario(yards, monkeypatch):
     monkeypatch.chdir(yards)
     (yards / "a,b=c.yaml").write_text((yards / "near.yaml").read_text())
     assert Settings(RIGS[0], "a,b=c.yaml").mixture is None

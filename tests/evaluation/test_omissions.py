@@ -15,17 +15,17 @@ def test_points_outside_the_grid_are_counted_over_all_rigs():
     metric = CoverageMetric(grid)
     metric.update(torch.zeros(1, 3), torch.tensor([[0.5, 0.5, 0.0], [9.0, 0.0, 0.0], [-1.0, 0.0, 0.0]]))
     records = {row.description: row for row in list_omissions({}, [metric.compute()] * 2)}
-    outside = records["reference points outside every cell: not searched for"]
+    outside = records["reference points outside the grid: no search for sensor points"]
     assert (outside.count, outside.total) == (4, 6)
     others = ", ".join(aggregation.description for aggregation in AGGREGATIONS)
-    assert f"{others}: not asked for, not kept" in records
+    assert f"{others}: not requested, not computed" in records
 
 
 def test_aggregations_that_were_asked_for_are_not_left_out():
     metric = CoverageMetric(BevGrid(x_m=(0.0, 2.0), y_m=(0.0, 2.0), cell_m=1.0), aggregations=[Maximum()])
     metric.update(torch.zeros(1, 3), torch.tensor([[0.5, 0.5, 0.0]]))
     (listed,) = [
-        row.description for row in list_omissions({}, [metric.compute()], [Maximum()]) if "not kept" in row.description
+        row.description for row in list_omissions({}, [metric.compute()], [Maximum()]) if "not computed" in row.description
     ]
     assert [kind.description in listed for kind in AGGREGATIONS] == [kind is not Maximum for kind in AGGREGATIONS]
 

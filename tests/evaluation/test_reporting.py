@@ -65,7 +65,7 @@ def test_a_sensor_that_fails_takes_what_it_alone_sees(found):
 def test_a_difference_of_sensor_models_is_said(found):
     source = {**found.result.source, "sensor_model": {"one": "real", "two": "ideal"}}
     mixed = replace(found, result=replace(found.result, source=source))
-    assert "Sensor models: one real, two ideal: differences are of both." in mixed.verdict
+    assert "Sensor models differ: one real, two ideal; differences between rigs include their effect." in mixed.verdict
     assert not any("Sensor model" in sentence for sentence in found.verdict)
 
 

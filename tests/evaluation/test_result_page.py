@@ -48,7 +48,7 @@ def test_the_page_says_what_the_table_says_and_where_it_comes_from(result, tmp_p
     assert NASTY in words
     for row in result.table.rows[NASTY]:
         assert row.region.name in words
-    for fact in ("courtyard", torchcover.__version__, "rays that end on the ego itself", "seed", "duration s"):
+    for fact in ("courtyard", torchcover.__version__, "self hits, which end on the ego vehicle", "seed", "duration s"):
         assert fact in words
 
 

@@ -82,7 +82,7 @@ def test_every_result_names_its_sensor_model_and_the_weather(worse):
 def test_a_difference_of_sensor_models_is_said_with_the_answer(worse):
     _, real = worse
     mixed = replace(real, source={**real.source, "sensor_model": {"a": "real", "b": "ideal"}})
-    assert mixed.verdict[-1] == "Sensor models: a real, b ideal: differences are of both."
+    assert mixed.verdict[-1] == "Sensor models differ: a real, b ideal; differences between rigs include their effect."
     assert not any("Sensor model" in sentence for one in worse for sentence in one.verdict)
 
 

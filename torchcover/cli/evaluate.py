@@ -261,7 +261,7 @@ def save_and_print(
 
     if ranks is None or ranks.rank == 0:
         for world in result.scenario_results.values() if isinstance(result, MixedResult) else [result]:
-            if announcement := world.announce_pictures(file_kinds):
+            if announcement := world.describe_rendering_cost(file_kinds):
                 typer.echo(f"torchcover: {announcement}", err=True)
         written = result.save(out, file_kinds=file_kinds)
         print_result(result, written, out, explain=explain)

@@ -8,7 +8,7 @@ from rich.markup import escape
 
 from torchcover.evaluation import MixedResult, Result, Study
 from torchcover.evaluation.mixed_result import MIXTURE
-from torchcover.evaluation.result_page import build_omissions_table
+from torchcover.evaluation.omissions import build_omissions_table
 from torchcover.evaluation.study import WANTED
 from torchcover.report import Terminal, print_page_tables, print_table
 

@@ -11,6 +11,8 @@ from .mixed_result import MixedResult as MixedResult
 from .observers import CoverageObserver as CoverageObserver
 from .observers import Observer as Observer
 from .observers import Stateful as Stateful
+from .omissions import Omission as Omission
+from .omissions import list_omissions as list_omissions
 from .pipeline import Run as Run
 from .pipeline import StoppingRule as StoppingRule
 from .pipeline import observe as observe
@@ -24,9 +26,7 @@ from .requirements import Requirements as Requirements
 from .requirements_check import CheckResult as CheckResult
 from .requirements_check import check as check
 from .result import Result as Result
-from .result_page import Omission as Omission
 from .result_page import build_sensor_views as build_sensor_views
-from .result_page import list_omissions as list_omissions
 from .scene_figures import list_cameras as list_cameras
 from .scene_figures import plot_rig_figures as plot_rig_figures
 from .scene_figures import plot_scenario as plot_scenario

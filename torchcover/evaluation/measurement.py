@@ -17,10 +17,11 @@ from torchcover.coverage import CoverageSums
 from torchcover.evaluation.checkpoint import Checkpoint, CheckpointManager
 from torchcover.evaluation.cpu_cores import compute_num_workers
 from torchcover.evaluation.observers import AnyObserver, CoverageObserver
+from torchcover.evaluation.omissions import list_omissions
 from torchcover.evaluation.pipeline import Run, StoppingRule, observe
 from torchcover.evaluation.ranks import Ranks
 from torchcover.evaluation.result import Result
-from torchcover.evaluation.result_page import check_drawable, list_omissions
+from torchcover.evaluation.result_page import check_drawable
 from torchcover.evaluation.settings import Settings, load_contrib
 from torchcover.evaluation.target_error import TargetErrorRule
 from torchcover.evaluation.task import CALLER, Task, build_run_identity, find_ray_device, get_device

@@ -1,10 +1,9 @@
-"""Rigs in several kinds of world, and in a mixture of them."""
+"""Results of rigs in several scenarios, and in the weighted mixture of them."""
 
 import json
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -22,18 +21,19 @@ from torchcover.files import SUMMARY, AtomicOutput, format_csv
 from torchcover.report import RENDERERS, CoverageTable, PageTable, build_file_stems, merge_notes, render_page
 from torchcover.report.records import build_records
 
+# Name of the mixture in tables and in the column `scenario`.
 MIXTURE = "mixture"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MixedResult(Result):
-    """What `evaluate` and `compare` return of several scenarios: the numbers of their mixture.
+    """Result of `evaluate` and `compare` for several scenarios: the numbers of their mixture.
 
-    Coverages, maps, and metrics of others are of one kind of world each: those of `scenario_results`.
+    Coverages, maps and published metrics belong to one scenario each; see `scenario_results`.
 
     Args:
-        scenario_results: By the name of the scenario, what was measured there: the same rigs in all of them.
-        weights: By the same names, how much each counts in the mixture; they sum to 1.
+        scenario_results: Name of each scenario -> its result; all have the same rigs.
+        weights: Name of each scenario -> its weight in the mixture; the weights sum to 1.
     """
 
     scenario_results: Mapping[str, Result] = field(default_factory=dict)
@@ -41,168 +41,220 @@ class MixedResult(Result):
 
     @classmethod
     def from_results(cls, scenario_results: Mapping[str, Result], weights: Mapping[str, float]) -> "MixedResult":
-        """Mix results.
+        """Mix the results of several scenarios.
+
+        Args:
+            scenario_results: Name of each scenario -> its result.
+            weights: Name of each scenario -> its weight; the weights sum to 1.
+
+        Returns:
+            The mixture.
 
         Raises:
-            ValueError: They were not asked about the same.
+            ValueError: The results have different regions, thresholds or averages.
         """
         first = next(iter(scenario_results.values()))
-        told = {
-            key: _agreed({name: world.source.get(key) for name, world in scenario_results.items()})
-            for key in first.source
-        }
+        source = {}
+        for key in first.source:
+            source[key] = _merge_values({name: result.source.get(key) for name, result in scenario_results.items()})
         mixed = cls(
             coverages={},
             regions=first.regions,
             run=None,
             rigs=first.rigs,
-            source={**told, "scenario": dict(weights)},
+            source={**source, "scenario": dict(weights)},
             reference_record=None,
             device=first.device,
             sensors=first.sensors,
-            ego_outline_m=first.ego_outline_m if told["vehicle"] == first.source["vehicle"] else None,
+            ego_outline_m=first.ego_outline_m if source["vehicle"] == first.source["vehicle"] else None,
             scenario_results=scenario_results,
             weights=weights,
         )
-        _ = mixed.table  # what cannot be mixed is refused now
+        _ = mixed.table  # raises the errors of results that cannot be mixed
         return mixed
 
     @property
     def coverage(self) -> Coverage:
-        """None.
+        """Not available for a mixture.
 
         Raises:
-            ValueError: Always: a mixture has numbers only.
+            ValueError: Always; a mixture only has numbers.
         """
-        raise ValueError(f"a mixture has no maps: use worlds[name].coverage, of {', '.join(self.scenario_results)}")
+        names = ", ".join(self.scenario_results)
+        raise ValueError(f"a mixture has no maps: use scenario_results[name].coverage, with a name of {names}")
 
     @cached_property
     def mixtures(self) -> Mapping[str, CoverageMixture]:
-        """Name of each rig -> its numbers, for any region, with what they become without one block after the other."""
-        counted = [(name, weight, self.scenario_results[name]) for name, weight in self.weights.items() if weight > 0.0]
-        rigs = counted[0][2].coverages
-        return {
-            rig: CoverageMixture({name: (weight, of.coverages[rig]) for name, weight, of in counted}) for rig in rigs
-        }
+        """Name of each rig -> its numbers in the mixture, for any region, with their jackknife values."""
+        names = [name for name, weight in self.weights.items() if weight > 0.0]
+        mixtures = {}
+        for rig in self.scenario_results[names[0]].coverages:
+            parts = {name: (self.weights[name], self.scenario_results[name].coverages[rig]) for name in names}
+            mixtures[rig] = CoverageMixture(parts)
+        return mixtures
 
     @cached_property
     def table(self) -> CoverageTable:
-        """The numbers of the mixture, with errors, differences and marks."""
-        shares = ", ".join(f"{name} {weight:.3g}" for name, weight in self.weights.items())
+        """Numbers of the mixture with standard errors, differences and marks."""
+        weights = ", ".join(f"{name} {weight:.3g}" for name, weight in self.weights.items())
         note = (
-            f"Weighted means over kinds of world: {shares}. These are given, not drawn: intervals are about chance "
-            "within each of them, and say nothing of other kinds or other weights. What is unknown in one of them is "
-            "unknown; maps are of one of them each."
+            f"Weighted means over scenarios: {weights}. The weights are fixed, so confidence intervals cover chance "
+            "within the scenarios, but not other scenarios or weights. A number that is unknown in one scenario is "
+            "unknown in the mixture; each map shows one scenario."
         )
-        of_kinds = merge_notes({name: world.notes for name, world in self.scenario_results.items()})
-        return CoverageTable.from_coverages(self.mixtures, self.regions, [note, *of_kinds], self.source)
+        scenario_notes = merge_notes({name: result.notes for name, result in self.scenario_results.items()})
+        return CoverageTable.from_coverages(self.mixtures, self.regions, [note, *scenario_notes], self.source)
 
     @property
     def record(self) -> dict[str, Any]:
-        """What stands in `summary.json`: the numbers of the mixture, and under `worlds` the record of each."""
-        worlds = {name: {"weight": self.weights[name], **world.record} for name, world in self.scenario_results.items()}
-        runs = [world.run for world in self.scenario_results.values() if world.run]
-        duration_s = round(sum(run.duration_s for run in runs), 3) if runs else None
-        skipped = [line for run in runs for line in run.skipped_frames]
-        complete = all(run.is_complete for run in runs)
-        run = {"duration_s": duration_s, "complete": complete, "skipped_frames": skipped}
-        return {**super().record, **run, "scenarios": worlds}
+        """Content of `summary.json`: the numbers of the mixture, and the record of each scenario in `scenarios`."""
+        scenarios = {}
+        for name, result in self.scenario_results.items():
+            scenarios[name] = {"weight": self.weights[name], **result.record}
+        runs = [result.run for result in self.scenario_results.values() if result.run]
+        skipped_frames: list[str] = []
+        for run in runs:
+            skipped_frames += run.skipped_frames
+        return {
+            **super().record,
+            "duration_s": round(sum(run.duration_s for run in runs), 3) if runs else None,
+            "complete": all(run.is_complete for run in runs),
+            "skipped_frames": skipped_frames,
+            "scenarios": scenarios,
+        }
 
     @property
     def tables(self) -> list[PageTable]:
-        """Those of the mixture, then those of each kind of world."""
-        each = {
-            MIXTURE: build_result_tables(self.table),
-            **{name: world.tables for name, world in self.scenario_results.items()},
-        }
-        return [replace(one, title=f"{name}: {one.title}".rstrip(": ")) for name, of in each.items() for one in of]
+        """Tables of the mixture, followed by those of each scenario."""
+        tables_by_name = {MIXTURE: build_result_tables(self.table)}
+        tables_by_name |= {name: result.tables for name, result in self.scenario_results.items()}
+        titled = []
+        for name, tables in tables_by_name.items():
+            titled += [replace(table, title=f"{name}: {table.title}".rstrip(": ")) for table in tables]
+        return titled
 
     def plot_maps(self, layer: str | None = None) -> Iterator[tuple[str, Figure]]:
-        """Those of each kind of world; its name is the first part of the stems."""
-        for name, world in self.scenario_results.items():
-            yield from ((f"{name}/{stem}", figure) for stem, figure in world.plot_maps(layer))
-
-    def save(self, folder: str | Path, *, file_kinds: str | Iterable[str] = FILES) -> list[Path]:
-        """Write the files of each kind of world to a folder of its own, as `Result.save`, and those of the mixture.
+        """Plot the maps of each scenario one after the other.
 
         Args:
-            folder: Where to write: `NAME/...`; `summary.csv`, with the rows of all worlds and of the mixture,
-                `report.html` and `summary.json`.
-            file_kinds: As in `Result.save`.
-        """
-        wanted, record = parse_file_kinds(file_kinds), self.record
-        worlds = dict(zip(build_file_stems(list(self.scenario_results)), self.scenario_results.values(), strict=True))
-        with AtomicOutput(Path(folder)) as written:
-            with defer_signals():  # the numbers are safe before anything ends this
-                for stem, world in worlds.items():
-                    if "numbers" in wanted:
-                        world.add_numbers(written, f"{stem}/")
-                    written.add_text(f"{stem}/{SUMMARY}", json.dumps(world.record, indent=2, allow_nan=False) + "\n")
-                if "numbers" in wanted:
-                    written.add_text("summary.csv", self._csv())
-                written.publish(record)
-            for stem, world in worlds.items():
-                world.add_pictures(written, wanted, f"{stem}/")
-            if "page" in wanted:
-                written.add_text("report.html", render_page(self.page))
-            written.publish(record)
-        return written.paths
+            layer: Key of the only quantity to plot; all quantities by default.
 
-    def _csv(self) -> str:
-        tables = {**{name: world.table for name, world in self.scenario_results.items()}, MIXTURE: self.table}
-        rows = [{"scenario": name, **row} for name, table in tables.items() for row in build_records(table)]
-        columns = list(dict.fromkeys(chain.from_iterable(rows)))
-        return format_csv([columns, *([row.get(column, "") for column in columns] for row in rows)])
+        Returns:
+            Stem of the file name, which begins with the name of the scenario, and a figure outside pyplot.
+        """
+        for name, result in self.scenario_results.items():
+            for stem, figure in result.plot_maps(layer):
+                yield f"{name}/{stem}", figure
+
+    def save(self, folder: str | Path, *, file_kinds: str | Iterable[str] = FILES) -> list[Path]:
+        """Write the files of each scenario into a subfolder, as `Result.save` does, and those of the mixture.
+
+        Args:
+            folder: Folder of the files, created if necessary: `NAME/...` for each scenario; `summary.csv` with the rows
+                of all scenarios and of the mixture, `report.html` and `summary.json`.
+            file_kinds: Files besides `summary.json`, as in `Result.save`.
+
+        Returns:
+            Paths of the files.
+
+        Raises:
+            ValueError: A file kind is unknown, or there is not enough memory for the page and the maps.
+        """
+        kinds, record = parse_file_kinds(file_kinds), self.record
+        results = dict(zip(build_file_stems(list(self.scenario_results)), self.scenario_results.values(), strict=True))
+        with AtomicOutput(Path(folder)) as output:
+            with defer_signals():  # the numbers are complete before a signal ends the process
+                for stem, result in results.items():
+                    if "numbers" in kinds:
+                        result.add_numbers(output, f"{stem}/")
+                    text = json.dumps(result.record, indent=2, allow_nan=False) + "\n"
+                    output.add_text(f"{stem}/{SUMMARY}", text)
+                if "numbers" in kinds:
+                    output.add_text("summary.csv", self._format_csv())
+                output.publish(record)
+            for stem, result in results.items():
+                result.add_page_and_maps(output, kinds, f"{stem}/")
+            if "page" in kinds:
+                output.add_text("report.html", render_page(self.page))
+            output.publish(record)
+        return output.paths
 
     @property
-    def _about(self) -> str:
+    def _tables_by_name(self) -> dict[str, CoverageTable]:
+        return {**{name: result.table for name, result in self.scenario_results.items()}, MIXTURE: self.table}
+
+    def _format_csv(self) -> str:
+        """Format the rows of all scenarios and of the mixture; a scenario may lack columns of another."""
+        rows: list[dict[str, object]] = []
+        columns: dict[str, None] = {}
+        for name, table in self._tables_by_name.items():
+            for record in build_records(table):
+                row = {"scenario": name, **record}
+                rows.append(row)
+                columns |= dict.fromkeys(row)
+        return format_csv([list(columns), *([row.get(column, "") for column in columns] for row in rows)])
+
+    @property
+    def _title(self) -> str:
         return f"Mixture of {', '.join(self.scenario_results)}: {', '.join(self.rigs)}"
 
     def __str__(self) -> str:
-        tables = {**{name: world.table for name, world in self.scenario_results.items()}, MIXTURE: self.table}
-        return "\n".join(f"{name}\n{RENDERERS['text'](table)}" for name, table in tables.items())
+        return "\n".join([f"{name}\n{RENDERERS['text'](table)}" for name, table in self._tables_by_name.items()])
 
 
-def _agreed(each: Mapping[str, Any]) -> object:
-    """What all kinds of world say; else what each of them says."""
-    said = list(each.values())
-    if all(one == said[0] for one in said):
-        return said[0]
-    if isinstance(said[0], Mapping):  # of the rigs
-        return {rig: _agreed({name: of.get(rig) for name, of in each.items()}) for rig in said[0]}
-    return ", ".join(f"{name} {one}" for name, one in each.items())
+def _merge_values(values: Mapping[str, Any]) -> object:
+    """Merge the values of a setting: the common value, or a text with the value of each scenario.
+
+    Args:
+        values: Name of each scenario -> its value; a mapping has a value for each rig.
+    """
+    first, *others = values.values()
+    if all(value == first for value in others):
+        return first
+    if isinstance(first, Mapping):
+        return {rig: _merge_values({name: value.get(rig) for name, value in values.items()}) for rig in first}
+    return ", ".join(f"{name} {value}" for name, value in values.items())
 
 
 def measure_scenarios(settings: Settings) -> MixedResult:
-    """Measure in one kind of world after the other.
+    """Measure the rigs in several scenarios, one after the other.
 
-    `settings`: of `evaluate`, with several scenarios. ValueError: a recording among them, other regions in one than in
-    another, processes that share the run, or observers; as `evaluate`.
+    Args:
+        settings: Settings of `evaluate` with several scenarios.
+
+    Returns:
+        Numbers of the mixture, with the result of each scenario.
+
+    Raises:
+        ValueError: The settings also have a recording, ranks or observers, or the regions of the scenarios differ; and
+            as in `evaluate`.
     """
-    assert settings.mixture is not None  # as its caller knows
+    assert settings.mixture is not None  # checked by the caller
     if settings.frames is not None:
-        raise ValueError("scenario and frames exclude each other: a recording is measured apart")
+        raise ValueError("scenario and frames exclude each other: evaluate the recording separately")
     if settings.ranks or settings.observers:
-        raise ValueError("several scenarios: observers, and processes that share a run, are for one at a time")
+        raise ValueError("several scenarios: observers and torchrun need a single scenario")
+    weights = {name: weight for name, (_, weight) in settings.mixture.items()}
+    stems = build_file_stems(list(settings.mixture))
     tasks = {}
-    for (name, (scenario, _)), stem in zip(
-        settings.mixture.items(), build_file_stems(list(settings.mixture)), strict=True
-    ):
+    for (name, (scenario, _)), stem in zip(settings.mixture.items(), stems, strict=True):
         checkpoint = settings.checkpoint
         if checkpoint is not None:
             checkpoint = checkpoint if isinstance(checkpoint, Checkpoint) else Checkpoint(Path(checkpoint))
             checkpoint = checkpoint.in_folder(stem)
-        of_one = replace(settings, scenario=scenario, checkpoint=checkpoint)
-        tasks[name] = build_task(of_one), of_one  # all of them before the first is measured, which may take hours
-    asked = [tasks[name][0].query_plan.regions for name, (_, weight) in settings.mixture.items() if weight > 0.0]
-    if any(regions != asked[0] for regions in asked):
+        scenario_settings = replace(settings, scenario=scenario, checkpoint=checkpoint)
+        # All tasks are built before the first measurement, which may take hours.
+        tasks[name] = build_task(scenario_settings), scenario_settings
+    regions = [tasks[name][0].query_plan.regions for name, weight in weights.items() if weight > 0.0]
+    if any(scenario_regions != regions[0] for scenario_regions in regions):
         raise ValueError(
-            f"{', '.join(tasks)} cannot be mixed: the regions around their egos differ; give `vehicle`, or ask about "
-            "the same"
+            f"{', '.join(tasks)} cannot be mixed: the regions around their ego vehicles differ; set `vehicle` or "
+            "`regions`"
         )
-    worlds = {}
-    for name in settings.mixture:
-        worlds[name] = measure_coverage(*tasks.pop(name))
-        if (run := worlds[name].run) is not None:
-            run.raise_failure()
-    return MixedResult.from_results(worlds, {name: weight for name, (_, weight) in settings.mixture.items()})
+    results = {}
+    for name in weights:
+        result = measure_coverage(*tasks.pop(name))
+        if result.run is not None:
+            result.run.raise_failure()
+        results[name] = result
+    return MixedResult.from_results(results, weights)

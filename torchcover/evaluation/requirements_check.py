@@ -21,7 +21,7 @@ from torchcover.evaluation.requirements import (
     TargetPositions,
     TargetRequirement,
 )
-from torchcover.evaluation.result import describe_perfect_depth
+from torchcover.evaluation.result_notes import describe_perfect_depth
 from torchcover.evaluation.settings import DEFAULT_SCENARIO, Settings
 from torchcover.evaluation.target_visibility import build_flat_ground, load_rig_and_scenario
 from torchcover.evaluation.task import (

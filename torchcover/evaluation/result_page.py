@@ -1,125 +1,108 @@
-"""The parts of the page of a result: tables, rigs as they are drawn and written, settings, what was left out."""
+"""Page of a result: tables, maps, rigs, settings and facts on the run."""
 
 import platform
-import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, version
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from pydantic import BaseModel
 
-from torchcover.coverage import AGGREGATIONS, Aggregation, Coverage, Region
+from torchcover.coverage import Region
+from torchcover.evaluation.omissions import build_omissions_table
 from torchcover.files import to_yaml
-from torchcover.report import BOLD_MARKS, MapLine, PageTable, SensorView, TextCell, build_page_tables
+from torchcover.report import (
+    BOLD_MARKS,
+    MapLine,
+    Page,
+    PageRig,
+    PageTable,
+    SensorView,
+    build_page_maps,
+    build_page_tables,
+)
 from torchcover.report.table import CoverageTable
 from torchcover.report.table_notes import explain_marks, list_notes
-from torchcover.simulation import CameraSensor, Sensor, compute_vertical_fov_deg
+from torchcover.simulation import Sensor, compute_vertical_fov_deg
 
-# What decides about the numbers, with this package.
-PACKAGES = ("torch", "numpy", "embreex", "trimesh", "pykdtree", "kornia")
-OF_THE_RUN = ("torchcover", "duration_s", "complete", "device", "skipped_frames")
-ELSEWHERE = ("verdict", "notes", "rows", "scenarios", "metrics", "counts", "frame_counts", "omissions", "rig", "rigs")
-# What it is, how often it was left out, and of how many; the counts are those of the frames, added up.
-COUNTED = (
-    ("moving bodies out of every sensor's range: not placed", "moving_bodies_out_of_range", "moving_bodies"),
-    ("road users of SUMO or a recording where bodies cannot be: not there", "road_users_omitted", "moving_bodies"),
-    ("pairs of a ray and a moving body that cannot meet: not cast", "ray_body_pairs_omitted", "ray_body_pairs"),
-    ("rays of sensors where nothing moves: cast once, for all steps", "sensor_rays_reused", "sensor_rays"),
-    ("rays of sensors that hit nothing near a reference point: not cast", "sensor_rays_omitted", "sensor_rays"),
-    ("rays that end on the ego itself: known from the first scan", "sensor_self_hits_reused", "sensor_self_hits"),
+if TYPE_CHECKING:
+    from torchcover.evaluation.result import Result
+
+# Keys of the record that the page shows under "Run".
+RUN_FACTS = ("torchcover", "duration_s", "complete", "device", "skipped_frames")
+# Keys of the record that the page shows in its tables.
+FACTS_IN_TABLES = frozenset(
+    ["verdict", "notes", "rows", "scenarios", "metrics", "counts", "frame_counts", "omissions", "rig", "rigs"]
 )
-# Packages that take long to import, and what would have needed them; not all lenses with distortion need kornia, but
-# where there is one, nobody is to think that its distortion was left out.
-HEAVY = {"kornia": "lenses with distortion", "lightning": "training"}
 
 
-@dataclass(frozen=True)
-class Omission:
-    """Something that a run left out.
+def build_page(result: "Result") -> Page:
+    """Build the page of a result.
 
     Args:
-        description: What it is, and why it could be left out.
-        count: How often; None where there is nothing to count.
-        total: Of how many; likewise.
+        result: The result.
+
+    Returns:
+        Page with the findings, tables, maps, rigs, settings and omissions.
     """
-
-    description: str
-    count: int | None = None
-    total: int | None = None
-
-
-def list_omissions(
-    frame_counts: Mapping[str, int],
-    coverages: Sequence[Coverage],
-    aggregations: Sequence[Aggregation] = (),
-    sensors: Sequence[Sensor] = (),
-    *,
-    num_workers: int = 0,
-    num_ranks: int = 1,
-) -> list[Omission]:
-    """List what was left out of a run, at its end: later, other modules may have been imported for other reasons.
-
-    Args:
-        frame_counts: Sums of `Frame.counts`.
-        coverages: What the metrics gave, one for each rig.
-        aggregations: Those that were asked for.
-        sensors: Those that are known of all rigs.
-        num_workers: Processes that made the frames of each rank. What they have imported is unknown.
-        num_ranks: Ranks that shared the run.
-    """
-    steps = max((coverage.counts["num_frames"] for coverage in coverages), default=0)
-    is_static = 0 < frame_counts.get("sensor_rays", 0) == frame_counts.get("sensor_rays_reused", 0)
-    # Where nothing moves, each process casts the rays of its first step.
-    first_steps = min(steps, num_ranks * max(num_workers, 1)) if is_static else 0
-    found = []
-    for what, count, of in COUNTED:
-        omitted = frame_counts.get(count, 0)
-        if first_steps and count.endswith("_reused"):
-            omitted = omitted * (steps - first_steps) // steps
-        if omitted:
-            found.append(Omission(what, omitted, frame_counts[of]))
-    outside = sum(coverage.counts["outside_points"] for coverage in coverages)
-    inside = sum(coverage.counts["inside_points"] for coverage in coverages)
-    if outside:
-        found.append(Omission("reference points outside every cell: not searched for", outside, inside + outside))
-    asked_for = {aggregation.name for aggregation in aggregations}
-    others = [aggregation.description for aggregation in AGGREGATIONS if aggregation.name not in asked_for]
-    if others:
-        found.append(Omission(f"{', '.join(others)}: not asked for, not kept"))
-    used = set(HEAVY) if num_workers else set(sys.modules)
-    if any(isinstance(sensor, CameraSensor) and sensor.lens != "pinhole" for sensor in sensors):
-        used.add("kornia")
-    unused = [package for package in HEAVY if package not in used]
-    return found + [Omission(f"{package}, for {HEAVY[package]}: not imported") for package in unused]
+    rigs = {name: result.sensors.get(name, ()) for name in result.rigs}
+    source = result.source.get("frames") or result.source.get("scenario") or "saved results"
+    location = ", on ".join(format_facts({"source": source, "vehicle": result.vehicle}).values())
+    page_rigs = []
+    for name, sensors in rigs.items():
+        page_rigs.append(PageRig(name, build_sensor_views(sensors), format_rig_yaml(name, sensors)))
+    return Page(
+        title=(" vs. " if len(rigs) == 2 else ", ").join(rigs),
+        lead=f"Blind spots and coverage in {location}, measured by torchcover.",
+        findings=result.verdict,
+        tables=result.tables,
+        maps=list(build_page_maps(result.coverages)) if result.coverages else [],
+        rigs=page_rigs,
+        ego_outline_m=result.ego_outline_m,
+        outlines=[build_region_outline(region) for region in result.regions],
+        facts=collect_facts(result.record, result.rigs, result.table.first_conditions.counts["num_frames"]),
+        more_tables=[build_omissions_table(result.omissions)] if result.omissions else [],
+    )
 
 
 def build_result_tables(table: CoverageTable) -> list[PageTable]:
-    """The parts of a table, with its notes below the last."""
-    marks = [f"{BOLD_MARKS[mark]}: {meaning}" for mark, meaning in explain_marks(table).items()]
-    *parts, last = build_page_tables(table)
-    return [*parts, replace(last, notes=[*marks, *list_notes(table)])]
+    """Build the tables of a coverage table, with its notes below the last one."""
+    notes = [f"{BOLD_MARKS[mark]}: {meaning}" for mark, meaning in explain_marks(table).items()]
+    *tables, last_table = build_page_tables(table)
+    return [*tables, replace(last_table, notes=[*notes, *list_notes(table)])]
 
 
 def build_sensor_views(sensors: Sequence[Sensor]) -> list[SensorView]:
-    """Where sensors are and what they see."""
-    return [
-        SensorView(
+    """Build the poses and fields of view of sensors, for maps.
+
+    Args:
+        sensors: The sensors.
+
+    Returns:
+        One view for each sensor: pose in the vehicle frame, fields of view in degrees, range in meters.
+    """
+    views = []
+    for sensor in sensors:
+        view = SensorView(
             name=sensor.name,
             vehicle_T_sensor=sensor.mount.to_matrix(),
             horizontal_fov_deg=sensor.horizontal_fov_deg,
             vertical_fov_deg=compute_vertical_fov_deg(sensor),
             range_m=sensor.max_range_m,
         )
-        for sensor in sensors
-    ]
+        views.append(view)
+    return views
 
 
 def check_drawable(sensors: Sequence[Sensor]) -> None:
-    """Find out before a run, not after it, whether its maps can show the sensors.
+    """Check before a run that its maps can show the sensors.
 
-    ValueError: a sensor none of whose rays in the middle row is one, so that it is unknown how wide it sees.
+    Args:
+        sensors: The sensors.
+
+    Raises:
+        ValueError: The rays in the middle row of a sensor have no horizontal field of view.
     """
     for sensor in sensors:
         if not 0 < sensor.horizontal_fov_deg <= 360:
@@ -130,67 +113,88 @@ def check_drawable(sensors: Sequence[Sensor]) -> None:
 
 
 def format_rig_yaml(name: str, sensors: Sequence[Sensor]) -> str:
-    """A rig as YAML that `Rig.load` reads; empty if its sensors are not known, or are not of ours."""
-    known = [sensor.model_dump(mode="json", exclude_unset=True) for sensor in sensors if isinstance(sensor, BaseModel)]
-    if not known or len(known) < len(sensors):
+    """Format a rig as YAML that `Rig.load` reads.
+
+    Args:
+        name: Name of the rig.
+        sensors: Its sensors.
+
+    Returns:
+        The text; empty if the sensors are unknown or a sensor is a class of the user.
+    """
+    documents = []
+    for sensor in sensors:
+        if isinstance(sensor, BaseModel):
+            documents.append(sensor.model_dump(mode="json", exclude_unset=True))
+    if not documents or len(documents) < len(sensors):
         return ""
-    return to_yaml({"name": name, "sensors": known})
+    return to_yaml({"name": name, "sensors": documents})
 
 
 def build_region_outline(region: Region) -> MapLine:
-    """Its outline on the maps."""
-    (left, right), (low, high) = region.x_m, region.y_m
-    return MapLine(region.name, np.array(region.corners_m or [[left, low], [right, low], [right, high], [left, high]]))
+    """Build the outline of a region on maps."""
+    (rear, front), (right, left) = region.x_m, region.y_m
+    rectangle = [[rear, right], [front, right], [front, left], [rear, left]]
+    return MapLine(region.name, np.array(region.corners_m or rectangle))
 
 
 def collect_facts(
     record: Mapping[str, Any], rigs: Mapping[str, str | None], num_frames: int
 ) -> dict[str, dict[str, str]]:
-    """Under which settings, and how the run went.
+    """Collect the settings and the facts on the run, as a page shows them.
 
-    `record`: what stands in `summary.json`; `rigs`: what the user called each rig, by its name; `num_frames`: steps that
-    were measured.
+    Args:
+        record: Content of `summary.json`.
+        rigs: Name of each rig -> name or file that the user gave; None if the rig came from a recording.
+        num_frames: Number of measured frames.
+
+    Returns:
+        Heading -> name of a fact -> its text.
     """
-    settings = {name: value for name, value in record.items() if name not in (*OF_THE_RUN, *ELSEWHERE)}
-    run = {name: record[name] for name in OF_THE_RUN} | {"python": platform.python_version()} | _versions()
-    named = {f"rig {name}": str(given) for name, given in rigs.items() if given is not None}
-    return {"Settings": named | format_facts({"num_frames": num_frames} | settings), "Run": format_facts(run)}
+    rig_facts = {f"rig {name}": str(source) for name, source in rigs.items() if source is not None}
+    settings = {"num_frames": num_frames}
+    settings |= {name: value for name, value in record.items() if name not in FACTS_IN_TABLES.union(RUN_FACTS)}
+    run = {name: record[name] for name in RUN_FACTS} | {"python": platform.python_version()} | _find_versions()
+    return {"Settings": rig_facts | format_facts(settings), "Run": format_facts(run)}
 
 
-def _versions() -> dict[str, str]:
-    found = {}
-    for package in PACKAGES:
+def _find_versions() -> dict[str, str]:
+    """Find the versions of the packages that may change numbers."""
+    versions = {}
+    for package in ("torch", "numpy", "embreex", "trimesh", "pykdtree", "kornia"):
         try:
-            found[package] = version(package)
-        except PackageNotFoundError:  # a part of a larger one
+            versions[package] = version(package)
+        except PackageNotFoundError:  # installed as part of another package, or missing
             continue
-    return found
+    return versions
 
 
 def format_facts(facts: Mapping[str, Any]) -> dict[str, str]:
-    """Facts of a record as a page says them; without those that are unknown."""
-    return {name.replace("_", " "): words for name, value in facts.items() if (words := _value(value))}
+    """Format the values of a record for readers; facts without a value are omitted.
+
+    Args:
+        facts: Name -> value.
+
+    Returns:
+        Name with spaces -> text.
+    """
+    texts = {}
+    for name, value in facts.items():
+        text = _format_value(value)
+        if text:
+            texts[name.replace("_", " ")] = text
+    return texts
 
 
-def _value(value: object) -> str:
+def _format_value(value: object) -> str:
     if isinstance(value, Mapping):
-        return ", ".join(f"{name} {words}" for name, one in value.items() if (words := _value(one)))
+        texts = {name: _format_value(item) for name, item in value.items()}
+        return ", ".join(f"{name} {text}" for name, text in texts.items() if text)
     if isinstance(value, list | tuple):
-        return ("; " if any(isinstance(one, str) for one in value) else " to ").join(map(_value, value))
+        has_texts = any(isinstance(item, str) for item in value)
+        return ("; " if has_texts else " to ").join([_format_value(item) for item in value])
     if isinstance(value, bool):
         return "yes" if value else "no"
     if value is None:
         return ""
     return f"{value:g}" if isinstance(value, float) else str(value)
-
-
-def build_omissions_table(omissions: Sequence[Omission]) -> PageTable:
-    """What a run left out."""
-    rows = [tuple(map(TextCell, _omission(one))) for one in omissions]
-    return PageTable("Left out, for this run did not need it", ("what", "count", "of", "share"), rows)
-
-
-def _omission(one: Omission) -> tuple[str, ...]:
-    if one.count is None or one.total is None:
-        return one.description, "", "", ""
-    return one.description, f"{one.count:,}", f"{one.total:,}", f"{one.count / one.total:.1%}"

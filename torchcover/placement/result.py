@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from torchcover.evaluation.result import describe_sensor_models
+from torchcover.evaluation.result_notes import describe_sensor_models
 from torchcover.placement.free_sensor import FreeNumber
 from torchcover.placement.report_files import RUN_KEYS, PlacementReport, ReportMixin
 from torchcover.placement.search import OPTIMIZER, RANDOM, START, Evaluation, PlacementSearch

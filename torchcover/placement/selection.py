@@ -16,7 +16,7 @@ from torchcover.coverage.quantities import make_detection_quantity
 from torchcover.coverage.regions import RegionBands
 from torchcover.estimation import Number
 from torchcover.evaluation.progress import Progress
-from torchcover.evaluation.result import describe_sensor_models
+from torchcover.evaluation.result_notes import describe_sensor_models
 from torchcover.frames import Frame
 from torchcover.geometry.arrays import Bools, Float64
 from torchcover.neighbors import nearest
