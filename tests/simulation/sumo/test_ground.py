@@ -6,7 +6,8 @@ import trimesh
 
 from torchcover.simulation.height_field import FlatGround, GroundHeightField
 from torchcover.simulation.sumo.ground import Sidewalks, build_bridges, build_ground, compute_tilts_deg
-from torchcover.simulation.sumo.network import Vicinity, read_network
+from torchcover.simulation.sumo.network import read_network
+from torchcover.simulation.sumo.vicinity import Vicinity
 
 from .towns import DRIVE, WALK, edge, street, write_net
 

@@ -13,7 +13,8 @@ from torchcover.simulation.sumo.motion import (
     compute_rectangle_corners_m,
     drop_colliding_users,
 )
-from torchcover.simulation.sumo.network import Vicinity, read_network
+from torchcover.simulation.sumo.network import read_network
+from torchcover.simulation.sumo.vicinity import Vicinity
 from torchcover.simulation.traffic.fleet import HITCHES, compute_tractrix_yaw_rad
 
 from .towns import DRIVE, WALK, edge, write_net

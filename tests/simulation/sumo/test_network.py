@@ -61,7 +61,7 @@ def test_lanes_without_length_are_left_out_and_a_file_that_changes_is_read_again
         ([edge("a", (DRIVE, "nan", LINE))], "lane 'a_0': a width above 0"),
         ([edge("a", (DRIVE, "wide", LINE))], "lane 'a_0': width is 'wide', not a number"),
         ([edge("a", (DRIVE, 3, [(0, 0), ("nan", 1)]))], "lane 'a_0': its shape has NaN"),
-        ([edge("a", (DRIVE, 3, [(0, 0), (1, 1, 1, 1)]))], "a shape of places"),
+        ([edge("a", (DRIVE, 3, [(0, 0), (1, 1, 1, 1)]))], "a shape of positions"),
         ([edge("a", (WALK, 3, LINE))], "a street for vehicles is needed; it has 1 lanes"),
         ([], "a street for vehicles is needed"),
     ],

@@ -1,4 +1,4 @@
-"""From tracks to bodies: which of ours stands for a type of SUMO, who is the ego, and who comes near it."""
+"""Selection of road users from tracks: their bodies, the ego vehicle, and those that come near it."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -8,27 +8,31 @@ import numpy as np
 from torchcover.files import guard_reader
 from torchcover.simulation.sumo.floating import FloatingCarData, SumoTrack
 from torchcover.simulation.sumo.motion import RoadUser
-from torchcover.simulation.sumo.network import pair_attributes, parse_xml_stream, read_chunks
+from torchcover.simulation.sumo.xml_stream import pair_attributes, parse_xml_stream, read_chunks
 from torchcover.simulation.traffic.assemble import HORIZON_M
 from torchcover.simulation.traffic.fleet import CATEGORIES, EGO, Fleet, VehicleType
 
-# What SUMO takes for the length of a type that has none.
-USUAL_LENGTH_M = {
+# SUMO's default lengths by vehicle class; all others have that of a car.
+CAR_LENGTH_M = 5.0
+DEFAULT_LENGTHS_M = {
     "pedestrian": 0.215, "bicycle": 1.6, "scooter": 1.2, "moped": 2.1, "motorcycle": 2.2, "truck": 7.1,
     "trailer": 16.5, "bus": 12.0, "coach": 14.0, "tram": 22.0, "delivery": 6.5, "emergency": 6.5,
 }  # fmt: skip
-CAR_LENGTH_M = 5.0
-# In floating car data alone a type is but a name.
-WORDS = (
-    ("ped", "pedestrian"), ("person", "pedestrian"), ("motorcycle", "motorcycle"), ("moped", "moped"),
-    ("bike", "bicycle"), ("bicycle", "bicycle"), ("cycl", "bicycle"), ("bus", "bus"), ("coach", "coach"),
-    ("truck", "truck"), ("trailer", "trailer"), ("lorry", "truck"), ("tram", "tram"), ("rail", "rail"),
-    ("train", "rail"), ("subway", "subway"), ("ship", "ship"), ("van", "delivery"), ("delivery", "delivery"),
-)  # fmt: skip
+# Vehicle class of types of which only the name is known, by the first of these words in it.
+CLASSES_BY_WORD = {
+    "ped": "pedestrian", "person": "pedestrian", "motorcycle": "motorcycle", "moped": "moped", "bike": "bicycle",
+    "bicycle": "bicycle", "cycl": "bicycle", "bus": "bus", "coach": "coach", "truck": "truck", "trailer": "trailer",
+    "lorry": "truck", "tram": "tram", "rail": "rail", "train": "rail", "subway": "subway", "ship": "ship",
+    "van": "delivery", "delivery": "delivery",
+}  # fmt: skip
 
 
 def get_vehicle_type(name: str, known_types: Mapping[str, VehicleType]) -> VehicleType:
-    """A type by its name: one that is known, else what its name says.
+    """Return a vehicle type by its name.
+
+    Args:
+        name: Name of the type.
+        known_types: Types that are declared; the class of all others is guessed from their names.
 
     Example:
         >>> get_vehicle_type("DEFAULT_BIKETYPE", {}).vehicle_class
@@ -36,26 +40,31 @@ def get_vehicle_type(name: str, known_types: Mapping[str, VehicleType]) -> Vehic
     """
     if name in known_types:
         return known_types[name]
-    vehicle_class = next((found for word, found in WORDS if word in name.lower()), "passenger")
-    return VehicleType(vehicle_class, USUAL_LENGTH_M.get(vehicle_class, CAR_LENGTH_M))
+    vehicle_class = "passenger"
+    for word, class_of_word in CLASSES_BY_WORD.items():
+        if word in name.lower():
+            vehicle_class = class_of_word
+            break
+    return VehicleType(vehicle_class, DEFAULT_LENGTHS_M.get(vehicle_class, CAR_LENGTH_M))
 
 
 @guard_reader("routes of SUMO")
 def read_vehicle_types(path: Path) -> dict[str, VehicleType]:
-    """The types that a file of routes declares."""
-    found: dict[str, VehicleType] = {}
+    """Read the vehicle types that a file of routes declares."""
+    types: dict[str, VehicleType] = {}
 
-    def start(name: str, names_and_values: list[str]) -> None:
+    def start_element(name: str, names_and_values: list[str]) -> None:
         attributes = pair_attributes(names_and_values)
-        if name == "vType" and "id" in attributes:
-            vehicle_class = attributes.get("vClass", "passenger")
-            length_m = float(attributes.get("length", USUAL_LENGTH_M.get(vehicle_class, CAR_LENGTH_M)))
-            if not length_m > 0:
-                raise ValueError(f"type {attributes['id']!r}: a positive length is needed; got {length_m:g}")
-            found[attributes["id"]] = VehicleType(vehicle_class, length_m)
+        if name != "vType" or "id" not in attributes:
+            return
+        vehicle_class = attributes.get("vClass", "passenger")
+        length_m = float(attributes.get("length", DEFAULT_LENGTHS_M.get(vehicle_class, CAR_LENGTH_M)))
+        if not length_m > 0:
+            raise ValueError(f"type {attributes['id']!r}: a positive length is needed; got {length_m:g}")
+        types[attributes["id"]] = VehicleType(vehicle_class, length_m)
 
-    parse_xml_stream(read_chunks(path), start)
-    return found
+    parse_xml_stream(read_chunks(path), start_element)
+    return types
 
 
 def select_road_users(
@@ -67,70 +76,95 @@ def select_road_users(
     duration_s: float,
     generator: np.random.Generator,
 ) -> tuple[RoadUser, list[RoadUser]]:
-    """Choose the ego, and those of the others who come near to it.
+    """Select the ego vehicle and all road users that come near it.
 
-    The ego is the one of a name; else it is drawn in proportion to the ways that vehicles drive, of one type or of all
-    cars.
+    Args:
+        floating_car_data: Tracks.
+        known_types: Declared vehicle types.
+        fleet: Bodies.
+        ego_id: Name of the ego vehicle; if None, it is sampled with probabilities proportional to driven distances.
+        ego_type: Name of the type from which it is sampled; all cars if None.
+        duration_s: Duration for which the ego vehicle must be present.
+        generator: Random generator.
 
-    ValueError: nobody who may be the ego is there for the whole run.
+    Raises:
+        ValueError: No vehicle that can be the ego vehicle is present for the whole duration.
     """
     lengths_m = {kind: fleet.get_length_m(kind) for kind in CATEGORIES}
     users: list[RoadUser] = []
     for track in floating_car_data.tracks:
-        found = get_vehicle_type(track.type_name, known_types)
-        kind = found.find_body(lengths_m)
-        if track.is_pedestrian:  # all have one length; those that were drawn are called as their bodies are
-            named = "child" if "child" in track.type_name.lower() else "adult"
-            kind = track.type_name if CATEGORIES.get(track.type_name) == "pedestrian" else named
+        vehicle_type = get_vehicle_type(track.type_name, known_types)
+        kind = vehicle_type.find_body(lengths_m)
+        if track.is_pedestrian:
+            # Types of sampled pedestrians are named after their bodies.
+            is_body = CATEGORIES.get(track.type_name) == "pedestrian"
+            kind = "child" if "child" in track.type_name.lower() else "adult"
+            kind = track.type_name if is_body else kind
         if kind is not None:
-            users.append(RoadUser(track, kind, found.length_m, fleet.get_sizes_m(kind)))
-    ego = _ego(users, floating_car_data, ego_id, ego_type, duration_s, generator)
-    others = [other for other in users if other is not ego and _comes_near(other.track, ego.track)]
-    return ego._replace(kind=EGO, part_sizes_m=fleet.get_sizes_m(EGO)), others
+            users.append(RoadUser(track, kind, vehicle_type.length_m, fleet.get_sizes_m(kind)))
+    if ego_id is not None:
+        ego = _find_ego(users, floating_car_data, ego_id, duration_s)
+    else:
+        ego = _sample_ego(users, floating_car_data, ego_type, duration_s, generator)
+    nearby = [user for user in users if user is not ego and comes_near(user.track, ego.track)]
+    return ego._replace(kind=EGO, part_sizes_m=fleet.get_sizes_m(EGO)), nearby
 
 
-def _ego(
+def _format_window(data: FloatingCarData, duration_s: float) -> str:
+    return f"from t = {data.begin_s:g} to {data.begin_s + duration_s:g} s"
+
+
+def _find_ego(users: Sequence[RoadUser], data: FloatingCarData, ego_id: str, duration_s: float) -> RoadUser:
+    """Find the ego vehicle by its name."""
+    tracks = [user for user in users if user.track.name == ego_id and not user.track.is_pedestrian]
+    for user in tracks:
+        if user.track.is_present_for(duration_s):
+            return user
+    if not tracks:
+        raise ValueError(f"ego_id: no vehicle {ego_id!r} up to t = {data.last_time_s:g} s, where the data end")
+    present_s = float(tracks[0].track.times_s[-1])
+    end_s = data.begin_s + present_s
+    raise ValueError(
+        f"ego_id: {ego_id!r} is not there all the time {_format_window(data, duration_s)}: it leaves the network, "
+        f"teleports or has a gap after t = {end_s:g} s; shorten duration_s to {max(end_s - data.begin_s, 0.0):g}, or "
+        "take another ego"
+    )
+
+
+def _sample_ego(
     users: Sequence[RoadUser],
-    recorded: FloatingCarData,
-    name: str | None,
-    kind: str | None,
+    data: FloatingCarData,
+    ego_type: str | None,
     duration_s: float,
     generator: np.random.Generator,
 ) -> RoadUser:
-    """Who is the ego: by name, or drawn."""
-    begin_s, end_s = recorded.begin_s, recorded.begin_s + duration_s
-    when = f"from t = {begin_s:g} to {end_s:g} s"
-    if name is not None:
-        own = [user for user in users if user.track.name == name and not user.track.is_pedestrian]
-        there = [user for user in own if user.track.is_present_for(duration_s)]
-        if there:
-            return there[0]
-        if not own:
-            raise ValueError(f"ego_id: no vehicle {name!r} up to t = {recorded.last_time_s:g} s, where the data end")
-        gone_s = begin_s + float(own[0].track.times_s[-1])
+    """Sample the ego vehicle with probabilities proportional to driven distances."""
+    vehicles = []
+    for user in users:
+        is_candidate = CATEGORIES[user.kind] == "car" if ego_type is None else user.track.type_name == ego_type
+        if is_candidate:
+            vehicles.append(user)
+    candidates = [user for user in vehicles if user.track.is_present_for(duration_s) and not user.track.is_pedestrian]
+    if not candidates:
+        longest_s = max((float(np.ptp(user.track.times_s)) for user in vehicles), default=0.0)
+        description = "car" if ego_type is None else f"vehicle of type {ego_type!r}"
         raise ValueError(
-            f"ego_id: {name!r} is not there all the time {when}: it leaves the network, teleports or has a gap after "
-            f"t = {gone_s:g} s; shorten duration_s to {max(gone_s - begin_s, 0.0):g}, or take another ego"
+            f"no {description} that could be the ego is there all the time {_format_window(data, duration_s)}: of "
+            f"{len(vehicles)}, the longest drives for {longest_s:g} s (data end at t = {data.last_time_s:g} s); change "
+            "duration_s or begin_s"
         )
-    drivers = [
-        user for user in users if (user.track.type_name == kind if kind is not None else CATEGORIES[user.kind] == "car")
-    ]
-    there = [user for user in drivers if user.track.is_present_for(duration_s) and not user.track.is_pedestrian]
-    if not there:
-        longest = max((float(np.ptp(user.track.times_s)) for user in drivers), default=0.0)
-        who = f"vehicle of type {kind!r}" if kind is not None else "car"
-        raise ValueError(
-            f"no {who} that could be the ego is there all the time {when}: of {len(drivers)}, the longest drives "
-            f"for {longest:g} s (data end at t = {recorded.last_time_s:g} s); change duration_s or begin_s"
-        )
-    ways_m = [np.linalg.norm(np.diff(user.track.front_positions_m[:, :2], axis=0), axis=1).sum() for user in there]
-    shares = np.array(ways_m) + 1e-3
-    return there[int(generator.choice(len(there), p=shares / shares.sum()))]
+    weights = []
+    for user in candidates:
+        steps_m = np.linalg.norm(np.diff(user.track.front_positions_m[:, :2], axis=0), axis=1)
+        weights.append(steps_m.sum() + 1e-3)
+    shares = np.array(weights)
+    return candidates[int(generator.choice(len(candidates), p=shares / shares.sum()))]
 
 
-def _comes_near(other: SumoTrack, ego: SumoTrack) -> bool:
-    """Whether the two are ever within the range of sensors, at the times of the other."""
-    ego_m = ego.front_positions_m[:, :2]
-    if other.times_s is not ego.times_s:
-        ego_m = np.stack([np.interp(other.times_s, ego.times_s, axis, np.nan, np.nan) for axis in ego_m.T], axis=1)
-    return bool((np.linalg.norm(other.front_positions_m[:, :2] - ego_m, axis=1) < HORIZON_M).any())
+def comes_near(track: SumoTrack, ego_track: SumoTrack) -> bool:
+    """Test whether a road user ever comes within the range of sensors of the ego vehicle."""
+    ego_m = ego_track.front_positions_m[:, :2]
+    if track.times_s is not ego_track.times_s:
+        columns_m = [np.interp(track.times_s, ego_track.times_s, axis_m, np.nan, np.nan) for axis_m in ego_m.T]
+        ego_m = np.stack(columns_m, axis=1)
+    return bool((np.linalg.norm(track.front_positions_m[:, :2] - ego_m, axis=1) < HORIZON_M).any())

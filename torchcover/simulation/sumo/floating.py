@@ -1,6 +1,6 @@
-"""Floating car data: where everybody is at each time, as SUMO writes it while it runs, or into a file."""
+"""Floating car data of SUMO: positions of all vehicles and people at each time, from a running simulation or a file."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
@@ -10,27 +10,23 @@ import numpy as np
 
 from torchcover.files import guard_reader
 from torchcover.geometry.arrays import Float64
-from torchcover.simulation.sumo.network import parse_xml_stream, read_chunks
+from torchcover.simulation.sumo.xml_stream import parse_xml_stream, read_chunks
 
-ATTRIBUTES = "id,x,y,z,angle,slope,type"
-# Who is not heard of for longer than this many usual steps, or moves faster than this from one to the next, is gone in
-# between, or was moved by the simulation.
-MAX_STEPS = 1.5
-FASTEST_MPS = 90.0
-TIME_SLACK_S = 1e-6
-# Largest longitude and latitude.
-DEGREES = (180.0, 90.0)
-# SUMO writes degrees with six decimals unless told otherwise, and all else with two.
-GEO_DIGITS = 5
-# By its speed, a road user gets farther than the degree that all positions lie within.
-MIN_DRIVEN_M = 2.0
+ATTRIBUTES = "id,x,y,z,angle,slope,type"  # attributes to be written by SUMO
+TIME_SLACK_S = 1e-6  # tolerance of comparisons of times
 
 
 class SumoTrack(NamedTuple):
-    """One vehicle or person, for as long as it was there without a gap; `type_name` is the name of its type.
+    """Positions of a vehicle or person, for as long as it was present without a gap.
 
-    At (K,) times from the first of the run: (K, 3) the middle of its front, float64, for they may be of UTM size; its
-    heading, counter-clockwise from x, where SUMO's own angles are clockwise from north; and its slope upwards.
+    Args:
+        name: Name in the simulation.
+        type_name: Name of its type.
+        is_pedestrian: True for a person.
+        times_s: (K,) times from the start of the window.
+        front_positions_m: (K, 3) float64 positions of the middle of the front, since coordinates may be UTM.
+        yaw_deg: (K,) headings, counterclockwise from x; SUMO's angles are clockwise from north.
+        slope_deg: (K,) slopes, positive uphill.
     """
 
     name: str
@@ -42,109 +38,153 @@ class SumoTrack(NamedTuple):
     slope_deg: Float64
 
     def is_present_for(self, duration_s: float) -> bool:
-        """Whether it is there from the first time to so much later."""
+        """Test whether the track lasts from the start of the window for a duration."""
         return bool(self.times_s[0] <= TIME_SLACK_S and self.times_s[-1] >= duration_s - TIME_SLACK_S)
 
 
 class TimeWindow(NamedTuple):
-    """What of the data is meant: from `begin_s` of the simulation, or from when `start_vehicle_id` is heard of, if later."""
+    """Part of a simulation.
+
+    Args:
+        begin_s: Earliest start.
+        duration_s: Duration.
+        start_vehicle_id: Vehicle at whose first appearance the window starts, if it is later.
+    """
 
     begin_s: float
     duration_s: float
     start_vehicle_id: str | None = None
 
 
-class _Enough(Exception):  # noqa: N818  (no error: the window is over)
-    pass
+class _WindowEndError(Exception):
+    """Signal that the window is complete."""
 
 
-class _Collector:
-    """Keeps the rows of a window, as start tags come in."""
+class FloatingCarDataParser:
+    """Collector of the rows of a window, from tags.
+
+    Args:
+        window: Part of the simulation.
+
+    Attributes:
+        begin_s: Start of the window; NaN before.
+        last_s: Last time in the data; -inf before.
+        indices: Index of each road user by its name and whether it is a person.
+        type_names: Name of the type of each road user.
+        times_s: Times in the window.
+        row_counts: Number of rows at each time.
+        row_indices: Index of the road user of each row.
+        rows: Arrays (N, 6) of x, y, angle, z, slope and speed; the speed is NaN where it is missing.
+        has_more_digits: Whether x always has as many decimals as degrees have, and angles have fewer.
+    """
 
     def __init__(self, window: TimeWindow) -> None:
         self._window = window
         self.begin_s, self.last_s, self._end_s = np.nan, -np.inf, np.inf
-        self._now: dict[str, list[list[str]]] = {"vehicle": [], "person": []}
-        self.number: dict[tuple[bool, str], int] = {}
-        self.kinds: list[str] = []
+        self._vehicles: list[list[str]] = []
+        self._people: list[list[str]] = []
+        self.indices: dict[tuple[bool, str], int] = {}
+        self.type_names: list[str] = []
         self.times_s: list[float] = []
-        self.of: list[int] = []
+        self.row_counts: list[int] = []
+        self.row_indices: list[int] = []
         self.rows: list[Float64] = []
-        # Whether x always has the decimals of degrees, and angles fewer.
         self.has_more_digits = True
-        self.counts: list[int] = []
 
-    def start(self, name: str, attributes: list[str]) -> None:
-        """A tag; see `parse_xml_stream`."""
-        if name in self._now:
-            self._now[name].append(attributes)
+    def start_element(self, name: str, attributes: list[str]) -> None:
+        """Process a start tag from `parse_xml_stream`."""
+        if name == "vehicle":
+            self._vehicles.append(attributes)
+        elif name == "person":
+            self._people.append(attributes)
         elif name == "timestep":
-            self.end_step()
+            self.end_time_step()
             time_s = float(attributes[attributes.index("time") + 1])
             if time_s <= self.last_s:
                 raise ValueError(f"the times of its steps must ascend; {time_s:g} s follows {self.last_s:g} s")
             if time_s > self._end_s + TIME_SLACK_S:
-                raise _Enough
+                raise _WindowEndError
             self.last_s = time_s
 
-    def end_step(self) -> None:
-        """Keep what was told of the step, if it is in the window."""
-        now = {name: rows for name, rows in self._now.items() if rows}
-        self._now = {"vehicle": [], "person": []}
+    def end_time_step(self) -> None:
+        """Store the rows of the last time step if it is in the window."""
+        vehicles, people = self._vehicles, self._people
+        self._vehicles, self._people = [], []
         if np.isnan(self.begin_s):
-            waits = self._window.start_vehicle_id is not None and not any(
-                ("id", self._window.start_vehicle_id) in zip(row[::2], row[1::2], strict=True)
-                for row in now.get("vehicle", ())
-            )
-            if waits or self.last_s < self._window.begin_s - TIME_SLACK_S or not np.isfinite(self.last_s):
+            if not self._is_window_start(vehicles):
                 return
             self.begin_s, self._end_s = self.last_s, self.last_s + self._window.duration_s
         self.times_s.append(self.last_s)
-        self.counts.append(0)
-        driven: set[tuple[str, str]] = set()
-        for name, rows in now.items():
-            columns = self._columns(rows)
-            places = list(zip(columns["x"], columns["y"], strict=True))
-            if name == "vehicle":
-                driven = set(places)
-            elif not driven.isdisjoint(places):  # who rides is told of where the vehicle is
-                rows = [row for row, place in zip(rows, places, strict=True) if place not in driven]  # noqa: PLW2901
-                if not rows:
-                    continue
-                columns = self._columns(rows)
-            self.counts[-1] += len(rows)
-            for who, kind in zip(columns["id"], columns.get("type", ("",) * len(rows)), strict=True):
-                number = self.number.setdefault((name == "person", who), len(self.kinds))
-                if number == len(self.kinds):
-                    self.kinds.append(kind)
-                self.of.append(number)
-            zeros = ("0",) * len(rows)
-            numbers = [columns[name] for name in ("x", "y", "angle")]
-            numbers += [columns.get(name, zeros) for name in ("z", "slope")]
-            numbers.append(columns.get("speed", ("nan",) * len(rows)))
-            self.has_more_digits &= _digits(columns["x"]) >= GEO_DIGITS > _digits(columns["angle"])
-            self.rows.append(np.array([list(map(float, column)) for column in numbers]).T)
+        self.row_counts.append(0)
+        columns = self._parse_columns(vehicles)
+        vehicle_positions = set(zip(columns["x"], columns["y"], strict=True))
+        self._store_rows(columns, is_person=False)
+        # SUMO reports passengers at the position of their vehicle.
+        columns = self._parse_columns(people)
+        positions = list(zip(columns["x"], columns["y"], strict=True))
+        if not vehicle_positions.isdisjoint(positions):
+            outside = []
+            for person, position in zip(people, positions, strict=True):
+                if position not in vehicle_positions:
+                    outside.append(person)
+            columns = self._parse_columns(outside)
+        self._store_rows(columns, is_person=True)
 
-    def _columns(self, rows: list[list[str]]) -> dict[str, tuple[str, ...]]:
-        """The values of each attribute; all rows have the same ones."""
+    def _is_window_start(self, vehicles: Sequence[list[str]]) -> bool:
+        """Test whether the window starts at the last time step."""
+        if self.last_s < self._window.begin_s - TIME_SLACK_S or not np.isfinite(self.last_s):
+            return False
+        vehicle_id = self._window.start_vehicle_id
+        if vehicle_id is None:
+            return True
+        return any(("id", vehicle_id) in zip(row[::2], row[1::2], strict=True) for row in vehicles)
+
+    def _parse_columns(self, rows: list[list[str]]) -> dict[str, tuple[str, ...]]:
+        """Parse the values of all attributes that the rows share."""
+        if not rows:
+            return {"id": (), "x": (), "y": (), "angle": ()}
         names = rows[0][::2]
         if any(row[::2] != names for row in rows):
-            shared = sorted(set(names).intersection(*(row[::2] for row in rows)))
-            rows = [[part for name in shared for part in (name, row[2 * row[::2].index(name) + 1])] for row in rows]
-            names = shared
+            dicts = [dict(zip(row[::2], row[1::2], strict=True)) for row in rows]
+            names = sorted(set(names).intersection(*dicts))
+            values = [tuple(row[name] for row in dicts) for name in names]
+        else:
+            values = list(zip(*rows, strict=True))[1::2]
         missing = [name for name in ("id", "x", "y", "angle") if name not in names]
         if missing:
             raise ValueError(
                 f"t = {self.last_s:g} s: a vehicle or person without {', '.join(missing)}; id, x, y and angle are "
-                f"needed of each (sumo --fcd-output.attributes {ATTRIBUTES})"
+                f"needed (sumo --fcd-output.attributes {ATTRIBUTES})"
             )
-        return dict(zip(names, list(zip(*rows, strict=True))[1::2], strict=True))
+        return dict(zip(names, values, strict=True))
+
+    def _store_rows(self, columns: dict[str, tuple[str, ...]], is_person: bool) -> None:
+        num_rows = len(columns["id"])
+        if not num_rows:
+            return
+        self.row_counts[-1] += num_rows
+        for name, type_name in zip(columns["id"], columns.get("type", ("",) * num_rows), strict=True):
+            index = self.indices.setdefault((is_person, name), len(self.type_names))
+            if index == len(self.type_names):
+                self.type_names.append(type_name)
+            self.row_indices.append(index)
+        geo_digits = 5  # SUMO writes degrees with six decimals by default, and other numbers with two
+        x_digits, angle_digits = count_decimals(columns["x"]), count_decimals(columns["angle"])
+        self.has_more_digits &= x_digits >= geo_digits > angle_digits
+        numbers = []
+        for name, default in (("x", ""), ("y", ""), ("angle", ""), ("z", "0"), ("slope", "0"), ("speed", "nan")):
+            texts = columns.get(name, (default,) * num_rows)
+            numbers.append([float(text) for text in texts])
+        self.rows.append(np.array(numbers).T)
 
 
 class FloatingCarData(NamedTuple):
-    """What there is in a window that begins at `begin_s` of the simulation; `last_time_s` is the last time read, or -inf.
+    """Tracks of all road users in a window.
 
-    The tracks are in the order of their first appearance; somebody who was gone in between has several.
+    Args:
+        tracks: Tracks in the order of their first appearance; a road user with gaps has several.
+        begin_s: Start of the window in the simulation.
+        last_time_s: Last time in the data; -inf without any.
     """
 
     tracks: tuple[SumoTrack, ...]
@@ -153,82 +193,104 @@ class FloatingCarData(NamedTuple):
 
 
 def parse_floating_car_data(chunks: Iterable[bytes], window: TimeWindow) -> FloatingCarData:
-    """Read floating car data from pieces of XML, no more of which are asked for than the window needs.
+    """Parse floating car data from chunks of XML, and stop after the window.
 
-    ValueError: not such data, or without angles.
+    Args:
+        chunks: Content of the file.
+        window: Part of the simulation.
+
+    Raises:
+        ValueError: The content is no floating car data, or has no angles.
     """
-    collector = _Collector(window)
-    with suppress(_Enough):
-        parse_xml_stream(chunks, collector.start)
-        collector.end_step()
-    return FloatingCarData(tuple(_tracks(collector)), collector.begin_s, collector.last_s)
+    parser = FloatingCarDataParser(window)
+    with suppress(_WindowEndError):
+        parse_xml_stream(chunks, parser.start_element)
+        parser.end_time_step()
+    return FloatingCarData(tuple(_iterate_tracks(parser)), parser.begin_s, parser.last_s)
 
 
 @guard_reader("floating car data of SUMO")
 def read_floating_car_data(path: Path, window: TimeWindow) -> FloatingCarData:
-    """Read it from a file; see `record`."""
-    recorded = parse_floating_car_data(read_chunks(path), window)
-    if not np.isfinite(recorded.last_time_s):
+    """Read floating car data from a file.
+
+    Args:
+        path: The file.
+        window: Part of the simulation.
+
+    Raises:
+        BadFileError: The file is no floating car data, or has no angles or time steps.
+    """
+    data = parse_floating_car_data(read_chunks(path), window)
+    if not np.isfinite(data.last_time_s):
         raise ValueError("floating car data of SUMO with at least one <timestep> is needed")
-    return recorded
+    return data
 
 
-def _digits(numbers: tuple[str, ...]) -> int:
-    """Return how many decimals the first of these numbers has."""
+def count_decimals(numbers: tuple[str, ...]) -> int:
+    """Count the decimals of the first number."""
     return len(numbers[0].partition(".")[2])
 
 
-def _check_meters(places: Float64, speed_mps: Float64, times_s: Float64, has_more_digits: bool) -> None:
-    """Refuse longitude and latitude: everything lies within a degree, although it drives.
+def check_meters(positions: Float64, speed_mps: Float64, times_s: Float64, has_more_digits: bool) -> None:
+    """Check that positions are not degrees: road users in one square degree must not drive farther than it is wide.
 
     Args:
-        places: (N, 2) x and y of everybody at all times.
-        speed_mps: (N,) NaN where the file does not say it.
+        positions: (N, 2) x and y of all road users at all times.
+        speed_mps: (N,) speeds; NaN where they are missing.
         times_s: (K,) times of the window.
         has_more_digits: Whether x is written with the decimals of degrees, and angles with fewer.
 
     Raises:
-        ValueError: They are degrees.
+        ValueError: The positions are longitude and latitude.
     """
-    if not len(places) or (np.abs(places) > DEGREES).any() or (np.ptp(places, axis=0) >= 1.0).any():
+    max_degrees = (180.0, 90.0)
+    if not len(positions) or (np.abs(positions) > max_degrees).any() or (np.ptp(positions, axis=0) >= 1.0).any():
         return
+    min_driven_m = 2.0  # a road user that drove this far left a square of 1 m
     driven_m = float(np.nan_to_num(speed_mps).max(initial=0.0)) * float(np.ptp(times_s))
-    if driven_m > MIN_DRIVEN_M if np.isfinite(speed_mps).any() else has_more_digits:
+    are_degrees = driven_m > min_driven_m if np.isfinite(speed_mps).any() else has_more_digits
+    if are_degrees:
         raise ValueError(
-            f"x and y are degrees of longitude and latitude, such as {places[0, 0]:g}, {places[0, 1]:g}; meters of the "
-            "network are needed: write it without --fcd-output.geo"
+            f"x and y are degrees of longitude and latitude, such as {positions[0, 0]:g}, {positions[0, 1]:g}; meters "
+            "of the network are needed: write it without --fcd-output.geo"
         )
 
 
-def _tracks(collector: _Collector) -> Iterator[SumoTrack]:
-    times_s = np.array(collector.times_s) - collector.begin_s
-    of = np.array(collector.of, dtype=np.int64)
-    step = np.repeat(np.arange(len(times_s)), collector.counts)
-    rows = np.concatenate([*collector.rows, np.empty((0, 6))])
-    rows, speed_mps = rows[:, :5], rows[:, 5]
-    if not np.isfinite(rows).all():
-        raise ValueError(f"{int((~np.isfinite(rows)).any(axis=1).sum())} of {len(rows)} positions are NaN or infinite")
-    _check_meters(rows[:, :2], speed_mps, times_s, collector.has_more_digits)
-    usual_s = float(np.median(np.diff(times_s))) if len(times_s) > 1 else 0.0
-    order = np.argsort(of, kind="stable")
-    ends = np.concatenate([[0], np.cumsum(np.bincount(of, minlength=len(collector.kinds)))])
-    for (on_foot, name), number in collector.number.items():
-        own = order[ends[number] : ends[number + 1]]
-        if len(own) == 0:
-            continue
-        # Bodies that are there all the time share their times.
-        own_s = times_s if len(own) == len(times_s) else times_s[step[own]]
-        taken_s, way_m = np.diff(own_s), np.linalg.norm(np.diff(rows[own, :2], axis=0), axis=1)
-        if (taken_s <= 0).any():
-            raise ValueError(f"{name!r} is there twice at t = {collector.begin_s + own_s[taken_s.argmin()]:g} s")
-        breaks = np.flatnonzero((taken_s > MAX_STEPS * usual_s + TIME_SLACK_S) | (way_m > FASTEST_MPS * taken_s)) + 1
-        for first, end in pairwise([0, *breaks.tolist(), len(own)]):
-            x_m, y_m, angle_deg, z_m, slope_deg = rows[own[first:end]].T
+def _iterate_tracks(parser: FloatingCarDataParser) -> Iterator[SumoTrack]:
+    """Iterate over the tracks, split where a road user is absent or is moved by the simulation."""
+    max_missing_steps = 1.5  # longer gaps, in median time steps, split a track
+    max_speed_mps = 90.0  # larger distances between two rows split a track
+    times_s = np.array(parser.times_s) - parser.begin_s
+    row_indices = np.array(parser.row_indices, dtype=np.int64)
+    time_indices = np.repeat(np.arange(len(times_s)), parser.row_counts)
+    all_rows = np.concatenate([*parser.rows, np.empty((0, 6))])
+    rows, speed_mps = all_rows[:, :5], all_rows[:, 5]
+    is_finite = np.isfinite(rows)
+    if not is_finite.all():
+        raise ValueError(f"{int((~is_finite).any(axis=1).sum())} of {len(rows)} positions are NaN or infinite")
+    check_meters(rows[:, :2], speed_mps, times_s, parser.has_more_digits)
+    median_step_s = float(np.median(np.diff(times_s))) if len(times_s) > 1 else 0.0
+    order = np.argsort(row_indices, kind="stable")
+    ends = np.cumsum(np.bincount(row_indices, minlength=len(parser.type_names))).tolist()
+    for (is_person, name), index in parser.indices.items():
+        selection = order[ends[index - 1] if index else 0 : ends[index]]
+        is_always_present = len(selection) == len(times_s)
+        # Road users that are always present share one array of times.
+        track_times_s = times_s if is_always_present else times_s[time_indices[selection]]
+        steps_s = np.diff(track_times_s)
+        steps_m = np.linalg.norm(np.diff(rows[selection, :2], axis=0), axis=1)
+        if (steps_s <= 0).any():
+            time_s = parser.begin_s + track_times_s[steps_s.argmin()]
+            raise ValueError(f"{name!r} is there twice at t = {time_s:g} s")
+        is_gap = steps_s > max_missing_steps * median_step_s + TIME_SLACK_S
+        breaks = np.flatnonzero(is_gap | (steps_m > max_speed_mps * steps_s)) + 1
+        for first, end in pairwise([0, *breaks.tolist(), len(selection)]):
+            x_m, y_m, angle_deg, z_m, slope_deg = rows[selection[first:end]].T
             yield SumoTrack(
                 name=name,
-                type_name=collector.kinds[number],
-                is_pedestrian=on_foot,
-                times_s=own_s if end - first == len(own) else own_s[first:end],
+                type_name=parser.type_names[index],
+                is_pedestrian=is_person,
+                times_s=track_times_s if end - first == len(selection) else track_times_s[first:end],
                 front_positions_m=np.stack([x_m, y_m, z_m], axis=1),
                 yaw_deg=90.0 - angle_deg,
                 slope_deg=slope_deg,

@@ -22,7 +22,7 @@ from torchcover.simulation.height_field import (
 )
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.sumo.motion import Motion, compute_rectangle_corners_m, smooth_positions
-from torchcover.simulation.sumo.network import Vicinity
+from torchcover.simulation.sumo.vicinity import Vicinity
 from torchcover.simulation.traffic.alignment import Polyline
 from torchcover.simulation.traffic.assemble import compute_attitude_deg
 from torchcover.simulation.traffic.city import CITY, PARKED_KINDS

@@ -21,7 +21,7 @@ from xml.sax.saxutils import quoteattr
 from torchcover.files import end_with_parent, find_memory_limit_gb, guard_reader, parse_xml, report_stopped_processes
 from torchcover.files.bad_file import VARIABLE
 from torchcover.simulation.sumo.floating import ATTRIBUTES
-from torchcover.simulation.sumo.network import parse_xml_stream, read_chunks
+from torchcover.simulation.sumo.xml_stream import parse_xml_stream, read_chunks
 from torchcover.simulation.traffic.assemble import HORIZON_M
 
 # The elements of a network and of traffic demand. SUMO would take detectors, calibrators, rerouters, timed events and

@@ -22,9 +22,10 @@ from torchcover.simulation.sumo.floating import (
 )
 from torchcover.simulation.sumo.ground import BodyPlacer, Sidewalks, build_bridges, build_ground, place_parked_vehicles
 from torchcover.simulation.sumo.motion import compute_motions, drop_colliding_users
-from torchcover.simulation.sumo.network import OFF_STREET_M, SAME_PLACE_M, Vicinity, read_network
+from torchcover.simulation.sumo.network import SAME_POSITION_M, read_network
 from torchcover.simulation.sumo.simulating import convert_opendrive, find_sumo_home, simulate
 from torchcover.simulation.sumo.streets import EGO_TYPE, RandomStreets, write_routes
+from torchcover.simulation.sumo.vicinity import Vicinity
 from torchcover.simulation.traffic.fleet import EGO, Fleet
 from torchcover.simulation.traffic.frontage import RoadsideDensity, StreetSide, find_street_sides, place_scenery
 from torchcover.simulation.traffic.kind import ProceduralTraffic, SceneParts
@@ -126,13 +127,13 @@ class SumoTraffic(ProceduralTraffic):
         ego, others = select_road_users(recorded, known, fleet, self.ego_id, ego_type, duration_s, generator)
         near_m = np.floor(ego.track.front_positions_m[0, :2])
         (alone,) = compute_motions([ego], duration_s, near_m)
-        begin_m = np.floor(alone.poses[0, :2] + SAME_PLACE_M)
+        begin_m = np.floor(alone.poses[0, :2] + SAME_POSITION_M)
         origin_m, way_m = near_m + begin_m, alone.poses[:, :2] - begin_m
         vicinity = Vicinity(network, way_m, origin_m)
         gone = np.flatnonzero(~vicinity.is_on_street(way_m))
         if len(gone):
             raise ValueError(
-                f"the ego is farther than {OFF_STREET_M:g} m from all streets of the network at t = "
+                f"the ego is farther than {vicinity.params.max_off_street_m:g} m from all streets of the network at t = "
                 f"{recorded.begin_s + alone.times_s[gone[0]]:g} s: it leaves them, or the data are those of another "
                 "network"
             )
