@@ -110,7 +110,7 @@ def test_a_run_goes_on_with_the_same_question_only(evaluate, worlds):
         (["--region", "a:1,2,3"], "--region a:1,2,3: 4 numbers x0,x1,y0,y1 in metres are needed"),
         (["--region", "a:1,2,3,x"], "--region a:1,2,3,x: 4 numbers"),
         (["--region", "a:2,1,0,1"], "regions.a.x_m: the lower bound must be below the upper one; got 2 to 1 m"),
-        (["--region", "a:nan,1,0,1"], "regions.a.x_m.0: Input should be"),
+        (["--region", "a:nan,1,0,1"], "regions.a.x_m.0: a finite number"),
         (["--region", "a:0,1,0,1", "--region", "a:0,2,0,1"], "the name 'a' is given already"),
         (["--region", "a:0,0.1,0,1"], "region 'a' holds no cell center; use smaller cells than 0.5 m"),
         (["--regions", "nowhere.yaml"], "nowhere.yaml"),

@@ -47,7 +47,7 @@ def test_the_exit_code_is_the_verdict_on_all(torchcover, worlds, requirements, c
         ("requirements: [{target: moon, positions: {within_m: 1}, points: 5}]", [], "no target is called 'moon'"),
         ("requirements: [{target: dog, positions: {within_m: 1}, pionts: 5}]", [], "pionts: unknown key"),
         ("requirements: [{target: dog, positions: {within_m: 1}, points: 5, counted_sensors: rof}]", [], "no sensor is called 'rof'"),
-        ("{}", [], "requirements: Field required"),
+        ("{}", [], "requirements: a value is needed; the key is missing"),
         (f"requirements: [{AHEAD}]", ["--requirements", "crosing_like"], "is 'crossing_like' meant?"),
         (f"requirements: [{AHEAD}]", ["--requirements", "none.yaml"], "none.yaml: no such file"),
     ],

@@ -122,9 +122,9 @@ def test_a_robot_of_urdf_becomes_a_vehicle_and_a_rig_that_can_be_shown(torchcove
     ("<robot name='a'><link name='b'><visual><geometry><box size='1 nan 1'/></geometry></visual></link></robot>",
      "box size: 3 numbers needed"),
     ("<robot name='a'><link name='b'><visual><geometry><box size='1 -2 1'/></geometry></visual></link></robot>",
-     "link 'b': <box>: size_m.1: Input should be greater than 0 (got -2.0)\n"),
+     "link 'b': <box>: size_m.1: a number above 0 is needed; got -2.0\n"),
     ("<robot name='a'><link name='b'><visual><geometry><sphere radius='0'/></geometry></visual></link></robot>",
-     "link 'b': <sphere>: size_m.0: Input should be greater than 0 (got 0.0)"),
+     "link 'b': <sphere>: size_m.0: a number above 0 is needed; got 0.0"),
     ("<robot name='a'><link name='b'/><joint name='j'><parent link='b'/><child link='c'/></joint></robot>",
      "joint 'j' is about 'c', which is no link"),
 ])  # fmt: skip

@@ -429,9 +429,9 @@ MISTAKES = [
     ({"obstacle": []}, "obstacle"),
     (
         {"name": None, "ego": {"speed_kmh": 10, "radius_m": [8, 9]}},
-        "encounters.0: name: Input should be a valid string",
+        "encounters.0: name: a text is needed",
     ),
-    ({"name": ["f", "g"]}, "encounters.0: name: Input should be a valid string"),
+    ({"name": ["f", "g"]}, "encounters.0: name: a text is needed"),
     ({"ego": {"speed_kmh": [-10, 0, 10]}}, "'f' has speeds forward and in reverse"),
     ({"ego": {"speed_kmh": {"from": -10, "to": 10}}}, "'f' has speeds forward and in reverse"),
 ]  # fmt: skip

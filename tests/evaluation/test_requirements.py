@@ -18,7 +18,7 @@ from torchcover.placement.selection_space import SelectionSpace
 from torchcover.placement.space import SearchSpace
 from torchcover.simulation import RegionsOfInterest, Rig, Scenario, documents, list_builtin_names
 from torchcover.simulation.bodies import Vehicle
-from torchcover.simulation.document_errors import format_validation_error
+from torchcover.simulation.documents import explain_document_error
 from torchcover.targets import SIDES, Raster, Target, measure_target_visibility
 
 CAR = BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5))
@@ -188,7 +188,7 @@ def test_requirements_that_read_alike_are_told_apart_or_refused():
 def test_messages_are_about_keys_of_the_file_and_not_of_the_program(one):
     with pytest.raises(ValidationError) as told:
         asked(one)
-    words = format_validation_error(told.value)
+    words = explain_document_error(told.value)
     assert words.startswith("requirements.0.")
     assert not re.search(r"\(place\)|tuple|literal|function|instance|validation|\.str", words.partition(" (got")[0])
 
@@ -445,4 +445,4 @@ def test_a_key_in_another_unit_names_the_right_one():
     for key, right in (("yaw_rad", "yaw_deg"), ("x_mm", "x_m"), ("pitch_rad", "pitch_deg"), ("max_range_km", None)):
         with pytest.raises(ValueError, match="x") as told:
             Rig.model_validate({"name": "x", "sensors": [{"name": "s", "type": "lidar", "mount": {key: 1.0}}]})
-        assert f"is {right} meant?" in format_validation_error(told.value) or right is None
+        assert f"is {right} meant?" in explain_document_error(told.value) or right is None

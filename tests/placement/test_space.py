@@ -271,7 +271,7 @@ MISTAKES = [
     ({"vehicle": "spaceship"}, "vehicle: 'spaceship' is neither a .yaml file nor one of the built-in vehicles"),
     ({"vehicle": "body.ply"}, "vehicle: got 'body.ply'; give the name of a vehicle or the path of its YAML file"),
     ({"start": "none"}, "start: 'none' is neither a .yaml file nor one of the built-in rigs"),
-    ({"start": 3}, "start: Input should be a valid dictionary (got 3)"),
+    ({"start": 3}, "start: a mapping is needed; got 3"),
 ]
 
 

@@ -104,14 +104,14 @@ def test_yaml_and_python_say_the_same(tmp_path):
     ("content", "message"),
     [
         ("regions: {a: {x_m: [1, 1], y_m: [0, 1]}}", "regions.a.x_m: the lower bound must be below the upper one"),
-        ("regions: {a: {x_m: [.nan, 1], y_m: [0, 1]}}", r"regions.a.x_m.0: Input should be"),
+        ("regions: {a: {x_m: [.nan, 1], y_m: [0, 1]}}", r"regions.a.x_m.0: a finite number"),
         ("regions: {a: {x_m: [0, 1]}}", "regions.a: give x_m and y_m, two bounds each, or the corners of polygon_m"),
         ("regions: {a: {polygon_m: [[0, 0], [1, 1], [1, 0], [0, 1]]}}", "regions.a: .*edges cross .*Self-intersection"),
         ("regions: {a: {polygon_m: [[0, 0], [1, 1], [2, 2]]}}", "regions.a: .*edges cross"),
         ("regions: {a: {polygon_m: [[0, 0], [1, 1]]}}", "three different corners or more are needed; got 2"),
         ("heights: {low: [0.5, 0.5]}", "heights.low: the lower bound must be below the upper one; got 0.5 to 0.5 m"),
         ("heights: {low: [0, 1], low: [0, 2]}", "low"),
-        ("grid: {cell_m: 0}", "grid.cell_m: Input should be greater than 0"),
+        ("grid: {cell_m: 0}", "grid.cell_m: a number above 0"),
         ("regions: {a: {x: [0, 1], y: [0, 1]}}", "regions.a.x: .*regions.a.y: "),
     ],
 )

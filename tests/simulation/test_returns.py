@@ -3,10 +3,8 @@
 import numpy as np
 import pytest
 import yaml
-from pydantic import ValidationError
 
 from torchcover.simulation import Lidar, Material, PaperReference, Rig, Scenario, Simulator, list_builtin_names
-from torchcover.simulation.document_errors import format_validation_error
 from torchcover.simulation.returns import (
     MAX_RETURN_PROBABILITY,
     compute_extinction_per_m,
@@ -81,10 +79,10 @@ def test_each_builtin_material_is_called_as_its_file():
 
 def test_bad_materials_are_told():
     for reflectivity in (1.5, -0.1, True, "shiny", float("nan"), None):
-        with pytest.raises(ValidationError) as refused:
+        with pytest.raises(ValueError) as raised:
             Material(name="snow", reflectivity=reflectivity)
-        assert format_validation_error(refused.value) == (
-            f"reflectivity: a share of light from 0 to 1, or `retroreflective`, is needed; got {reflectivity!r}"
+        assert str(raised.value) == (
+            f"Material: reflectivity: a share of light from 0 to 1, or `retroreflective`, is needed; got {reflectivity!r}"
         )
     with pytest.raises(FileNotFoundError, match="is 'brick' meant"):
         Material.load("bricks")
@@ -93,14 +91,14 @@ def test_bad_materials_are_told():
 @pytest.mark.parametrize(
     ("given", "told"),
     [
-        ({"range_at_10_percent_m": 0.0}, "greater than 0"),
-        ({"range_at_10_percent_m": 50.0, "log_range_std": 0.0}, "greater than 0"),
+        ({"range_at_10_percent_m": 0.0}, "a number above 0"),
+        ({"range_at_10_percent_m": 50.0, "log_range_std": 0.0}, "a number above 0"),
         ({"range_factors": [1.0]}, "one for each of the 2 rows is needed; got 1"),
     ],
 )
 def test_bad_keys_of_a_lidar_are_told(given, told):
-    with pytest.raises(ValidationError, match=told):
-        Lidar.model_validate(KEYS | given)
+    with pytest.raises(ValueError, match=told):
+        Lidar(**KEYS | given)
 
 
 PLAIN = {
@@ -260,8 +258,8 @@ def test_an_ideal_rig_is_the_one_without_a_range_at_10_percent():
 @pytest.mark.parametrize(
     ("given", "told"),
     [
-        ({"weather": {"visibility_m": 0.0}}, "visibility_m: Input should be greater than 0"),
-        ({"weather": {"rain_mm_h": -1.0}}, "greater than or equal to 0"),
+        ({"weather": {"visibility_m": 0.0}}, "visibility_m: a number above 0"),
+        ({"weather": {"rain_mm_h": -1.0}}, "a number of at least 0"),
         ({"bodies": [PLAIN["bodies"][0] | {"material": "raod"}]}, "is 'road' meant"),
     ],
 )

@@ -183,5 +183,5 @@ def test_a_scan_that_is_longer_than_a_time_step_is_refused():
             ValueError, match=r"'roof': a scan of period_s 0\.1 is longer than the time step .* 0\.05 s"
         ):
             swept(world(ego_mps=ego_mps, step_s=0.05))
-    with pytest.raises(ValueError, match=r"scan\.period_s\n.*greater than 0"):
-        Lidar.model_validate({**LIDAR.model_dump(), "scan": {"period_s": 0.0}})
+    with pytest.raises(ValueError, match=r"scan\.period_s: a number above 0"):
+        Lidar(**{**LIDAR.model_dump(), "scan": {"period_s": 0.0}})

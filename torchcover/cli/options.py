@@ -200,7 +200,7 @@ def combine_regions(regions_file: Path | None, regions: Sequence[str] | None) ->
     from pydantic import ValidationError
 
     from torchcover.simulation import RegionsOfInterest
-    from torchcover.simulation.document_errors import format_validation_error
+    from torchcover.simulation.documents import explain_document_error
 
     content = {} if regions_file is None else RegionsOfInterest.load(regions_file).model_dump(exclude_unset=True)
     if regions:
@@ -209,7 +209,7 @@ def combine_regions(regions_file: Path | None, regions: Sequence[str] | None) ->
     try:
         return RegionsOfInterest.model_validate(content)
     except ValidationError as error:
-        raise ValueError(format_validation_error(error)) from error
+        raise ValueError(explain_document_error(error)) from error
 
 
 def _named(option: str, given: Sequence[str], bounds: Sequence[str]) -> dict[str, tuple[float, ...]]:

@@ -387,7 +387,7 @@ class FrameMetric(MergeableSums):
 
 def describe_number(
     key: str, unit: str, counted_items: str, *, lower_is_better: bool = False, **parameters: Any
-) -> Number:  # noqa: ANN401
+) -> Number:
     """Describe a number of a metric that has no value yet.
 
     Args:

@@ -19,8 +19,7 @@ from pydantic import (
 )
 
 from torchcover.simulation.bodies import Shape, Vehicle, VehicleShape
-from torchcover.simulation.document_errors import format_validation_error
-from torchcover.simulation.documents import BuiltInDocument, Document, build_name_validator
+from torchcover.simulation.documents import BuiltInDocument, Document, build_name_validator, explain_document_error
 from torchcover.simulation.returns import CLEAR, Weather
 
 KeyPath = tuple[str | int, ...]
@@ -244,7 +243,7 @@ class EncounterSet(BuiltInDocument):
                     if first_index < family_index:
                         raise ValueError(f"the name {encounter.name!r} is already used by encounters.{first_index}")
             except ValueError as error:
-                message = format_validation_error(error) if isinstance(error, ValidationError) else error
+                message = explain_document_error(error) if isinstance(error, ValidationError) else error
                 raise ValueError(f"encounters.{family_index}: {message}") from error
         return {**content, "encounters": tuple(encounters)}
 

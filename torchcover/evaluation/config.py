@@ -12,7 +12,8 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field, StrictBool, StrictFloat, ValidationError
 
-from torchcover.recordings.settings import RecordingSettings, explain_validation_error
+from torchcover.files import explain_validation_error
+from torchcover.recordings.settings import RecordingSettings
 
 Names = tuple[str, ...]
 

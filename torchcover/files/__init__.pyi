@@ -43,3 +43,4 @@ from .tables import read_npy as read_npy
 from .tables import read_npz as read_npz
 from .tables import read_npz_headers as read_npz_headers
 from .tables import write_npz as write_npz
+from .validation import explain_validation_error as explain_validation_error

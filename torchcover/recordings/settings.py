@@ -1,6 +1,5 @@
 """Settings for recordings with missing or wrong metadata: `recording.yaml` and `--set recording.KEY=VALUE`."""
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -134,7 +133,7 @@ def merge_recording_settings(recording: Path, settings: RecordingSettings | None
 
 def _read_settings(path: Path) -> dict[str, Any]:
     """Read and validate `recording.yaml`."""
-    from torchcover.files import parse_yaml, read_short_text
+    from torchcover.files import explain_validation_error, parse_yaml, read_short_text
 
     content = parse_yaml(read_short_text(path))
     if not isinstance(content, dict):
@@ -144,23 +143,3 @@ def _read_settings(path: Path) -> dict[str, Any]:
     except ValidationError as error:
         raise ValueError("; ".join(explain_validation_error(error))) from error
     return content
-
-
-def explain_validation_error(error: ValidationError) -> Iterator[str]:
-    """Explain each mistake that pydantic found in one sentence.
-
-    Args:
-        error: Error of a validated model.
-
-    Yields:
-        The key, the fault and the value of each mistake.
-    """
-    for detail in error.errors(include_url=False):
-        key = ".".join(str(part) for part in detail["loc"])
-        if detail["type"] == "extra_forbidden":
-            yield f"{key}: unknown key"
-        elif detail["type"] == "value_error":
-            yield f"{key}: {detail['msg'].removeprefix('Value error, ')}"
-        else:
-            expected = detail["msg"].removeprefix("Input should be ").replace("tuple", "list")
-            yield f"{key}: {expected} is needed; got {detail['input']!r:.60}"

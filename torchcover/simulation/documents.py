@@ -18,14 +18,32 @@ from pydantic import (
     model_validator,
 )
 
-from torchcover.files import BadFileError, guard_reader, parse_yaml, read_short_text
+from torchcover.files import (
+    BadFileError,
+    explain_validation_error,
+    guard_reader,
+    parse_yaml,
+    read_short_text,
+)
 from torchcover.geometry import build_transform, convert_euler_to_rotation, convert_quaternion_to_rotation
 from torchcover.geometry.arrays import Float64
 from torchcover.geometry.rigid import warn_about_radians
 from torchcover.recordings.unsupported_formats import find_remedy
 from torchcover.simulation.builtin import get_builtin_folder, hash_file, list_builtin_names
-from torchcover.simulation.document_errors import format_validation_error
 
+# Keys of other formats -> keys of this package.
+FOREIGN_KEYS = {
+    **dict.fromkeys(("xyz", "position", "translation", "location"), "x_m, y_m, z_m"),
+    **dict.fromkeys(("rpy", "euler"), "roll_deg, pitch_deg, yaw_deg"),
+    **dict.fromkeys(("rotation", "orientation", "quaternion"), "quaternion_wxyz, or roll_deg, pitch_deg, yaw_deg,"),
+    **dict.fromkeys(("rows", "beams", "lines", "layers"), "channels"),
+    **dict.fromkeys(("lidars", "cameras", "radars"), "sensors"),
+    "fov": "horizontal_fov_deg, vertical_fov_deg or, of a camera, fov_deg",
+    "resolution": "width, height",
+    "range": "max_range_m",
+}
+# Suffixes of keys that are units.
+UNITS = ("rad", "deg", "mm", "cm", "m", "km", "ft", "in", "s", "ms", "hz", "mps", "kmh")
 SETTINGS_KIND = "a file of settings"
 # Kind of document -> its required and its optional top-level keys, for files that commands read.
 KINDS = {
@@ -57,6 +75,15 @@ class Document(BaseModel):
 
     kind: ClassVar[str] = ""
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, strict=True)
+
+    def __init__(self, **values: Any) -> None:  # noqa: ANN401  (raw content)
+        try:
+            super().__init__(**values)
+        except ValidationError as error:
+            raise ValueError(f"{type(self).__name__}: {explain_document_error(error)}") from None
+
+    # As pydantic marks its own: documents within documents are validated without a call of it.
+    __init__.__pydantic_base_init__ = True  # type: ignore[attr-defined]
 
     @model_validator(mode="before")
     @classmethod
@@ -159,8 +186,36 @@ def read_document(document_type: type[DocumentT], path: Path) -> DocumentT:
         return document_type.model_validate(content, context={"folder": path.parent})
     except ValidationError as error:
         kind = find_other_kind(document_type.kind, content)
-        message = f"this is {kind}; {document_type.kind} is needed" if kind else format_validation_error(error)
+        message = f"this is {kind}; {document_type.kind} is needed" if kind else explain_document_error(error)
         raise BadFileError(f"{path}: {message}") from error
+
+
+def explain_document_error(error: ValidationError) -> str:
+    """Explain the mistakes of a document in one line, with suggestions for unknown keys.
+
+    Args:
+        error: Error of a document.
+    """
+    return "; ".join(explain_validation_error(error, _suggest_key))
+
+
+def _suggest_key(key: str) -> str:
+    """Suggest a key for an unknown one: a translation, the key with another unit, or a similar key; empty if none."""
+    if key in FOREIGN_KEYS:
+        return FOREIGN_KEYS[key]
+    known_keys = sorted(_collect_keys(Document))
+    stem, _, unit = key.rpartition("_")
+    quantity = stem if unit in UNITS else key
+    same_quantity = [name for name in known_keys if name.rpartition("_")[0] == quantity]
+    return next(iter(same_quantity or get_close_matches(key, known_keys, n=1, cutoff=0.8)), "")
+
+
+def _collect_keys(document_type: type[BaseModel]) -> set[str]:
+    """Collect the keys of a type and all its subclasses."""
+    keys = set(document_type.model_fields)
+    for subclass in document_type.__subclasses__():
+        keys |= _collect_keys(subclass)
+    return keys
 
 
 def find_other_kind(kind: str, content: Mapping[str, Any]) -> str:

@@ -16,8 +16,7 @@ from torchcover.geometry import BoundingBox, build_transform, convert_quaternion
 from torchcover.geometry.arrays import Float64
 from torchcover.recordings.unsupported_formats import find_remedy
 from torchcover.simulation.bodies import merge_meshes
-from torchcover.simulation.document_errors import format_validation_error
-from torchcover.simulation.documents import FARTHEST_M
+from torchcover.simulation.documents import FARTHEST_M, explain_document_error
 from torchcover.simulation.gazebo_sensors import PlacedSensor, read_numbers, read_pose, read_sensors
 from torchcover.simulation.instant import is_enclosed
 from torchcover.simulation.raycaster import RayCaster
@@ -122,7 +121,9 @@ def read_robot(path: Path, packages: Mapping[str, str | Path] | None = None) -> 
     base_T_link = _link_poses(links, joints, positions)
     meshes = _read_meshes(links, path, packages or {})
     with np.errstate(over="ignore", invalid="ignore"):  # lengths of 1e308 m: refused below
-        pieces = [mesh.transform(base_T_link[name]) for name, link in links.items() for mesh in _link_meshes(link, meshes)]
+        pieces = [
+            mesh.transform(base_T_link[name]) for name, link in links.items() for mesh in _link_meshes(link, meshes)
+        ]
     if not pieces:
         raise ValueError("no link has a visual or collision geometry, so there is no body")
     vertices_m = merge_meshes(pieces).vertices_m
@@ -297,7 +298,7 @@ def _link_meshes(link: Element, meshes: Mapping[str, Mesh]) -> list[Mesh]:
             try:
                 mesh = _shape_mesh(shape, name, meshes)
             except ValidationError as error:
-                raise ValueError(f"link {name!r}: <{shape.tag}>: {format_validation_error(error)}") from error
+                raise ValueError(f"link {name!r}: <{shape.tag}>: {explain_document_error(error)}") from error
             shown.append(mesh.transform(read_pose(body.find("origin"))))
     return shown
 
@@ -337,7 +338,7 @@ def _mounted(sensors: Sequence[PlacedSensor]) -> Sequence[Sensor]:
     try:
         return Rig.model_validate({"name": "robot", "sensors": [sensor.sensor_keys for sensor in sensors]}).sensors
     except ValidationError as error:
-        raise ValueError(format_validation_error(error)) from error
+        raise ValueError(explain_document_error(error)) from error
 
 
 def _without_housings(pieces: Sequence[Mesh], sensors: Sequence[PlacedSensor]) -> list[Mesh]:

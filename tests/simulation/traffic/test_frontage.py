@@ -111,5 +111,5 @@ def test_what_stands_on_pavement_is_a_kerb_higher_and_nothing_stands_across_its_
 def test_other_densities_are_refused(times):
     with pytest.raises(ValidationError):
         TypeAdapter(RoadsideDensity).validate_python(times)
-    with pytest.raises(ValidationError, match="roadside"):
+    with pytest.raises(ValueError, match="UrbanTraffic: roadside_density"):
         UrbanTraffic(roadside_density=times)

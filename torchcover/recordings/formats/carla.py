@@ -14,7 +14,14 @@ from pydantic import AliasChoices, BaseModel, ConfigDict, Field, TypeAdapter, Va
 from torchcover.cameras import Camera, read_depth
 from torchcover.cameras.calibration import LOOKING_FORWARD
 from torchcover.detection.boxes import Boxes, build_upright_rows
-from torchcover.files import guard_reader, parse_yaml, read_csv, read_short_text, report_bad_file
+from torchcover.files import (
+    explain_validation_error,
+    guard_reader,
+    parse_yaml,
+    read_csv,
+    read_short_text,
+    report_bad_file,
+)
 from torchcover.geometry import BoundingBox, build_transform, convert_euler_to_rotation, invert, transform_points
 from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.clouds import read_cloud
@@ -156,7 +163,9 @@ def read_carla_sensors(path: Path) -> list[CarlaSensor]:
     try:
         sensors = TypeAdapter(list[CarlaSensor]).validate_python(parse_yaml(read_short_text(path)))
     except ValidationError as error:
-        raise ValueError(f"a list of sensors with id and type is needed; {_format_errors(error)}") from error
+        raise ValueError(
+            f"a list of sensors with id and type is needed; {'; '.join(explain_validation_error(error))}"
+        ) from error
     sensors = [sensor for sensor in sensors if sensor.type in (*LIDAR_TYPES, DEPTH_TYPE)]
     names = [sensor.id for sensor in sensors]
     if not set(names) - {REFERENCE} or len(set(names)) < len(names):
@@ -183,7 +192,9 @@ def read_carla_vehicle(path: Path) -> CarlaVehicle:
     try:
         vehicle = CarlaVehicle.model_validate(parse_yaml(read_short_text(path)))
     except ValidationError as error:
-        raise ValueError(f"location and extent, each with x, y, z, are needed; {_format_errors(error)}") from error
+        raise ValueError(
+            f"location and extent, each with x, y, z, are needed; {'; '.join(explain_validation_error(error))}"
+        ) from error
     _ = vehicle.ego_box  # raises for a box without a size
     return vehicle
 
@@ -245,15 +256,6 @@ def to_right_handed(pose: list[float] | list[NDArray[np.float64]]) -> Matrix:
     """
     x, y, z, roll, pitch, yaw = (np.asarray(values) for values in pose)
     return build_transform(convert_euler_to_rotation(-yaw, -pitch, roll), np.stack([x, -y, z], axis=-1))
-
-
-def _format_errors(error: ValidationError) -> str:
-    """Format the errors of pydantic with their keys."""
-    messages = []
-    for detail in error.errors():
-        key = ".".join(str(part) for part in detail["loc"])
-        messages.append(f"{key}: {detail['msg']}")
-    return "; ".join(messages)
 
 
 class Carla(RecordingBase):

@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar, NamedTuple
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from torchcover.detection.boxes import Boxes
-from torchcover.files import guard_reader, parse_yaml, read_short_text
+from torchcover.files import explain_validation_error, guard_reader, parse_yaml, read_short_text
 from torchcover.geometry import BoundingBox
 from torchcover.geometry.rigid import Matrix, check_rigid
 from torchcover.recordings.clouds import read_cloud
@@ -124,8 +124,7 @@ def _read_settings_file(path: Path) -> FolderSettings:
     try:
         settings = _SettingsFile.model_validate(content)
     except ValidationError as error:
-        complaints = [f"{'.'.join(map(str, detail['loc']))}: {detail['msg']}" for detail in error.errors()]
-        raise ValueError(f"{'; '.join(complaints)}; {allowed}") from error
+        raise ValueError(f"{'; '.join(explain_validation_error(error))}; {allowed}") from error
     entries: dict[str, _SensorEntry | None] = {"sensor": settings.sensor, "reference": settings.reference}
     entries |= {f"sensors/{name}": entry for name, entry in settings.sensors.items()}
     entries |= {f"rigs/{name}": entry for name, entry in settings.rigs.items()}
