@@ -241,7 +241,6 @@ def test_extreme_parameters_still_make_a_world(model, options, bodies):
         (UrbanTraffic, {"parked_share": 1.5}),
         (UrbanTraffic, {"cross_traffic_share": 1.5}),
         (UrbanTraffic, {"traffic_per_km": -1}),
-        (UrbanTraffic, {"num_lanes": 3}),
         (HighwayTraffic, {"ego_lane": 4}),
         (HighwayTraffic, {"duration_s": 0}),
         (HighwayTraffic, {"hill_height_std_m": 11}),
