@@ -86,7 +86,11 @@ def main():
         "pinhole": rig_of("pinhole", calibration, "pinhole"),
     }
     frames = SimulatedFrames(
-        "courtyard", rigs=rigs, num_frames=options.steps, seed=0, reference_sensor=PaperReference(rows=512, columns=512)
+        "courtyard",
+        rigs=rigs,
+        num_frames=options.num_frames,
+        seed=0,
+        reference_sensor=PaperReference(rows=512, columns=512),
     )
     observers = {name: CoverageObserver(CoverageMetric(GRID, max_radius_m=GRID.diagonal_m), name) for name in rigs}
     observe(frames, observers.values(), show_progress=True)

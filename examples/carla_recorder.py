@@ -163,13 +163,13 @@ def record(client, options, listed):
     listed = [at_each_tick(one, options.tick_s) for one in listed if one["type"] in (*LIDAR_TYPES, DEPTH_TYPE)]
     best_case = {
         "type": LIDAR_TYPES[0],
-        "channels": options.rays,
+        "channels": options.num_rays,
         "upper_fov": 0.0,
         "lower_fov": -90.0,
         "range": 250.0,
         **EXACT,
     }
-    best_case["points_per_second"] = round(options.rays**2 / options.tick_s)
+    best_case["points_per_second"] = round(options.num_rays**2 / options.tick_s)
     ego, sensors = None, []
     try:
         world.apply_settings(settings)

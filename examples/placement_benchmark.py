@@ -65,7 +65,7 @@ BATCH = 4
 SECONDS_APART = 15.0
 # Each step of the metrics shows another city: worlds are what their errors are over.
 WORLD_S = 60.0
-REDUCED = {"placements": 3, "seeds": 2, "train": 4, "validate": 4, "epochs": 1, "steps": 2}
+REDUCED = {"placements": 3, "seeds": 2, "train": 4, "validate": 4, "epochs": 1, "num_frames": 2}
 
 
 def placements(count, seed):
@@ -103,7 +103,9 @@ def simulate(rigs, steps, seed, name):
     for index in track(range(steps), description=f"simulating {name}", console=Console(stderr=True)):
         frame = frames[index]
         clouds = {rig: thinned(frame.get_measured_points(rig)) for rig in frame.clouds}
-        kept.append(replace(frame, clouds=clouds, measurements={}, boxes=in_region(frame.boxes), sensor_point_counts=None))
+        kept.append(
+            replace(frame, clouds=clouds, measurements={}, boxes=in_region(frame.boxes), sensor_point_counts=None)
+        )
     return kept
 
 
@@ -180,7 +182,7 @@ def check_same(options, path):
         path.write_text(json.dumps(settings, indent=1), encoding="utf-8")
     earlier = json.loads(path.read_text(encoding="utf-8"))
     # A training depends on none of these.
-    free = ("placements", "seeds", "steps", "metrics")
+    free = ("placements", "seeds", "num_frames", "metrics")
     if other := [name for name in settings if earlier.get(name) != settings[name] and name not in free]:
         told = ", ".join(f"{name} {earlier.get(name)} (now {settings[name]})" for name in other)
         raise SystemExit(f"{path.parent} holds trainings with {told}; choose another --out")
@@ -192,7 +194,7 @@ def page(judged, scores, options):
     text = (
         f"{len(judged.placements)} placements of {LIDARS} LiDARs ({LIDAR['channels']} rows, {LIDAR['columns']} columns "
         f"each), {each} on {options.train} frames in {options.epochs} epochs, average precision of cars on "
-        f"{options.validate} held-out frames; metrics in {options.steps} other steps. Spearman's correlation and "
+        f"{options.validate} held-out frames; metrics in {options.num_frames} other frames. Spearman's correlation and "
         "Kendall's tau-b with the mean of the trainings, 95 % intervals from drawing placements, trainings and worlds "
         "anew (where marked *, not worlds); p of a correlation as strong, of either sign, by chance; the lead is what "
         "Spearman's correlation has more than that of the mean mounting height.\n\n"
@@ -200,9 +202,9 @@ def page(judged, scores, options):
     on_the_roof = [name for name in judged.placements if name.startswith("roof")]
     for words, names in (("All placements", judged.placements), ("Placements on the roof", on_the_roof)):
         if len(names) >= LEAST:
-            text += f"## {words}\n\n{ranks(judged.of(names), scores.of(names))}\n"
-    text += f"## Average precision\n\n| placement | LiDARs at x, y, z (m) | {' | '.join(judged.judges)} |\n"
-    text += "|---|---|" + "---:|" * len(judged.judges) + "\n"
+            text += f"## {words}\n\n{ranks(judged.select(names), scores.select(names))}\n"
+    text += f"## Average precision\n\n| placement | LiDARs at x, y, z (m) | {' | '.join(judged.raters)} |\n"
+    text += "|---|---|" + "---:|" * len(judged.raters) + "\n"
     rigs = placements(len(judged.placements), options.seed)
     for name, column in zip(judged.placements, judged.values.T, strict=True):
         places = "; ".join(
@@ -216,12 +218,16 @@ def ranks(judged, rankings):
     """The table of some placements, and what it is worth."""
     found = correlate_rankings(rankings, judged, resample_placements=True)
     (height,) = (one for one in rankings if one.name == "mean mounting height")
-    ceiling = f"{judged.ceiling:.2f}" if len(judged.judges) > 1 else "an unknown amount, for there is one of each,"
+    ceiling = (
+        f"{judged.inter_rater_correlation:.2f}"
+        if len(judged.raters) > 1
+        else "an unknown amount, for there is one of each,"
+    )
     text = (
         f"The trainings agree with each other by {ceiling} on {len(judged.placements)} placements, whose "
         f"average precision is {judged.mean.min():.3f} to {judged.mean.max():.3f}. Of {found.metric_count} metrics the "
-        f"best is `{found.best_metric}`, p = {found.best_p_value:.2g} as the best of so many; one of twenty times chance alone "
-        f"gives the best more than {found.chance_threshold:.2f}.\n\n"
+        f"best is `{found.best_metric}`, p = {found.best_p_value:.2g} corrected for the choice of "
+        f"the best; in one of twenty cases, chance alone gives the best more than {found.chance_threshold:.2f}.\n\n"
         "| metric | Spearman | tau-b | p | lead |\n|---|---:|---:|---:|---:|\n"
     )
     order = sorted(
@@ -266,7 +272,7 @@ def main():
         "urban",
         region=Region("seen by the detector", X_M, Y_M),
         metrics=parse_metric_names(options.metrics),
-        num_frames=options.steps,
+        num_frames=options.num_frames,
         seed=options.seed + 2,
         frame_interval_s=WORLD_S,
         progress=True,

@@ -1,7 +1,8 @@
-"""`python -m examples.place3d`: boards whose values were worked out before, the page, and what contradicts it."""
+"""Tests of `python -m examples.place3d`: occupancy boards, agreement with published results, and the page."""
 
 import sys
 from importlib import import_module
+from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -31,37 +32,37 @@ def example():
         ("line", [0.9083, 0.3143, 0.1295, 0.0489, 0.0482]),
     ],
 )
-def test_the_published_rigs_have_the_shares_that_were_worked_out_before(example, name, expected):
-    hit = [example.boards.cells_hit(place3d(name), distance_m) for distance_m in example.boards.DISTANCES_M]
-    # The distance decides which rig is better.
-    assert [round(one.mean(), 4) for one in hit] == expected
-    assert hit[0].shape == (10, 314)
+def test_boards_of_published_rigs_have_known_shares(example, name, expected):
+    boards = [example.boards.find_hit_cells(place3d(name), distance_m) for distance_m in example.boards.DISTANCES_M]
+    # Which rig is better depends on the distance.
+    assert [round(board.mean(), 4) for board in boards] == expected
+    assert boards[0].shape == (10, 314)
 
 
-def test_level_rays_hit_a_cell_each_and_the_same_ray_no_other(example):
+def test_level_rays_hit_one_cell_each(example):
     around = beam(columns=16, z_m=1.1)
-    assert example.boards.cells_hit([around], 10.0).mean() == pytest.approx(16 / 3140)
+    assert example.boards.find_hit_cells([around], 10.0).mean() == pytest.approx(16 / 3140)
     again = around.model_copy(update={"name": "again"})
-    assert example.boards.cells_hit([around, again], 10.0).sum() == 16
-    assert not example.boards.cells_hit([beam(columns=16, z_m=2.1)], 10.0).any()
-    assert not example.boards.cells_hit([beam(columns=16, z_m=1.1, range_m=9.0)], 10.0).any()
+    assert example.boards.find_hit_cells([around, again], 10.0).sum() == 16
+    assert not example.boards.find_hit_cells([beam(columns=16, z_m=2.1)], 10.0).any()
+    assert not example.boards.find_hit_cells([beam(columns=16, z_m=1.1, range_m=9.0)], 10.0).any()
 
 
-def test_the_bottom_is_in_the_board_and_the_top_is_not(example):
+def test_board_includes_its_bottom_but_not_its_top(example):
     for z_m, hit in ((0.0, 1), (2.0, 0)):
-        assert example.boards.cells_hit([beam(z_m=z_m)], 10.0).sum() == hit
+        assert example.boards.find_hit_cells([beam(z_m=z_m)], 10.0).sum() == hit
 
 
-def test_a_sensor_off_the_middle_hits_the_cylinder_where_it_is(example):
-    # Ahead from y = 6 m, the cylinder of 10 m is met at x = 8 m.
-    hit = example.boards.cells_hit([beam(y_m=6.0, z_m=1.1)], 10.0)
+def test_offset_sensor_hits_the_cylinder_ahead_of_it(example):
+    # A ray ahead from y = 6 m hits the cylinder of 10 m at x = 8 m.
+    hit = example.boards.find_hit_cells([beam(y_m=6.0, z_m=1.1)], 10.0)
     ((row, column),) = np.argwhere(hit)
     assert row == 5
     assert column == int((np.arctan2(6.0, 8.0) / (2 * np.pi) + 0.5) * 314)
-    assert not example.boards.cells_hit([beam(y_m=6.0, z_m=1.1, range_m=7.9)], 10.0).any()
+    assert not example.boards.find_hit_cells([beam(y_m=6.0, z_m=1.1, range_m=7.9)], 10.0).any()
 
 
-def test_a_flat_board_is_hit_ahead_only(example):
+def test_flat_board_is_only_ahead(example):
     fan = Lidar(
         name="fan",
         mount=Pose(z_m=1.1),
@@ -70,31 +71,31 @@ def test_a_flat_board_is_hit_ahead_only(example):
         columns=360,
         max_range_m=100.0,
     )
-    hit = example.boards.cells_hit([fan], 10.0, width_m=4.0)
-    # Cells are 1.15 degrees wide in the middle, the rays a degree: none is missed in the one row.
+    hit = example.boards.find_hit_cells([fan], 10.0, width_m=4.0)
+    # Cells are at most 1.15 degrees wide and rays are 1 degree apart, so that each cell of the row is hit.
     assert (hit.mean(), hit.size) == (pytest.approx(1 / 10), 20 * 10)
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"distance_m": -1.0}, "distance_m: a positive length"),
-        ({"cell_m": 0.0}, "cell_m: a positive length"),
-        ({"cell_m": 0.3}, "height_m: 2 m is not a multiple of the cell of 0.3 m"),
-        ({"height_m": (2.0, 0.0)}, "height_m: a lower and a higher bound"),
-        ({"width_m": 0.3}, "width_m: 0.3 m is not a multiple"),
+        ({"distance_m": -1.0}, "distance_m: got -1.0; give a positive length"),
+        ({"cell_m": 0.0}, "cell_m: got 0.0; give a positive length"),
+        ({"cell_m": 0.3}, "height_m: 2 m is no multiple of the cell of 0.3 m"),
+        ({"height_m": (2.0, 0.0)}, r"height_m: got \(2.0, 0.0\); give a lower and a higher bound"),
+        ({"width_m": 0.3}, "width_m: 0.3 m is no multiple"),
         ({"sensors": [beam(x_m=12.0)]}, "sensor 'beam' is 12 m away, behind the board at 10 m"),
         ({"sensors": [beam(x_m=12.0)], "width_m": 4.0}, "sensor 'beam' is 12 m away, behind the board at 10 m"),
     ],
 )
-def test_boards_that_cannot_be_are_refused(example, options, message):
+def test_invalid_boards_are_refused(example, options, message):
     with pytest.raises(ValueError, match=message):
-        example.boards.cells_hit(**{"sensors": [beam()], "distance_m": 10.0, **options})
+        example.boards.find_hit_cells(**{"sensors": [beam()], "distance_m": 10.0, **options})
 
 
 # Tables I and II of Li et al., ICRA 2024, arXiv:2310.05245: `s_mig_1e3` is S-MIG of the LiDARs in thousands of nats,
 # `map` the mAP in per cent of each fusion network and set of cameras, on the rigs `hu2022_NAME`.
-def test_two_papers_contradict_each_other_on_the_placements_that_both_have(example):
+def test_two_papers_contradict_each_other(example):
     li = read_results(ROOT / "examples" / "place3d" / "li_2024.csv")
     cars = li["map", "car"]
     place3d = read_results(get_builtin_folder("published") / "place3d_2024.csv")["map", "car"]
@@ -105,71 +106,78 @@ def test_two_papers_contradict_each_other_on_the_placements_that_both_have(examp
         f"the same four placements ({', '.join(both)}) with a Spearman correlation of {rho:.2f}"
         in example.study.NOTES[1]
     )
-    # The metric of Li et al. ranks as their own detectors do, and every placement is a rig.
+    # The metric of Li et al. ranks as their own detectors do, and each placement is a built-in rig.
     for category in ("car", "bicycle", "pedestrian"):
         assert compute_spearman(li["s_mig_1e3", category].mean, li["map", category].mean) == pytest.approx(1.0)
-    for judged in li.values():
-        assert all(Rig.load(f"hu2022_{placement}").sensors for placement in judged.placements)
+    for ratings in li.values():
+        assert all(Rig.load(f"hu2022_{placement}").sensors for placement in ratings.placements)
 
 
 @pytest.fixture(scope="module")
 def study(example):
-    return example.study.agree(scenario="courtyard", metrics=["point_density"], steps=2)
+    return example.study.run_study(scenario="courtyard", metrics=["point_density"], num_frames=2)
 
 
-def test_each_truth_ranks_its_own_eight_placements_in_both_readings_of_the_rolls(example, study):
-    assert set(study.found) == {
-        (truth, reading) for truth in example.study.TRUTHS.values() for reading in example.study.READINGS
-    }
-    for (truth, _), found in study.found.items():
-        own = "segmentation" if truth == "mIoU" else "detection"
-        assert len(found.judged.placements) == 8
-        assert f"optimised_{own}" in found.judged.placements
-        height = next(row for row in found.ranked if row.metric == "mean mounting height")
-        assert np.isnan(next(row for row in found.ranked if row.metric == "rays").spearman.value)
-        if truth in ("car mAP", "mIoU"):
-            assert height.spearman.value == pytest.approx(0.93, abs=0.005)
-    names = [row.metric for row in study.found["car mAP", "radians"].ranked]
+def test_each_rating_has_both_readings_of_the_rolls(example, study):
+    ratings, readings = example.study.RATINGS.values(), example.study.READINGS
+    assert set(study.agreements) == set(product(ratings, readings))
+
+
+def test_each_rating_ranks_its_own_eight_placements(study):
+    for (rating, _), agreement in study.agreements.items():
+        task = "segmentation" if rating == "mIoU" else "detection"
+        assert len(agreement.ratings.placements) == 8
+        assert f"optimised_{task}" in agreement.ratings.placements
+        spearman = {row.metric: row.spearman.value for row in agreement.correlations}
+        assert np.isnan(spearman["rays"])
+        if rating in ("car mAP", "mIoU"):
+            assert spearman["mean mounting height"] == pytest.approx(0.93, abs=0.005)
+    names = [row.metric for row in study.agreements["car mAP", "radians"].correlations]
     assert len(names) == len(set(names))
     assert sum(name.startswith("detection 0.4 m") for name in names) == 6
 
 
-def test_a_reading_takes_its_own_rigs(study):
-    scores = {one.name: one.gains for one in study.scores.rankings}["points"]
+def test_each_reading_uses_its_own_rigs(study):
+    scores = {ranking.name: ranking.scores for ranking in study.scores.rankings}["points"]
     rigs = study.scores.rigs
-    # Where a LiDAR leans by 17 degrees, other points are missing than where it leans by a third of one.
+    assert len(rigs) == 13
+    # A roll of 17 degrees changes the number of points more than a roll of 0.3 degrees.
     pyramid, radians, degrees = (
         scores[rigs.index(f"place3d2024_pyramid{ending}")] for ending in ("", "_roll", "_roll_degrees")
     )
     assert abs(pyramid - degrees) < abs(pyramid - radians)
-    assert len(rigs) == 13
-    found = study.found["car mAP", "degrees"]
+    agreement = study.agreements["car mAP", "degrees"]
     tilted = ("line_roll", "pyramid_roll", "optimised_detection")
-    named = [f"place3d2024_{each}{'_degrees' * (each in tilted)}" for each in found.judged.placements]
-    assert str(correlate_rankings(study.scores.of(named), found.judged).correlations) == str(found.ranked)
-    assert str(study.found["car mAP", "radians"].ranked) != str(found.ranked)
+    names = [f"place3d2024_{name}{'_degrees' * (name in tilted)}" for name in agreement.ratings.placements]
+    expected = correlate_rankings(study.scores.select(names), agreement.ratings)
+    assert str(expected.correlations) == str(agreement.correlations)
+    assert str(study.agreements["car mAP", "radians"].correlations) != str(agreement.correlations)
 
 
-def test_the_notes_say_what_the_data_say(example, study):
+def test_notes_agree_with_the_data(example, study):
     heights, _, rolls = example.study.NOTES
-    cars = study.found["car mAP", "radians"].judged
-    mounts = [[sensor.mount.z_m for sensor in Rig.load(f"place3d2024_{name}").sensors] for name in cars.placements]
-    means = np.round(np.mean(mounts, axis=1), 6)
-    _, counts = np.unique(means, return_counts=True)
-    start = f"{len(means)} placements, {counts.max()} of which have the same mean height and which have {len(counts)} "
+    cars = study.agreements["car mAP", "radians"].ratings
+    mounts_m = []
+    for name in cars.placements:
+        mounts_m.append([sensor.mount.z_m for sensor in Rig.load(f"place3d2024_{name}").sensors])
+    means_m = np.round(np.mean(mounts_m, axis=1), 6)
+    _, counts = np.unique(means_m, return_counts=True)
+    start = (
+        f"{len(means_m)} placements, {counts.max()} of which have the same mean height and which have {len(counts)} "
+    )
     assert heights.startswith(start)
-    assert "({:.2f} and {:.2f})".format(*cars.of(["pyramid_roll", "pyramid"]).mean) in rolls
+    assert "({:.2f} and {:.2f})".format(*cars.select(["pyramid_roll", "pyramid"]).mean) in rolls
 
 
-def test_a_small_run_is_a_page_with_boards_among_the_metrics(example, tmp_path, monkeypatch, capsys):
+def test_small_run_writes_a_page_with_boards(example, tmp_path, monkeypatch, capsys):
     arguments = ["place3d", "--scenario", "courtyard", "--metrics", "point_density", "--num-frames", "1"]
     monkeypatch.setattr(sys, "argv", [*arguments, "--out", str(tmp_path)])
     example.main.main()
     page = (tmp_path / "agreement.md").read_text()
     assert page in capsys.readouterr().out
-    for words in ("## car mAP", "## mIoU", "agree with each other by 0.85", "as the best of so many", "| points *"):
-        assert words in page
-    # Boards depend on no world: these are the ranks that the example prints, other signs at 10 m and at 50 m.
+    for text in ("## car mAP", "## mIoU", "agree with each other by 0.85", "choice of the best", "| points *"):
+        assert text in page
+    # Boards do not depend on scenes: their correlations are known, with opposite signs at 10 m and at 50 m.
     assert "| lob_10m * | -0.64 [" in page
     assert "| lob_50m * | +0.90 [" in page
     assert [path.name for path in tmp_path.iterdir()] == ["agreement.md"]

@@ -1,38 +1,51 @@
-"""How metrics rank the placements of Place3D, as a page in Markdown."""
+"""Rank correlations of metrics with the placements of Place3D, as a page in Markdown."""
 
 import math
 
-from examples.place3d.study import NOTES, READINGS, verdict
+from examples.place3d.study import NOTES, READINGS, summarize_agreement
 
 
-def page(study):
-    """A table for each truth, with both readings of the rolls side by side, and what each metric says of each rig."""
+def format_page(study):
+    """Format a table for each rating of the detectors, with both readings of the rolls, and the scores of all rigs.
+
+    Args:
+        study: `Study`.
+    """
     scores = study.scores
-    measured = (
-        f"Measured in {scores.steps} steps of {study.scenario}, seed {study.seed}. "
-        "Spearman's correlation and Kendall's tau-b with the mean of the networks, 95 % intervals from drawing worlds "
-        "and networks anew (where marked *, networks only), p of a correlation as strong, of either sign, by chance. "
-        "More is better, as a metric's authors say it."
+    method = (
+        f"Measured in {scores.num_frames} frames of {study.scenario}, seed {study.seed}. Spearman's correlation and "
+        "Kendall's tau-b with the mean of the networks; 95 % intervals by resampling scenes and networks (where marked "
+        "*, networks only); p is the probability of a correlation as strong, of either sign, by chance. More is "
+        "better, as the authors of a metric define it."
     )
-    text = "".join(f"{line}\n\n" for line in (*NOTES, measured))
-    for truth in dict.fromkeys(truth for truth, _ in study.found):
-        found = {reading: study.found[truth, reading] for reading in READINGS}
-        text += f"## {truth}\n\n{verdict(truth, found)}\n\n{ranks(found)}\n"
+    text = "".join(f"{line}\n\n" for line in (*NOTES, method))
+    for rating in dict.fromkeys(rating for rating, _ in study.agreements):
+        agreements = {reading: study.agreements[rating, reading] for reading in READINGS}
+        text += f"## {rating}\n\n{summarize_agreement(rating, agreements)}\n\n{format_correlations(agreements)}\n"
     heading = f"| metric | {' | '.join(scores.rigs)} |\n|---|{'---:|' * len(scores.rigs)}\n"
-    rows = "".join(f"| {' | '.join([one.name, *map(short, one.gains)])} |\n" for one in scores.rankings)
-    return f"{text}## What each metric says of each rig\n\n{heading}{rows}"
-
-
-def ranks(found):
-    """A row for each metric."""
-    columns = [f"{name}, {reading}" for reading in found for name in ("Spearman", "tau-b", "p")]
-    text = f"| metric | {' | '.join(columns)} |\n|---|{'---:|' * len(columns)}\n"
-    for rows in zip(*(one.ranked for one in found.values()), strict=True):
-        cells = [cell for row in rows for cell in (row.spearman.words, row.kendall.words, short(row.p))]
-        text += f"| {rows[0].metric}{'' if rows[0].over_worlds else ' *'} | {' | '.join(cells)} |\n"
+    text += f"## Scores of each rig\n\n{heading}"
+    for ranking in scores.rankings:
+        cells = [ranking.name, *(format_score(score) for score in ranking.scores)]
+        text += f"| {' | '.join(cells)} |\n"
     return text
 
 
-def short(value):
-    """A number in four digits."""
+def format_correlations(agreements):
+    """Format a row for each metric.
+
+    Args:
+        agreements: Reading of the rolls -> `MetricAgreement`.
+    """
+    columns = [f"{name}, {reading}" for reading in agreements for name in ("Spearman", "tau-b", "p")]
+    text = f"| metric | {' | '.join(columns)} |\n|---|{'---:|' * len(columns)}\n"
+    for rows in zip(*(agreement.correlations for agreement in agreements.values()), strict=True):
+        cells = []
+        for row in rows:
+            cells += [row.spearman.text, row.kendall.text, format_score(row.p_value)]
+        text += f"| {rows[0].metric}{'' if rows[0].resamples_scenes else ' *'} | {' | '.join(cells)} |\n"
+    return text
+
+
+def format_score(value):
+    """Format a number with four digits."""
     return "-" if math.isnan(value) else f"{value:.4g}"

@@ -41,7 +41,7 @@ def photographed(tmp_path_factory):
         rig = Rig.model_validate({"name": sensor["name"], "sensors": [sensor]})
         frames = SimulatedFrames("courtyard", rig, num_frames=1, reference_sensor=PaperReference(rows=4, columns=4))
         points = frames[0].sensor
-        camera: Camera = rig.sensors[0].camera()
+        camera: Camera = rig.sensors[0].build_camera()
         in_camera = camera.to_camera(points)
         pixels, visible = camera.project(in_camera)
         assert visible.all()
