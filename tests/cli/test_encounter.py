@@ -46,7 +46,7 @@ def test_rigs_side_by_side_in_words_and_files(torchcover, worlds, monkeypatch):
     assert len(record["rows"]) == len((out / "encounters.csv").read_text().splitlines()) - 1 == 8
     assert record["rows"][0]["interval_low"] is None
     assert {one["max_speed_kmh"] for one in record["speeds"]} == {10.0}
-    assert "In time? low, both" in (out / "report.html").read_text()
+    assert "Detection before a collision: low, both" in (out / "report.html").read_text()
 
 
 @pytest.mark.parametrize(
@@ -78,7 +78,7 @@ def test_a_mistake_is_one_line(torchcover, worlds, text, arguments, message):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["low.yaml", "--scenario", "courtyard"], "nothing ever moves in it"),
+        (["low.yaml", "--scenario", "courtyard"], "nothing moves in it"),
         (["low.yaml", "--scenario", "urban", "--animation", "a.gif"], "--animation: of no use with --scenario"),
         (
             ["low.yaml", "--scenario", "urban", "--num-start-offsets", "10"],

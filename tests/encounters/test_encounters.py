@@ -403,10 +403,10 @@ def test_a_film_shows_where_everybody_is_and_what_is_on_the_other():
         (axes.get_xlim(), axes.get_ylim())
     }
     words = " ".join(text.get_text() for text in picture.findobj(Text))
-    assert "s to the collision; points on it: ahead 1, top 0" in words
+    assert "s to the collision; points on the road user: ahead 1, top 0" in words
     for told in (
         "at 90 km/h: detected",
-        "first ahead, without ahead",
+        "first sensor ahead, without ahead",
         "in time up to 20 km/h",
         "child_120cm (1)",
         "hatchback (1)",

@@ -1,8 +1,8 @@
 from .checkpoint import Checkpoint as Checkpoint
+from .encounter_animation import plot_encounter_animation as plot_encounter_animation
 from .encounter_evaluation import evaluate_encounters as evaluate_encounters
 from .encounter_evaluation import evaluate_recorded_encounters as evaluate_recorded_encounters
 from .encounter_evaluation import evaluate_traffic_encounters as evaluate_traffic_encounters
-from .encounter_evaluation import plot_encounter_animation as plot_encounter_animation
 from .encounter_evaluation import save_encounters as save_encounters
 from .encounter_evaluation import summarize_encounters as summarize_encounters
 from .evaluating import compare as compare

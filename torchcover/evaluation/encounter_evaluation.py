@@ -1,26 +1,16 @@
-"""In time or too late: names and defaults in, what rigs had of encounters and its files out."""
+"""Evaluation of encounters: time to collision at which rigs detect road users, in sets, traffic and recordings."""
 
-import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from io import BytesIO
 from pathlib import Path
-from typing import Literal, cast
+from typing import Literal
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from torchcover import __version__
-from torchcover.encounters import (
-    Criterion,
-    Encounter,
-    EncounterResults,
-    EncounterSet,
-    StagedEncounter,
-    detect_encounter,
-)
-from torchcover.encounters.detection import EncounterPointCounter, MountedRig
+from torchcover.encounters import Criterion, EncounterResults, EncounterSet, StagedEncounter, detect_encounter
+from torchcover.encounters.detection import MountedRig
 from torchcover.encounters.result import TOTAL_ROW
-from torchcover.encounters.staging import FRAME_INTERVAL_S, get_solid
 from torchcover.encounters.traffic import Drive, find_approaches
 from torchcover.encounters.traffic_detection import DriveSensors, detect_approach
 from torchcover.evaluation.progress import Progress, defer_signals
@@ -29,14 +19,9 @@ from torchcover.evaluation.settings import FILES, parse_file_kinds
 from torchcover.evaluation.target_visibility import build_flat_ground
 from torchcover.evaluation.task import AnyRig, load_named_rig
 from torchcover.files import AtomicOutput
-from torchcover.geometry import invert, transform_outline
 from torchcover.recordings import Recording, open_recording
-from torchcover.report import ActorMark, Page, PagePicture, StaticFaces, plot_scene, render_page
-from torchcover.simulation import PaperReference, Rig, Scenario, SensorNoise, Simulator, set_ego
-from torchcover.simulation.bodies import get_shape_name
-
-# Of a film: seconds, steps between two pictures, and what they show around all bodies.
-FILM_S, FILM_STEPS, FILM_AROUND_M = 3.0, 100, 3.0
+from torchcover.report import Page, PagePicture, render_page
+from torchcover.simulation import PaperReference, Rig, Scenario, Simulator, set_ego
 
 
 def evaluate_encounters(
@@ -50,21 +35,24 @@ def evaluate_encounters(
     seed: int = 0,
     progress: bool = False,
 ) -> EncounterResults:
-    """When rigs detect whom their vehicle is about to collide with, and whether that is in time.
+    """Evaluate when rigs detect a road user on a collision course, and whether that is in time to brake.
 
     Args:
-        rigs: A rig or several: each one itself, its built-in name, or its YAML file.
-        encounters: A set, the name of a built-in one, or a YAML file.
-        criterion: What is detected, and what is in time.
-        vehicle: What carries the rigs, as for `evaluate`; else each is on its own vehicle.
-        sensor_model: What sensors make of their hits; as for `evaluate`.
-        num_start_offsets: At how many places of their period the looks begin, in turn.
-        seed: Of noise and drop-out.
-        progress: Whether to show a bar.
+        rigs: One or several rigs, as objects, built-in names or YAML files.
+        encounters: A set of encounters, a built-in name or a YAML file.
+        criterion: Criterion of detection and braking.
+        vehicle: Vehicle that carries the rigs, as in `evaluate`; by default each rig is on its own vehicle.
+        sensor_model: Sensor model, as in `evaluate`.
+        num_start_offsets: Number of start times of the scans, evenly spaced over one scan period.
+        seed: Seed of noise and drop-out.
+        progress: Whether to show a progress bar.
+
+    Returns:
+        Times to collision at detection.
 
     Raises:
-        FileNotFoundError: An unknown name or file.
-        ValueError: A file that cannot be used, a number out of its bounds, an encounter that is none.
+        FileNotFoundError: Unknown file or built-in name.
+        ValueError: Invalid file, number out of its bounds, or an encounter without a collision.
 
     Example:
         >>> adult = {"body": "adult", "speed_kmh": 5, "approach_distance_m": 2}
@@ -74,32 +62,51 @@ def evaluate_encounters(
         >>> [(row.encounter, row.in_time_share) for row in result.rows]
         [('a', 1.0)]
     """
-    for name, value, least in (("phases", num_start_offsets, 1), ("seed", seed, 0)):
-        if value < least:
-            raise ValueError(f"{name}: a number >= {least} is needed; got {value}")
+    if num_start_offsets < 1:
+        raise ValueError(f"num_start_offsets: a number >= 1 is needed; got {num_start_offsets}")
+    if seed < 0:
+        raise ValueError(f"seed: a number >= 0 is needed; got {seed}")
     criterion = Criterion() if criterion is None else criterion
-    sensing = _sensing(rigs, sensor_model)
-    these = encounters if isinstance(encounters, EncounterSet) else EncounterSet.load(encounters)
-    mounted = [MountedRig(rig, set_ego(build_flat_ground(), {name: rig}, vehicle)) for name, rig in sensing.items()]
-    # Their mistakes are told before the first look.
-    staged = [(rig, StagedEncounter(one, rig.ego_solid)) for rig in mounted for one in these.encounters]
-    sightings = []
+    loaded_rigs = load_rigs(rigs, sensor_model)
+    encounter_set = encounters if isinstance(encounters, EncounterSet) else EncounterSet.load(encounters)
+    staged = []
+    for name, rig in loaded_rigs.items():
+        mounted = MountedRig(rig, set_ego(build_flat_ground(), {name: rig}, vehicle))
+        # All encounters are staged before the first scan, so that mistakes are reported at once.
+        staged += [(mounted, StagedEncounter(encounter, mounted.ego_solid)) for encounter in encounter_set.encounters]
+    detections = []
     with Progress(len(staged), "encounters", is_shown=progress) as bar:
-        for rig, one in staged:
-            sightings.append(detect_encounter(rig, one, criterion, num_start_offsets=num_start_offsets, seed=seed))
+        for mounted, encounter in staged:
+            detections.append(
+                detect_encounter(mounted, encounter, criterion, num_start_offsets=num_start_offsets, seed=seed)
+            )
             bar.advance(len(staged))
-    return EncounterResults(these.name, criterion, num_start_offsets, seed, _sensors(sensing), sightings)
+    sensor_names = _get_sensor_names(loaded_rigs)
+    return EncounterResults(encounter_set.name, criterion, num_start_offsets, seed, sensor_names, detections)
 
 
-def _sensing(rigs: AnyRig | Sequence[AnyRig], sensor_model: Literal["ideal", "real"] | None) -> dict[str, Rig]:
-    called = [load_named_rig(rig) for rig in ([rigs] if isinstance(rigs, str | Path | Rig) else rigs)]
-    sensing = {rig.name: rig.apply_sensor_model(sensor_model) for rig in called}
-    if not called or len(sensing) < len(called):
-        raise ValueError(f"rigs with different names are needed; got {', '.join(rig.name for rig in called) or 'none'}")
-    return sensing
+def load_rigs(rigs: AnyRig | Sequence[AnyRig], sensor_model: Literal["ideal", "real"] | None) -> dict[str, Rig]:
+    """Load rigs and set their sensor model.
+
+    Args:
+        rigs: One or several rigs, as objects, built-in names or YAML files.
+        sensor_model: Sensor model; None for the default of each rig.
+
+    Returns:
+        Name -> rig.
+
+    Raises:
+        FileNotFoundError: Unknown file or built-in name.
+        ValueError: Invalid file, no rig, or two rigs with the same name.
+    """
+    loaded = [load_named_rig(rig) for rig in ([rigs] if isinstance(rigs, str | Path | Rig) else rigs)]
+    rig_by_name = {rig.name: rig.apply_sensor_model(sensor_model) for rig in loaded}
+    if not loaded or len(rig_by_name) < len(loaded):
+        raise ValueError(f"rigs with different names are needed; got {', '.join(rig.name for rig in loaded) or 'none'}")
+    return rig_by_name
 
 
-def _sensors(rigs: Mapping[str, Rig]) -> dict[str, tuple[str, ...]]:
+def _get_sensor_names(rigs: Mapping[str, Rig]) -> dict[str, tuple[str, ...]]:
     return {name: tuple(sensor.name for sensor in rig.sensors) for name, rig in rigs.items()}
 
 
@@ -114,130 +121,82 @@ def evaluate_traffic_encounters(
     seed: int = 0,
     progress: bool = False,
 ) -> EncounterResults:
-    """When rigs detected those whom they met in the traffic of worlds: `Criterion.within_s` before a collision.
+    """Evaluate when rigs detect the road users whom they meet in simulated traffic.
+
+    A road user is met if the time to collision falls to `Criterion.max_ttc_s`.
 
     Args:
-        rigs: As for `encounter`, like all that is not named here.
-        scenario: Its worlds: a scenario, a built-in name or a YAML file.
-        criterion: Who is met, what is detected, and what is in time.
-        num_scenes: How many of them are driven through; 1 if it is always the same.
-        vehicle: What carries the rigs.
-        sensor_model: What sensors make of their hits.
-        seed: Of the traffic, of noise and drop-out.
-        progress: Whether to show a bar.
+        rigs: One or several rigs, as objects, built-in names or YAML files.
+        scenario: Scenario of the traffic, a built-in name or a YAML file.
+        criterion: Criterion of encounters, detection and braking.
+        num_scenes: Number of scenes of the scenario; 1 is used if all of its scenes are equal.
+        vehicle: Vehicle that carries the rigs, as in `evaluate`.
+        sensor_model: Sensor model, as in `evaluate`.
+        seed: Seed of the traffic, noise and drop-out.
+        progress: Whether to show a progress bar.
+
+    Returns:
+        Times to collision at detection.
 
     Raises:
-        FileNotFoundError: An unknown name or file.
-        ValueError: What cannot be used, a number out of its bounds, a scenario in which nothing ever moves.
+        FileNotFoundError: Unknown file or built-in name.
+        ValueError: Invalid file, number out of its bounds, or a scenario in which nothing moves.
     """
     if num_scenes < 1:
-        raise ValueError(f"worlds: a number >= 1 is needed; got {num_scenes}")
-    criterion, sensing = Criterion() if criterion is None else criterion, _sensing(rigs, sensor_model)
-    world = set_ego(scenario if isinstance(scenario, Scenario) else Scenario.load(scenario), sensing, vehicle)
-    if world.num_distinct_time_steps == 1:
-        raise ValueError(f"scenario {world.name!r}: nothing ever moves in it, so nobody is met")
-    num_scenes = 1 if world.is_repeating else num_scenes
-    nobody = Simulator(world, {}, PaperReference(rows=2, columns=2), seed=seed)
-    alone = {name: nobody.replace_rigs({name: rig}) for name, rig in sensing.items()}
-    sightings, hours = [], {}
-    with Progress(num_scenes, "worlds", is_shown=progress) as bar:
-        for number in range(num_scenes):
-            first = number * world.num_time_steps
-            drive = Drive.from_scene(f"{world.name} {number}", nobody.get_scene_geometry(first)[0].scene)
-            hours[drive.name] = world.num_time_steps * world.effective_time_step_s / 3600
-            met = find_approaches(drive, criterion)
-            for name, simulator in alone.items():
-                eyes = DriveSensors.from_simulator(simulator, first, criterion)
-                sightings += [detect_approach(name, drive, one, eyes, criterion) for one in met]
+        raise ValueError(f"num_scenes: a number >= 1 is needed; got {num_scenes}")
+    criterion = Criterion() if criterion is None else criterion
+    loaded_rigs = load_rigs(rigs, sensor_model)
+    scenario = set_ego(scenario if isinstance(scenario, Scenario) else Scenario.load(scenario), loaded_rigs, vehicle)
+    if scenario.num_distinct_time_steps == 1:
+        raise ValueError(f"scenario {scenario.name!r}: nothing moves in it, so there are no encounters")
+    num_scenes = 1 if scenario.is_repeating else num_scenes
+    scene_simulator = Simulator(scenario, {}, PaperReference(rows=2, columns=2), seed=seed)
+    simulators = {name: scene_simulator.replace_rigs({name: rig}) for name, rig in loaded_rigs.items()}
+    detections = []
+    durations_h = {}
+    with Progress(num_scenes, "scenes", is_shown=progress) as bar:
+        for scene_index in range(num_scenes):
+            first_frame = scene_index * scenario.num_time_steps
+            scene = scene_simulator.get_scene_geometry(first_frame)[0].scene
+            drive = Drive.from_scene(f"{scenario.name} {scene_index}", scene)
+            durations_h[drive.name] = scenario.num_time_steps * scenario.effective_time_step_s / 3600
+            approaches = find_approaches(drive, criterion)
+            for name, simulator in simulators.items():
+                drive_sensors = DriveSensors.from_simulator(simulator, first_frame, criterion)
+                for approach in approaches:
+                    detections.append(detect_approach(name, drive, approach, drive_sensors, criterion))
             bar.advance(num_scenes)
-    return EncounterResults(world.name, criterion, 1, seed, _sensors(sensing), sightings, hours)
+    sensor_names = _get_sensor_names(loaded_rigs)
+    return EncounterResults(scenario.name, criterion, 1, seed, sensor_names, detections, durations_h)
 
 
 def evaluate_recorded_encounters(
     recording: Recording | str | Path, criterion: Criterion | None = None
 ) -> EncounterResults:
-    """When the rigs of a recording first had enough points on those whom it met; as `evaluate_traffic_encounters`.
+    """Evaluate when the rigs of a recording detected the road users whom they met.
 
     Args:
-        recording: One with poses, times and labelled objects, or its path.
-        criterion: Who is met, what is detected, and what is in time.
+        recording: Recording with poses, times and labeled objects, or its path.
+        criterion: Criterion of encounters, detection and braking.
+
+    Returns:
+        Times to collision at detection.
 
     Raises:
-        FileNotFoundError: There is no such recording, or a part of it is missing.
-        ValueError: It lacks one of these, or does not say how large its vehicle is.
+        FileNotFoundError: The recording or a part of it does not exist.
+        ValueError: The recording lacks poses, times, labels of road users, or the size of its vehicle.
     """
     criterion = Criterion() if criterion is None else criterion
     opened = open_recording(recording) if isinstance(recording, str | Path) else recording
-    drive, sightings = Drive.from_recording(opened), []
+    drive = Drive.from_recording(opened)
+    detections = []
     for name, sensors in opened.rigs.items():
-        eyes = DriveSensors.from_recording(opened, sensors, criterion)
-        sightings += [detect_approach(name, drive, one, eyes, criterion) for one in find_approaches(drive, criterion)]
-    hours = {drive.name: float(np.ptp(drive.times_s)) / 3600}
-    return EncounterResults(
-        drive.name, criterion, 1, 0, {n: tuple(of) for n, of in opened.rigs.items()}, sightings, hours
-    )
-
-
-def plot_encounter_animation(
-    rig: AnyRig,
-    encounter_results: EncounterResults,
-    *,
-    vehicle: str | Path | None = None,
-    sensor_model: Literal["ideal", "real"] | None = None,
-) -> Iterator[Figure]:
-    """The last seconds of that encounter of a set in which a rig is latest, for what is needed: ten pictures a second.
-
-    Args:
-        rig: One of those that were asked about.
-        encounter_results: What they had, of a set.
-        vehicle: What carries the rig, as it was told.
-        sensor_model: As it was told.
-    """
-    ((name, sensing),) = _sensing(rig, sensor_model).items()
-    latest = min(
-        (one for one in encounter_results.detections if one.rig == name),
-        key=lambda one: one.ttc_s.min() - one.braking_time_s,
-    )
-    case, without_s = cast(Encounter, latest.encounter), latest.ttc_without_sensor_s.min(axis=1)
-    mounted = MountedRig(sensing, set_ego(build_flat_ground(), {name: sensing}, vehicle))
-    staged = StagedEncounter(case, mounted.ego_solid)
-    scene, looks = (
-        staged.build_scene(mounted.solids, includes_road_user=True),
-        EncounterPointCounter(mounted, staged, encounter_results.seed),
-    )
-    sensors, names = mounted.get_mounted_sensors(case, scene), encounter_results.sensor_names[name]
-    first, worst = latest.sensor_ttc_s.mean(axis=1).argmax(), without_s.argmin()
-    told = f"{case.description}: detected {latest.ttc_s.min():.2f} s before, needed {latest.braking_time_s:.2f} s"
-    told += f"; first {names[first]}, without {names[worst]} {without_s[worst]:.2f} s" if len(names) > 1 else ""
-    if case.is_speed_swept:
-        kmh = encounter_results.find_max_speeds_kmh()[case.name, name]
-        told += "; in time at none of the speeds" if math.isnan(kmh) else f"; in time up to {kmh:g} km/h"
-    steps = np.arange(
-        max(int((staged.contact_time_s - FILM_S) / FRAME_INTERVAL_S), 0), int(staged.contact_time_s / FRAME_INTERVAL_S), FILM_STEPS
-    )
-    times_s = FRAME_INTERVAL_S * steps.astype(np.float64)
-    vehicle_T_world = invert(staged.compute_world_T_ego(times_s))
-    bodies = [(one.body, vehicle_T_world @ pose) for one, pose in staged.obstacles]
-    bodies.append((case.road_user.body, staged.compute_vehicle_T_road_user(times_s)))
-    outlines_m = np.stack(
-        [transform_outline(get_solid(body).bounding_box.outline_m, there) for body, there in bodies], axis=1
-    )
-    ego_m = mounted.ego_solid.bounding_box.outline_m
-    all_m = np.concatenate([outlines_m.reshape(-1, 2), ego_m])
-    low_m, high_m = all_m.min(axis=0) - FILM_AROUND_M, all_m.max(axis=0) + FILM_AROUND_M
-    for step, now_m in zip(steps.tolist(), outlines_m, strict=True):
-        instant, at = scene.get_snapshot(step), np.array([step])
-        scans = [one.scan(instant, SensorNoise(np.random.default_rng(step), one.sensor.num_rays)) for one in sensors]
-        seen = ", ".join(f"{sensor} {looks.count_points([k], at)[0]}" for k, sensor in enumerate(names))
-        yield plot_scene(
-            *zip(low_m.tolist(), high_m.tolist(), strict=True),
-            static_faces=StaticFaces(np.empty((0, 3, 2)), np.empty(0)),
-            ego_outline_m=ego_m,
-            actors=[ActorMark(get_shape_name(body), there) for (body, _), there in zip(bodies, now_m, strict=True)],
-            sensor_points=np.concatenate([scan.points for scan in scans]),
-            title=f"{staged.contact_time_s - FRAME_INTERVAL_S * step:.2f} s to the collision; points on it: {seen}",
-            subtitle=told,
-        )
+        drive_sensors = DriveSensors.from_recording(opened, sensors, criterion)
+        for approach in find_approaches(drive, criterion):
+            detections.append(detect_approach(name, drive, approach, drive_sensors, criterion))
+    durations_h = {drive.name: float(np.ptp(drive.times_s)) / 3600}
+    sensor_names = {name: tuple(sensors) for name, sensors in opened.rigs.items()}
+    return EncounterResults(drive.name, criterion, 1, 0, sensor_names, detections, durations_h)
 
 
 def save_encounters(
@@ -246,54 +205,71 @@ def save_encounters(
     """Write the files of the command line.
 
     Args:
-        encounter_results: From `encounter`.
-        folder: Where to write `encounters.csv`, `report.html`, `encounters.png` and `summary.json`; as `save_target_map`.
-        file_kinds: What to write beside `summary.json`, as in `Result.save`; "maps" is the picture.
+        encounter_results: Results of encounters.
+        folder: Folder of `encounters.csv`, `report.html`, `encounters.png` and `summary.json`, created if necessary.
+            Files of an earlier run that its `summary.json` lists are deleted.
+        file_kinds: Files besides `summary.json`, as in `Result.save`; "maps" is the plot.
+
+    Returns:
+        Paths of the files.
+
+    Raises:
+        ValueError: A file kind is unknown.
     """
-    wanted = parse_file_kinds(file_kinds)
+    kinds = parse_file_kinds(file_kinds)
     record = {"verdict": list(summarize_encounters(encounter_results)), **encounter_results.to_record()}
-    with AtomicOutput(Path(folder)) as written:
-        with defer_signals():
-            if "numbers" in wanted:
-                written.add("encounters.csv", encounter_results.write_csv)
-            written.publish(record)
-        if "page" in wanted:
-            written.add_text("report.html", render_page(build_encounters_page(encounter_results)))
-        if "maps" in wanted and not encounter_results.scene_durations_h:
-            written.add_figure("encounters.png", encounter_results.plot())
-        written.publish(record)
-    return written.paths
+    with AtomicOutput(Path(folder)) as output:
+        with defer_signals():  # the numbers are complete before a signal ends the process
+            if "numbers" in kinds:
+                output.add("encounters.csv", encounter_results.write_csv)
+            output.publish(record)
+        if "page" in kinds:
+            output.add_text("report.html", render_page(build_encounters_page(encounter_results)))
+        if "maps" in kinds and not encounter_results.scene_durations_h:
+            output.add_figure("encounters.png", encounter_results.plot())
+        output.publish(record)
+    return output.paths
 
 
 def summarize_encounters(encounter_results: EncounterResults) -> tuple[str, ...]:
-    """In how many of the encounters each rig is in time, in a sentence; of traffic, who was met when too late."""
-    rows = [row for row in encounter_results.rows if row.encounter != TOTAL_ROW and row.braking_count]
-    of_rigs = {rig: [row for row in rows if row.rig == rig] for rig in encounter_results.sensor_names}
-    if not rows:
-        return ("Nobody was met for whom the vehicle had to brake.",)
+    """Summarize in how many encounters each rig detects the road user in time.
+
+    Args:
+        encounter_results: Results of encounters.
+
+    Returns:
+        One sentence: for a set the encounters that are always in time, in traffic the late detections.
+    """
+    all_rows = [row for row in encounter_results.rows if row.encounter != TOTAL_ROW and row.braking_count]
+    rows_by_rig = {rig: [row for row in all_rows if row.rig == rig] for rig in encounter_results.sensor_names}
+    if not all_rows:
+        return ("The vehicle had to brake for no road user.",)
+    counts, totals = {}, []
+    for rig, rows in rows_by_rig.items():
+        if encounter_results.scene_durations_h:
+            counts[rig] = round(sum((1 - row.in_time_share) * row.braking_count for row in rows))
+            totals.append(sum(row.braking_count for row in rows))
+        else:
+            counts[rig] = sum(row.in_time_share == 1 for row in rows)
+            totals.append(len(rows))
+    listed = ", ".join(f"{rig} {count}" for rig, count in counts.items())
     if encounter_results.scene_durations_h:
-        late = {
-            rig: round(sum((1 - row.in_time_share) * row.braking_count for row in of)) for rig, of in of_rigs.items()
-        }
-        most = max(sum(row.braking_count for row in of) for of in of_rigs.values())
-        told = "; ".join(f"{rig} {count}" for rig, count in late.items())
-        return (f"Of {most} for whom the vehicle had to brake, detected too late: {told}.",)
-    told = "; ".join(f"{rig} {sum(row.in_time_share == 1 for row in of)}" for rig, of in of_rigs.items())
-    count = max(map(len, of_rigs.values()))
-    return (f"Of {count} encounters of {encounter_results.name}, each speed counted, always in time: {told}.",)
+        return (f"Detected too late: {listed}, of {max(totals)} road users for whom the vehicle had to brake.",)
+    name = encounter_results.name
+    return (f"Always detected in time: {listed}, of {max(totals)} encounters of {name}, counting each speed.",)
 
 
 def build_encounters_page(encounter_results: EncounterResults) -> Page:
-    """All of it on one page."""
+    """Build the page of encounters, with a plot for a set."""
     pictures = []
     if not encounter_results.scene_durations_h:
         png = BytesIO()
         encounter_results.plot().savefig(png, format="png")
-        pictures = [PagePicture("Time to collision at detection against the speed", png.getvalue())]
+        pictures = [PagePicture("Time to collision at detection by speed", png.getvalue())]
     return Page(
-        title=f"In time? {', '.join(encounter_results.sensor_names)}",
-        lead=f"The encounters of {encounter_results.name}, measured by torchcover. In time is geometry: what was seen when, with "
-        "the brakes and the latency that were assumed.",
+        title=f"Detection before a collision: {', '.join(encounter_results.sensor_names)}",
+        lead=f"Encounters of {encounter_results.name}, measured by torchcover. A detection is in time if braking, with "
+        "the assumed latency and deceleration, prevents the collision; the decision is based on geometry alone.",
         findings=summarize_encounters(encounter_results),
         tables=encounter_results.build_tables(),
         pictures=pictures,
