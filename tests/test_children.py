@@ -124,7 +124,7 @@ def test_what_makes_traffic_ends(alive, tmp_path, monkeypatch):
     (tmp_path / "bin").mkdir()
     (tmp_path / "bin" / "sumo").write_text(f"#!/bin/sh\n{script(alive, LIVES_S)}\n")
     (tmp_path / "bin" / "sumo").chmod(0o755)
-    monkeypatch.setattr(simulating, "home", lambda: tmp_path)
+    monkeypatch.setattr(simulating, "find_sumo_home", lambda: tmp_path)
     is_killed(lambda: simulating.run_program("sumo"), alive)
     assert alive.has_ended(within_s=LIVES_S / 3)
 
@@ -141,7 +141,7 @@ def stopped(monkeypatch):
     monkeypatch.setattr("torchcover.files.processes.warnings.warn", warn)
     for place in ("evaluation.pipeline", "files.isolated", "simulation.sumo.simulating"):
         monkeypatch.setattr(
-            f"torchcover.{place}.reporting_stopped", partial(report_stopped_processes, look_every_s=0.1)
+            f"torchcover.{place}.report_stopped_processes", partial(report_stopped_processes, poll_interval_s=0.1)
         )
     return reported
 
@@ -179,7 +179,7 @@ def test_a_stopped_sumo_is_reported(stopped, tmp_path, monkeypatch):
     (tmp_path / "bin").mkdir()
     (tmp_path / "bin" / "sumo").write_text("#!/bin/sh\nkill -STOP $$\necho more\n")
     (tmp_path / "bin" / "sumo").chmod(0o755)
-    monkeypatch.setattr(simulating, "home", lambda: tmp_path)
+    monkeypatch.setattr(simulating, "find_sumo_home", lambda: tmp_path)
     assert list(simulating.stream_output("sumo")) == [b"more\n"]
     assert [message.split(" (process ")[0] for message in stopped] == ["SUMO's sumo"]
 
@@ -189,7 +189,7 @@ def test_a_stopped_reader_is_reported_and_ends_after_its_time(stopped, tmp_path,
     assert apart_readers.stopping(tmp_path / "file.x")["one"] == 1
     assert [message.split(" (process ")[0] for message in stopped] == ["the process that reads files"]
     monkeypatch.setattr("torchcover.files.processes.warnings.warn", lambda *_, **__: None)
-    monkeypatch.setattr(isolated, "MOST_S", 0.5)
+    monkeypatch.setattr(isolated, "BASE_TIMEOUT_S", 0.5)
     with pytest.raises(ValueError, match="the process that reads it was stopped"):
         apart_readers.stopping(tmp_path / "file.x")
 

@@ -54,7 +54,7 @@ def test_a_crash_is_a_bad_file_and_the_next_one_is_read(path):
 
 
 def test_a_library_that_never_ends_is_ended(path, monkeypatch):
-    monkeypatch.setattr(isolated, "MOST_S", 0.3)
+    monkeypatch.setattr(isolated, "BASE_TIMEOUT_S", 0.3)
     with pytest.raises(ValueError, match="it took more than 0 s"):
         apart_readers.hanging(path)
     monkeypatch.undo()

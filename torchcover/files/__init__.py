@@ -1,4 +1,4 @@
-"""Guards of all readers and their error, atomic writes, documents and tables, isolated readers, processes."""
+"""File access: guarded and isolated readers, atomic writes, YAML documents, tables, child processes."""
 
 import lazy_loader
 

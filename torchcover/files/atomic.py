@@ -1,6 +1,7 @@
 """Atomic writes: a file, or a folder of files with a manifest, is old, new, or recognizable as incomplete.
 
-Files are written into a temporary directory, synced, and moved one by one, the manifest last, which says so meanwhile.
+Files are written to a temporary directory, synced, and moved one by one. The manifest is marked as unfinished before
+and replaced last.
 """
 
 import errno
@@ -21,33 +22,51 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 TEMPORARY = ".torchcover_"  # prefix of temporary directories
+SUMMARY = "summary.json"  # manifest of a result
+RECORDING = "recording.json"  # manifest of a recording
+WRITING = "writing"  # key of a manifest while its files are written
+MAX_MANIFEST_BYTES = 70_000_000  # a million files take 60 MB, and 2 GB when parsed; larger files are no manifests
 
 _locked: set[Path] = set()  # folders that this process has locked
 
 
 def reject_links(path: Path) -> None:
-    """Raise a ValueError if a path is or leads through a symbolic link, except links in the root folder."""
-    for place in (path, *path.parents):
-        if place.is_symlink() and len(place.absolute().parts) > 2:
-            raise ValueError(f"{place}: a symbolic link; nothing is written through links: name its target instead")
+    """Reject symbolic links, except links in the root folder.
+
+    Args:
+        path: Path that is written to.
+
+    Raises:
+        ValueError: The path is a symbolic link, or leads through one.
+    """
+    for part in (path, *path.parents):
+        if part.is_symlink() and len(part.absolute().parts) > 2:
+            raise ValueError(f"{part}: a symbolic link; nothing is written through links: name its target instead")
 
 
 @contextmanager
 def lock_folder(folder: Path) -> Iterator[None]:
-    """Make a folder if needed, and keep other processes from writing to it until the block or the process ends.
+    """Lock a folder against writes of other processes until the block or the process ends.
 
-    ValueError: another process has locked it; it, or a file that its manifest lists, is reached through a link.
+    Args:
+        folder: Folder; created if it does not exist, and removed again if it stays empty.
+
+    Raises:
+        ValueError: Another process has locked the folder; or the folder, or a file of its manifest, is a link.
+        PermissionError: The folder is not writable.
     """
     import fcntl
 
     reject_links(folder)
-    for name in {name.partition("/")[0] for name in (read_manifest(folder / SUMMARY) or {"files": ()})["files"]}:
+    manifest = read_manifest(folder / SUMMARY) or {"files": {}}
+    for name in {name.partition("/")[0] for name in manifest["files"]}:
         if (folder / name).is_symlink():
             reject_links(folder / name)
-    if (key := folder.resolve()) in _locked:
+    key = folder.resolve()
+    if key in _locked:
         yield
         return
-    made = [place for place in (folder, *folder.parents) if not place.exists()]
+    created_folders = [path for path in (folder, *folder.parents) if not path.exists()]
     folder.mkdir(parents=True, exist_ok=True)
     if not os.access(folder, os.W_OK):
         raise PermissionError(errno.EACCES, "may not be written to", str(folder))
@@ -60,40 +79,40 @@ def lock_folder(folder: Path) -> Iterator[None]:
     except OSError as error:
         warnings.warn(f"{folder}: start no other run there, for it cannot be locked ({error.strerror})", stacklevel=3)
     try:
-        for left in folder.glob(f"{TEMPORARY}*"):  # by a process that was killed
-            if stat.S_ISDIR(left.lstat().st_mode):  # rmtree would open a FIFO
-                rmtree(left, ignore_errors=True)
+        for leftover in folder.glob(f"{TEMPORARY}*"):  # of a process that was killed
+            if stat.S_ISDIR(leftover.lstat().st_mode):  # rmtree would open a FIFO
+                rmtree(leftover, ignore_errors=True)
         _locked.add(key)
         yield
     finally:
         _locked.discard(key)
         with suppress(OSError):
-            fcntl.flock(lock, fcntl.LOCK_UN)  # forked processes hold it, too
+            fcntl.flock(lock, fcntl.LOCK_UN)  # forked processes hold the lock, too
         os.close(lock)
         with suppress(OSError):
-            for place in made:
-                place.rmdir()
+            for path in created_folders:
+                path.rmdir()
 
 
 def list_written(start_s: float) -> list[Path]:
-    """List what was written since a time (as `time.time`) in the folders that this process has locked."""
+    """List the files that were written in the folders that this process has locked.
+
+    Args:
+        start_s: Earliest time of modification, as `time.time`.
+    """
     visible = [path for folder in sorted(_locked) for path in sorted(folder.glob("[!.]*"))]
     return [path for path in visible if path.lstat().st_mtime >= start_s]
 
 
-SUMMARY = "summary.json"  # of a result
-RECORDING = "recording.json"
-WRITING = "writing"  # key of a manifest while its files are written
-MAX_MANIFEST_BYTES = 70_000_000  # larger files are not manifests; a million files take 60 MB, and 2 GB as empty lists
-MAX_NAME_BYTES = 255  # of a listed path; what file systems allow for a name
-FOLDER_DEPTH = 3  # files are listed at most this deep
-
-
 def read_manifest(path: Path) -> dict[str, Any] | None:
-    """Read a manifest: `files` by name, each with `bytes` and `sha256`, and its record.
+    """Read a manifest.
 
-    Returns None where there is none: no regular file, or another content. Entries of hidden files, and of files outside
-    of the folder, are dropped.
+    Args:
+        path: File.
+
+    Returns:
+        Record with `files` by name, each with `bytes` and `sha256`, without hidden files and files outside of the
+        folder. None if there is no regular file, or it has other content.
     """
     try:
         status = path.lstat()
@@ -116,14 +135,20 @@ def _parse_manifest(path: Path, *_: int) -> dict[str, Any] | None:
 
 
 def _is_entry(name: str, entry: object) -> bool:
-    is_short = len(os.fsencode(name)) <= MAX_NAME_BYTES
-    is_within = is_short and "\0" not in name and all(part[:1] not in ("", ".") for part in name.split("/"))
-    is_whole = isinstance(entry, dict) and isinstance(entry.get("bytes"), int) and isinstance(entry.get("sha256"), str)
-    return is_within and is_whole
+    is_short = len(os.fsencode(name)) <= 255  # limit of file systems for a name
+    is_in_folder = is_short and "\0" not in name and all(part[:1] not in ("", ".") for part in name.split("/"))
+    if not is_in_folder or not isinstance(entry, dict):
+        return False
+    return isinstance(entry.get("bytes"), int) and isinstance(entry.get("sha256"), str)
 
 
 def is_unchanged(path: Path, entry: Mapping[str, Any]) -> bool:
-    """Return whether a path is a regular file with the listed size and SHA-256."""
+    """Return whether a path is a regular file with the size and SHA-256 of a manifest.
+
+    Args:
+        path: File.
+        entry: `bytes` and `sha256` of the file.
+    """
     try:
         status = path.lstat()
         if not stat.S_ISREG(status.st_mode) or status.st_size != entry["bytes"]:
@@ -135,18 +160,36 @@ def is_unchanged(path: Path, entry: Mapping[str, Any]) -> bool:
 
 
 def find_changed(folder: Path, files: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Find the listed files that are missing, no regular files, or of another size."""
-    sizes = {name: os.path.getsize(folder / name) if os.path.isfile(folder / name) else None for name in files}
-    return [name for name, size_bytes in sizes.items() if size_bytes != files[name]["bytes"]]
+    """Find files of a manifest that are missing, no regular files, or of another size.
+
+    Args:
+        folder: Folder of the files.
+        files: Entries of the manifest by name.
+
+    Returns:
+        Names of these files.
+    """
+    changed = []
+    for name, entry in files.items():
+        if not os.path.isfile(folder / name) or os.path.getsize(folder / name) != entry["bytes"]:
+            changed.append(name)
+    return changed
 
 
 def check_manifest_entry(path: Path) -> None:
-    """Refuse a file of a result whose manifest lists another content, or that was not written to its end.
+    """Check that a file of a result is complete and has the content in the manifest of the result.
 
-    A YAML document may have been edited on purpose, which is a warning.
+    Args:
+        path: File; files without a manifest pass.
+
+    Raises:
+        ValueError: The result is incomplete, or the content differs.
+
+    Warns:
+        UserWarning: The content of a YAML document differs, which may be an intended edit.
     """
     path = path.absolute()
-    for folder in path.parents[:FOLDER_DEPTH]:
+    for folder in path.parents[:3]:  # manifests list files at most this deep
         manifest = read_manifest(folder / SUMMARY)
         name = path.relative_to(folder).as_posix()
         entry = manifest["files"].get(name) if manifest else None
@@ -161,13 +204,16 @@ def check_manifest_entry(path: Path) -> None:
         warnings.warn(f"{path}: edited since {SUMMARY} beside it was written", stacklevel=4)
 
 
-PNG_LEVEL = 3  # zlib level of figures: the default 6 takes as long as plotting, for 20 % smaller files
-
-
 def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
-    """Write a temporary file, sync it, and replace `path` by it; `write` gets the temporary path.
+    """Write a file atomically: write a temporary file, sync it, and replace `path` by it.
 
-    OSError: the file cannot be written, and is unchanged. ValueError: the path leads through a symbolic link.
+    Args:
+        path: File; its folder is created if needed.
+        write: Function that writes to the temporary path.
+
+    Raises:
+        OSError: The file cannot be written, and is unchanged.
+        ValueError: The path leads through a symbolic link.
 
     Example:
         >>> with TemporaryDirectory() as folder:
@@ -183,15 +229,15 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
 
 
 class AtomicOutput:
-    """Files that replace those which the manifest of a folder lists; a context manager that locks the folder.
+    """Files that replace those in the manifest of a folder; a context manager that locks the folder.
 
     Args:
-        folder: Where to write; made if it does not exist. Files that no manifest lists stay.
-        manifest: Name of the manifest, which lists size and SHA-256 of each other file.
-        files: Entries of an unfinished manifest to go on from.
+        folder: Output folder; created if it does not exist. Files outside of the manifest are not changed.
+        manifest: Name of the manifest, which lists size and SHA-256 of all other files.
+        files: Entries of an unfinished manifest that is continued.
 
     Attributes:
-        paths: The published files, the manifest last.
+        paths: Published files, the manifest last.
 
     Example:
         >>> with TemporaryDirectory() as folder, AtomicOutput(Path(folder, "out")) as files:
@@ -217,25 +263,47 @@ class AtomicOutput:
         self._until_exit.close()
 
     def add(self, name: str, write: Callable[[Path], object]) -> None:
-        """Write a temporary file that is published as `name`, a path in the folder; `write` gets its path."""
+        """Write a temporary file for the next `publish`.
+
+        Args:
+            name: Path relative to the folder.
+            write: Function that writes to the temporary path.
+        """
         with _name_errors(self.folder / name):
             self._files[name] = _write_synced(self._temporary / name, write)
         self._pending[name] = None
 
     def add_text(self, name: str, text: str) -> None:
-        """Write a text; see `add`."""
-        self.add(name, lambda path: path.write_text(text, encoding="utf-8"))
+        """Add a text file.
+
+        Args:
+            name: As in `add`.
+            text: Content.
+        """
+        self.add(name, partial(Path.write_text, data=text, encoding="utf-8"))
 
     def add_figure(self, name: str, figure: "Figure") -> None:
-        """Write a figure; see `add`."""
-        self.add(name, lambda path: figure.savefig(path, dpi=figure.dpi, pil_kwargs={"compress_level": PNG_LEVEL}))
+        """Add a PNG file.
+
+        Args:
+            name: As in `add`.
+            figure: Figure, saved at its own resolution.
+        """
+        # The default level 6 of zlib takes as long as plotting, for 20 % smaller files.
+        self.add(name, partial(figure.savefig, dpi=figure.dpi, pil_kwargs={"compress_level": 3}))
 
     def publish(self, record: Mapping[str, Any]) -> None:
-        """Move the files to their names, then the manifest with the record; more may be added and published."""
-        manifest, earlier = self.folder / self._manifest, read_manifest(self.folder / self._manifest)
+        """Move the added files to their names, then the manifest; further files may be added and published later.
+
+        Args:
+            record: Content of the manifest in addition to `files`.
+        """
+        manifest = self.folder / self._manifest
+        earlier = read_manifest(manifest)
         listed = earlier["files"] if earlier else {}
         outdated = [name for name in listed.keys() - self._files if is_unchanged(self.folder / name, listed[name])]
-        for path in (self.folder / name for name in (*self._pending, *outdated, self._manifest)):
+        for name in (*self._pending, *outdated, self._manifest):
+            path = self.folder / name
             reject_links(path)
             path.parent.mkdir(parents=True, exist_ok=True)
             if path.is_dir():
@@ -259,11 +327,11 @@ def _write_json(content: Mapping[str, Any], path: Path) -> None:
 
 
 def _replace(moves: Sequence[tuple[Path, Path]]) -> None:
-    """Move files to their names, and sync the folders of these."""
+    """Move files, and sync the folders of the targets."""
     for source, target in moves:
         os.replace(source, target)
     for folder in {target.parent for _, target in moves}:
-        with suppress(OSError):  # not every system can sync a folder
+        with suppress(OSError):  # some systems cannot sync a folder
             descriptor = os.open(folder, os.O_RDONLY)
             try:
                 os.fsync(descriptor)
@@ -272,7 +340,7 @@ def _replace(moves: Sequence[tuple[Path, Path]]) -> None:
 
 
 def _write_synced(path: Path, write: Callable[[Path], object]) -> dict[str, Any]:
-    """Write a file and wait until it is on the disk; returns its entry in a manifest."""
+    """Write and sync a file, and return its entry in a manifest."""
     path.parent.mkdir(parents=True, exist_ok=True)
     write(path)
     with path.open("r+b") as file:
@@ -282,7 +350,7 @@ def _write_synced(path: Path, write: Callable[[Path], object]) -> dict[str, Any]
 
 @contextmanager
 def _name_errors(path: Path) -> Iterator[None]:
-    """Let errors name the file instead of the temporary one, or none at all."""
+    """Replace the temporary path, or a missing path, in messages of OSError."""
     try:
         yield
     except OSError as error:

@@ -1,4 +1,4 @@
-"""The door of the readers: what is refused unread, the memory a file may take, and the one error that leaves it."""
+"""Guards of readers: checks before a file is opened, memory limits, and a single error type."""
 
 import os
 import stat
@@ -21,16 +21,15 @@ common_link_roots: list[Path] = []  # folders that links in any recording may le
 _link_roots: dict[Path, list[Path]] = {}  # folders that links in each recording may lead to
 
 MAX_REASON_CHARS = 500  # libraries may quote the whole file
-VARIABLE = "TORCHCOVER_MAX_FILE_GB"
-# A scan takes megabytes; a saved result with eight thresholds in the command line's grid, which is much, twice a
-# thousand of them.
+VARIABLE = "TORCHCOVER_MAX_FILE_GB"  # environment variable for the memory limit of a file
+# A scan takes megabytes; a large saved result, with eight thresholds in the default grid, 2 GB.
 DEFAULT_GB = 2.0
-LIBRARIES_GB = 1.0
-MAX_SHORT_BYTES = 1_000_000  # a calibration has kilobytes; what is parsed slowly must not be long
+LIBRARIES_GB = 1.0  # memory of the libraries of an isolated reader
+MAX_SHORT_BYTES = 1_000_000  # calibrations have kilobytes; parsers of text are slow
 
 
 class BadFileError(ValueError):
-    """A file is not what it is meant to be; the message names it, what arrived and what is needed.
+    """Error of a file with other content than expected; the message has the path, the finding and the expectation.
 
     Example:
         >>> isinstance(BadFileError("scan.pcd: an empty file (0 bytes)"), ValueError)
@@ -39,22 +38,22 @@ class BadFileError(ValueError):
 
 
 def guard_reader(content: str) -> Callable[[Reader[Arguments, Content]], GuardedReader[Arguments, Content]]:
-    """Make a function the door through which one kind of file is read.
+    """Create a decorator that guards a reader of one kind of file.
 
-    The function gets the path of a regular file that is not empty. It says what is wrong as a ValueError that does not
-    name the file, and may let through whatever its libraries raise.
+    The reader gets the path of a regular file that is not empty. It raises a ValueError without the path for unsuitable
+    content, and may raise any error of its libraries.
 
     Args:
-        content: What the file is meant to be, for messages: "a depth image".
+        content: Expected content, for messages: "a depth image".
 
     Returns:
-        A decorator. The function then raises
+        Decorator. The guarded reader raises
 
-            FileNotFoundError: There is no such file.
-            IsADirectoryError: A folder.
-            ImportError: A package that the reader needs is missing.
-            BadFileError: Anything else: a device or a FIFO (which would never end), an empty file, a file that may not
-                be opened, one that needs more memory than `check_memory` allows, damaged content, a link out of a
+            FileNotFoundError: The file does not exist.
+            IsADirectoryError: The path is a folder.
+            ImportError: A package that the reader needs is not installed.
+            BadFileError: In all other cases: a device or a FIFO (which may never end), an empty file, missing
+                permissions, a file that needs more memory than `check_memory` allows, damaged content, a link out of a
                 recording (see `allow_links`), a file of an incomplete result.
 
     Example:
@@ -69,24 +68,26 @@ def guard_reader(content: str) -> Callable[[Reader[Arguments, Content]], Guarded
 
     def decorate(read: Reader[Arguments, Content]) -> GuardedReader[Arguments, Content]:
         @wraps(read)
-        def door(path: str | os.PathLike[str], *args: Arguments.args, **kwargs: Arguments.kwargs) -> Content:
+        def read_guarded(path: str | os.PathLike[str], *args: Arguments.args, **kwargs: Arguments.kwargs) -> Content:
             path = Path(path)
-            # Numbers of damaged files overflow; what they become is infinite or NaN, and judged as such.
+            # Numbers of damaged files may overflow to infinity or NaN, which the readers check.
             with report_bad_file(path, content), np.errstate(all="ignore"):
                 check_regular(path, content)
                 check_manifest_entry(path)
                 return read(path, *args, **kwargs)
 
-        return door  # type: ignore[return-value]  # which would have the path without a name
+        return read_guarded  # type: ignore[return-value]  # the type has the path as a positional parameter
 
     return decorate
 
 
 @contextmanager
 def report_bad_file(path: Path, content: str) -> Iterator[None]:
-    """Turn whatever goes wrong into a `BadFileError` that names the file; a missing one, a folder and a package aside.
+    """Convert errors to a `BadFileError` with the path, except those of missing files, folders and packages.
 
-    `path`: the file, or the folder of several; `content`: what it is meant to be.
+    Args:
+        path: File, or folder of several files.
+        content: Expected content, for messages.
     """
     try:
         yield
@@ -105,12 +106,21 @@ def report_bad_file(path: Path, content: str) -> Iterator[None]:
 
 
 def allow_links(recording: Path, roots: Iterable[Path] = ()) -> None:
-    """Refuse files of a recording from now on whose links lead out of it and of the roots."""
-    _link_roots[recording.absolute()] = [place.resolve() for place in (recording, *common_link_roots, *roots)]
+    """Restrict links in a recording: files whose links lead out of it and of the roots are rejected from now on.
+
+    Args:
+        recording: Folder of the recording.
+        roots: Further folders that links may lead to.
+    """
+    _link_roots[recording.absolute()] = [root.resolve() for root in (recording, *common_link_roots, *roots)]
 
 
 def find_link_roots(recording: Path) -> list[Path]:
-    """Return the roots that `allow_links` was given for a recording."""
+    """Return the folders that links in a recording may lead to.
+
+    Args:
+        recording: Folder as in `allow_links`; empty list for other folders.
+    """
     return _link_roots.get(recording.absolute(), [])
 
 
@@ -124,11 +134,21 @@ def _check_links(path: Path) -> None:
 
 
 def check_regular(path: Path, content: str) -> None:
-    """Refuse what is no file, an empty one, or a link that leads out of a recording."""
+    """Check that a path is a regular file with content, and no link out of a recording.
+
+    Args:
+        path: Path.
+        content: Expected content, for messages.
+
+    Raises:
+        FileNotFoundError: The file does not exist.
+        IsADirectoryError: The path is a folder.
+        ValueError: The path is a device, a pipe or a forbidden link, or the file is empty.
+    """
     _check_links(path)
-    status = path.stat() if path.exists() else None
-    if status is None:
+    if not path.exists():
         raise FileNotFoundError(f"{path}: no such file; {content} is needed")
+    status = path.stat()
     if stat.S_ISDIR(status.st_mode):
         raise IsADirectoryError(f"{path}: a folder; {content} is one file")
     if not stat.S_ISREG(status.st_mode):
@@ -138,46 +158,62 @@ def check_regular(path: Path, content: str) -> None:
 
 
 class TooLargeError(ValueError):
-    """Reading a file takes more memory than one may take."""
+    """Error of a file that needs more memory than the limit."""
 
 
 def check_memory(needed_bytes: int) -> None:
-    """Refuse to read a file that needs more memory than one may take, before any of it is reserved.
+    """Check that reading a file fits into the memory limit, before memory is allocated.
 
-    `needed_bytes`: what reading it takes at its largest, the file's own bytes included where they are held.
-    TooLargeError: more than 2 GB, or than the environment variable TORCHCOVER_MAX_FILE_GB says.
+    Args:
+        needed_bytes: Peak memory of reading, including the bytes of the file if they are held.
+
+    Raises:
+        TooLargeError: More than 2 GB, or than the environment variable TORCHCOVER_MAX_FILE_GB allows.
 
     Example:
-        >>> check_memory(16 * 100_000)  # a scan
+        >>> check_memory(16 * 100_000)  # bytes of a scan
     """
-    allowed_gb = read_limit_gb(VARIABLE, DEFAULT_GB)
-    if needed_bytes > allowed_gb * 1e9:
+    limit_gb = read_limit_gb(VARIABLE, DEFAULT_GB)
+    if needed_bytes > limit_gb * 1e9:
         needed_gb = f"{needed_bytes / 1e9:.3g}" if needed_bytes < 10**300 else "endless"
         raise TooLargeError(
-            f"reading it takes {needed_gb} GB of memory, more than the {allowed_gb:g} GB that one file may take; "
+            f"reading it takes {needed_gb} GB of memory, more than the {limit_gb:g} GB that one file may take; "
             f"use a smaller one, or set the environment variable {VARIABLE}"
         )
 
 
 def find_memory_limit_gb() -> float:
-    """What a process of its own may take that reads a file: beside what a file may take, its libraries."""
+    """Return the memory limit of an isolated reader in gigabytes: that of a file, plus that of its libraries."""
     return read_limit_gb(VARIABLE, DEFAULT_GB) + LIBRARIES_GB
 
 
 def read_limit_gb(variable: str, default_gb: float) -> float:
-    """Gigabytes that an environment variable says, or what is usual without it.
+    """Read a limit in gigabytes from an environment variable.
 
-    ValueError: it is no number of at least 0.
+    Args:
+        variable: Name of the environment variable.
+        default_gb: Limit without the variable.
+
+    Raises:
+        ValueError: The value is not a number of at least 0.
     """
-    given = os.environ.get(variable, default_gb)
+    value = os.environ.get(variable, default_gb)
     with suppress(ValueError):
-        if (limit_gb := float(given)) >= 0:
+        limit_gb = float(value)
+        if limit_gb >= 0:
             return limit_gb
-    raise ValueError(f"the environment variable {variable} has to be a number of gigabytes; got {given!r}")
+    raise ValueError(f"the environment variable {variable} has to be a number of gigabytes; got {value!r}")
 
 
 def decode_utf8(data: bytes) -> str:
-    """Decode UTF-8, with or without a byte order mark. ValueError: not UTF-8."""
+    """Decode UTF-8, with or without a byte order mark.
+
+    Args:
+        data: Bytes of a file.
+
+    Raises:
+        ValueError: The bytes are not UTF-8.
+    """
     try:
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -185,7 +221,14 @@ def decode_utf8(data: bytes) -> str:
 
 
 def read_short_text(path: Path) -> str:
-    """Text of a file that people write, or could have written. ValueError: more than a megabyte, or not UTF-8."""
+    """Read a text file of at most a megabyte, such as a calibration.
+
+    Args:
+        path: File.
+
+    Raises:
+        ValueError: The file is larger, or not UTF-8.
+    """
     size_bytes = path.stat().st_size
     if size_bytes > MAX_SHORT_BYTES:
         raise ValueError(f"{size_bytes} bytes; at most {MAX_SHORT_BYTES} are read of such a file")

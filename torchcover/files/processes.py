@@ -1,4 +1,4 @@
-"""Processes that do not outlive the one that has started them, and that are reported while they are stopped."""
+"""Child processes: end with their parent, resource limits, and reports of stopped processes."""
 
 import ctypes
 import math
@@ -19,30 +19,36 @@ if sys.platform == "linux":
 else:
     resource = None
 
-# Of Linux: the signal that a process gets when the thread that has started it ends, or its whole process does.
-PR_SET_PDEATHSIG = 1
-MOST_FILES = 1024  # libraries are files, too, and a bag may be split into hundreds
 _prctl = ctypes.CDLL(None).prctl if sys.platform == "linux" else None
 
 
 def end_with_parent(
     memory_gb: float = math.inf, cpu_s: float = math.inf, *, can_write: bool = True
 ) -> Callable[..., None] | None:
-    """What a process that this one starts has to call first, to be killed when this one ends, however that ends.
+    """Build a function that child processes call first, so that the kernel kills them when this process ends.
 
-    `memory_gb`: what it may take in all; `can_write`: whether it may write files. Returns for the `preexec_fn` of
-    `subprocess` and the `worker_init_fn` of a `DataLoader`; None where the system, any but Linux, cannot do so.
+    Args:
+        memory_gb: Limit of the address space in gigabytes.
+        cpu_s: Limit of CPU time in seconds.
+        can_write: Allow writing files.
+
+    Returns:
+        Function for the `preexec_fn` of `subprocess` or the `worker_init_fn` of a `DataLoader`; None on other systems
+        than Linux.
 
     Example:
         >>> import subprocess
         >>> subprocess.run([sys.executable, "-c", ""], preexec_fn=end_with_parent()).returncode
         0
     """
-    return partial(_end_with, os.getpid(), memory_gb, cpu_s, can_write) if _prctl else None
+    return partial(_set_up_child, os.getpid(), memory_gb, cpu_s, can_write) if _prctl else None
 
 
 def is_stopped(pid: int) -> bool:
-    """Whether a process is stopped by a signal, as by SIGSTOP; False where the system, any but Linux, does not tell.
+    """Return whether a signal such as SIGSTOP has stopped a process; always False on other systems than Linux.
+
+    Args:
+        pid: Process id.
 
     Example:
         >>> is_stopped(os.getpid())
@@ -50,20 +56,20 @@ def is_stopped(pid: int) -> bool:
     """
     try:
         state = Path(f"/proc/{pid}/stat").read_text(encoding="utf-8", errors="replace")
-    except OSError:  # it has ended
+    except OSError:  # the process has ended
         return False
     return state.rpartition(")")[2].split()[0] == "T"
 
 
 @contextmanager
 def report_stopped_processes(pids: Collection[int], role: str, poll_interval_s: float = 5.0) -> Iterator[None]:
-    """Warn about processes that this one waits for, and that someone has stopped: nothing else would end the silence.
+    """Warn about stopped processes inside the block, since the program would wait for them silently.
 
     Args:
-        pids: Process numbers.
-        role: What they are, for the warning: "a worker".
-        poll_interval_s: Seconds between two looks; a process that is stopped at two of them in a row is reported, so that
-            Ctrl-Z and `fg`, which stop and continue all processes of a command, are not.
+        pids: Process ids.
+        role: Role of the processes for the warning: "a worker".
+        poll_interval_s: Seconds between two polls. A process that is stopped at two successive polls is reported, so
+            that Ctrl-Z and `fg`, which stop and continue all processes of a command, cause no warning.
     """
     if not pids:
         yield
@@ -71,11 +77,11 @@ def report_stopped_processes(pids: Collection[int], role: str, poll_interval_s: 
     ended = Event()
 
     def watch() -> None:
-        looks = dict.fromkeys(pids, 0)
+        stopped_polls = dict.fromkeys(pids, 0)
         while not ended.wait(poll_interval_s):
             for pid in pids:
-                looks[pid] = looks[pid] + 1 if is_stopped(pid) else 0
-                if looks[pid] == 2:
+                stopped_polls[pid] = stopped_polls[pid] + 1 if is_stopped(pid) else 0
+                if stopped_polls[pid] == 2:
                     warnings.warn(
                         f"{role} (process {pid}) is stopped, and the run waits for it: continue it with "
                         f"`kill -CONT {pid}`, or end the run with Ctrl-C",
@@ -93,41 +99,49 @@ def report_stopped_processes(pids: Collection[int], role: str, poll_interval_s: 
 
 
 def limit_resources(memory_gb: float) -> None:
-    """Limit what this process may take from now on: memory beyond what it has, files that are open; and write none."""
+    """Limit the memory and the open files of this process, and prevent it from writing files.
+
+    Args:
+        memory_gb: Additional address space in gigabytes.
+    """
     if resource is not None:
-        now_bytes = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-        _lower(resource.RLIMIT_AS, now_bytes + int(memory_gb * 1e9))
-        _lower(resource.RLIMIT_NOFILE, MOST_FILES)
-        _lower(resource.RLIMIT_CORE, 0)
-        _lower(resource.RLIMIT_FSIZE, 0)
+        used_bytes = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+        _lower_limit(resource.RLIMIT_AS, used_bytes + int(memory_gb * 1e9))
+        _lower_limit(
+            resource.RLIMIT_NOFILE, 1024
+        )  # libraries are open files, too, and a bag may have hundreds of parts
+        _lower_limit(resource.RLIMIT_CORE, 0)
+        _lower_limit(resource.RLIMIT_FSIZE, 0)
 
 
 def get_used_bytes() -> int:
-    """Return the resident memory of this process; 0 where the system, any but Linux, does not say it."""
+    """Return the resident memory of this process in bytes; 0 on other systems than Linux."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * resource.getpagesize() if resource else 0
 
 
-def _lower(what: int, most: int) -> None:
-    _, hard = resource.getrlimit(what)
-    resource.setrlimit(what, (most if hard == resource.RLIM_INFINITY else min(most, hard), hard))
+def _lower_limit(limit: int, value: int) -> None:
+    _, hard = resource.getrlimit(limit)
+    resource.setrlimit(limit, (value if hard == resource.RLIM_INFINITY else min(value, hard), hard))
 
 
-def _end_with(parent: int, memory_gb: float, cpu_s: float, writes: bool, *_: object) -> None:
-    assert _prctl is not None  # or nobody would have been given this
+def _set_up_child(parent_pid: int, memory_gb: float, cpu_s: float, can_write: bool, *_: object) -> None:
+    assert _prctl is not None  # checked by `end_with_parent`
     if cpu_s < math.inf:
-        _lower(resource.RLIMIT_CPU, math.ceil(cpu_s))
+        _lower_limit(resource.RLIMIT_CPU, math.ceil(cpu_s))
     if memory_gb < math.inf:
-        _lower(resource.RLIMIT_AS, int(memory_gb * 1e9))
-    if not writes:
-        _lower(resource.RLIMIT_FSIZE, 0)
-    _prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:  # which has ended before this was asked for, or had a server fork this one
-        if (starter := parent_process()) and starter.pid == parent:
-            Thread(target=_end_after, args=(starter,), daemon=True).start()
+        _lower_limit(resource.RLIMIT_AS, int(memory_gb * 1e9))
+    if not can_write:
+        _lower_limit(resource.RLIMIT_FSIZE, 0)
+    set_parent_death_signal = 1  # PR_SET_PDEATHSIG of Linux
+    _prctl(set_parent_death_signal, signal.SIGKILL)
+    if os.getppid() != parent_pid:  # the parent has ended already, or a fork server started this process for it
+        parent = parent_process()
+        if parent and parent.pid == parent_pid:
+            Thread(target=_kill_after, args=(parent,), daemon=True).start()
         else:
             os.kill(os.getpid(), signal.SIGKILL)
 
 
-def _end_after(starter: BaseProcess) -> None:
-    starter.join()
+def _kill_after(parent: BaseProcess) -> None:
+    parent.join()
     os.kill(os.getpid(), signal.SIGKILL)
