@@ -8,7 +8,7 @@ import numpy as np
 from torchcover.geometry import HeightField
 from torchcover.recordings.ground_model import GroundModel, extract_low_surfaces
 from torchcover.recordings.sweep_window import find_pose_discontinuities
-from torchcover.simulation.recorded_world import CELL_M, build_cell_mesh
+from torchcover.simulation.cell_mesh import CELL_M, build_cell_mesh
 
 from .case import Case, most
 

@@ -1,10 +1,11 @@
-"""A drive as a world: the ground that was seen, what stands as cells, and what moves on its tracks."""
+"""Scenarios of recorded drives: observed ground, static cells, and moving objects on their tracks."""
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -12,419 +13,381 @@ from torchcover.files import AtomicOutput, format_csv, to_yaml
 from torchcover.geometry import (
     BoundingBox,
     HeightField,
-    build_transform,
-    convert_euler_to_rotation,
     convert_rotation_to_euler,
     invert,
     transform_points,
 )
-from torchcover.geometry.arrays import Bools, Float64, Int64
+from torchcover.geometry.arrays import Float64, Int64
 from torchcover.geometry.rigid import Matrix
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.recordings.accumulated_reference import DEFAULT_EGO_BOX, AccumulatedReference, AccumulationParams
 from torchcover.recordings.formats.tracks import BOX_COLUMNS, TRAJECTORY_COLUMNS
-from torchcover.recordings.free_space import RangeImage
-from torchcover.recordings.moving_clusters import MovingCluster, find_moving_clusters
-from torchcover.recordings.objects import extract_objects
 from torchcover.recordings.recording import Recording
 from torchcover.recordings.sweep_window import compute_voxel_indices, find_first_occurrences
 from torchcover.recordings.vehicle_cloud import find_points_in_box
+from torchcover.simulation.cell_mesh import CELL_M, build_cell_mesh
 from torchcover.simulation.height_field import GroundHeightField
-from torchcover.simulation.recorded.excerpt import split_at_gaps
+from torchcover.simulation.recorded_tracks import (
+    DynamicScan,
+    MappedDrive,
+    TableRow,
+    build_row_box,
+    list_detected_tracks,
+    list_labeled_tracks,
+)
 from torchcover.simulation.shapes import Mesh
 
-# Parameters of the reference that separates static points from moving ones.
-ACCUMULATION = AccumulationParams()
-# Scans so near in time tell together what stands; those so far apart look at all of it once more.
-WINDOW_S, LOOK_EVERY_S = 5.0, 1.0
-# Instants of the world, and of those that movers are looked for at; how long one may be unseen.
-STEP_S, FOUND_EVERY_S, GAP_S = 0.1, 0.2, 1.0
-# Squares of the ground, as far around the way as sensors see; so many at most.
-SQUARE_M, AROUND_M, MOST_SQUARES = 1.0, 160.0, 30_000_000
-# What stands is made of such cells. A hole in a column that is no higher is filled, as between two rows of a LiDAR on a
-# wall; and what begins so low stands on the ground.
-CELL_M, HOLE_M, FOOT_M = 0.2, 1.0, 0.6
-# A mover is found again within so much of where it was to be. It has to be found so often, and to get so far.
-AGAIN_M, LEAST_TIMES, LEAST_WAY_M = 2.0, 3, 2.0
-# What is so wide is at least as long as a car, though only its end be seen.
-CAR_M = (4.5, 1.4)
-# What it is called by its length and width.
-CALLED = (((1.3, 1.3), "pedestrian"), ((2.6, 1.3), "bicycle"), ((6.5, np.inf), "car"), ((np.inf, np.inf), "truck"))
-# Of what moves, such a share is seen past; of a wall that comes into sight, and so seems to, none is.
-PAST = 0.3
-# So near to a mover, what seems to stand is its own; as is what seems to move so near to the vehicle, as its mirrors.
-BESIDE_M = 0.4
-# As large as nine in ten times; and no larger or smaller than that.
-USUALLY, LARGEST_M, SMALLEST_M = 0.9, (25.0, 4.0, 5.0), 0.3
-# Columns of the faces of a cell, and its corners around each, from outside.
-SIDES = np.array([[-1, 0, 0], [1, 0, 0], [0, -1, 0], [0, 1, 0], [0, 0, -1], [0, 0, 1]])
-AROUND_SIDES = np.array(
-    [
-        [[0, 0, 0], [0, 0, 1], [0, 1, 1], [0, 1, 0]],
-        [[1, 0, 0], [1, 1, 0], [1, 1, 1], [1, 0, 1]],
-        [[0, 0, 0], [1, 0, 0], [1, 0, 1], [0, 0, 1]],
-        [[0, 1, 0], [0, 1, 1], [1, 1, 1], [1, 1, 0]],
-        [[0, 0, 0], [0, 1, 0], [1, 1, 0], [1, 0, 0]],
-        [[0, 0, 1], [1, 0, 1], [1, 1, 1], [0, 1, 1]],
-    ]
-)
 
-TableRow = tuple[float | str, ...]
-
-
-class MappedDrive(NamedTuple):
-    """What a drive has seen, in the world from its first place: the ground, where it is known, and what is on it.
-
-    `static_points_m` (N, 3) is a place in each cell in which something stands or lies; `dynamic_scans` has of each scan when it was,
-    (N, 3) what does not stand, and whether each is seen past; `range_images` say how far some of them saw.
-    """
-
-    ground: GroundHeightField
-    static_points_m: Float64
-    dynamic_scans: list[tuple[float, Float64, Bools]]
-    range_images: list[RangeImage]
-
-
-def write_scenario(recording: Recording, folder: Path, *, num_frames: int | None = None) -> str:
-    """Make a scenario of a drive: `scenario.yaml` in a folder, and the files that it names.
-
-    The ground is a height field through what was seen of it. What stands is what no two scans have seen past, as cells
-    of 0.2 m. What is labelled has the tracks of its labels; without labels, what moves has those that are found by
-    rays. What nobody saw is not there.
+@dataclass(frozen=True)
+class SceneMappingParams:
+    """Parameters of the scene of a recorded drive.
 
     Args:
-        recording: With times and poses.
-        folder: Where to; made if it does not exist.
-        num_frames: How many of its frames, from the first on; all if not given.
+        window_s: Scans within this time are compared to separate static points from dynamic ones.
+        max_image_interval_s: Longest interval of the range images that carve free space.
+        time_step_s: Time step of the scenario.
+        ground_cell_m: Side of a cell of the ground.
+        ground_margin_m: Distance from the path up to which ground is mapped: the range of sensors.
+        max_ground_cells: Limit of the cells of the ground.
+        max_hole_m: Holes of a column of cells up to this height are filled, such as those between two rows of a LiDAR
+            on a wall.
+        max_foot_m: Columns that begin below this height above ground are extended to the ground.
+        margin_m: Points this close to the vehicle or a moving object are not static.
+        accumulation: Parameters of the separation of static and dynamic points.
+    """
+
+    window_s: float = 5.0
+    max_image_interval_s: float = 1.0
+    time_step_s: float = 0.1
+    ground_cell_m: float = 1.0
+    ground_margin_m: float = 160.0
+    max_ground_cells: int = 30_000_000
+    max_hole_m: float = 1.0
+    max_foot_m: float = 0.6
+    margin_m: float = 0.4
+    accumulation: AccumulationParams = AccumulationParams()
+
+
+def write_scenario(
+    recording: Recording,
+    folder: Path,
+    *,
+    num_frames: int | None = None,
+    params: SceneMappingParams = SceneMappingParams(),
+) -> str:
+    """Write the scenario of a drive: `scenario.yaml` in a folder, and the files that it names.
+
+    The ground is a height field through the observed ground. Static objects are cells of 0.2 m with points that no two
+    scans contradict. Labeled objects have the tracks of their labels; without labels, moving objects have tracks that
+    are found in the points. The scenario does not contain anything that was not observed.
+
+    Args:
+        recording: Recording with times and poses.
+        folder: Output folder; created if it does not exist.
+        num_frames: Number of key frames, from the first on; all if None.
+        params: Parameters of the scene.
 
     Returns:
-        What was made, in words.
+        Summary of the scenario.
 
     Raises:
         OSError: A file is missing, or cannot be written.
-        ValueError: No times or poses, poses that jump or a gap in time; no ground around the vehicle.
+        ValueError: Times or poses are missing, poses jump, there is a gap in time, or no ground is observed.
     """
-    reference = AccumulatedReference(WINDOW_S)
+    reference = AccumulatedReference(params.window_s)
     reference.check(recording, ())
-    assert recording.times_s is not None  # as checked
-    last = recording.key_frames[
-        (len(recording.key_frames) if num_frames is None else min(num_frames, len(recording.key_frames))) - 1
-    ]
-    times_s = recording.times_s[: last + 1] - recording.times_s[0]
-    gaps = np.flatnonzero(np.diff(times_s) > WINDOW_S)
-    if len(gaps):
-        before = sum(frame <= gaps[0] for frame in recording.key_frames)
-        raise ValueError(
-            f"{recording.path}: nothing is recorded for {np.diff(times_s)[gaps[0]]:,.1f} s after "
-            f"{recording.frame_names[gaps[0]]}, and a world needs a frame at least every {WINDOW_S:g} s; record more often, "
-            f"or make a world of the frames before (--num-frames {before})"
-        )
+    times_s = select_times_s(recording, num_frames, params)
     poses = np.array(
-        [reference.sweep_window.compute_local_T_vehicle(recording, instant) for instant in range(last + 1)]
+        [reference.sweep_window.compute_local_T_vehicle(recording, index) for index in range(len(times_s))]
     )
-    body = recording.ego_box or DEFAULT_EGO_BOX
-    beside_m = np.array([BESIDE_M, BESIDE_M, 0.0])
-    own = BoundingBox.from_points(np.array([body.lower_m - beside_m, body.upper_m + beside_m]))
-    seen = _seen(recording, reference, times_s, poses, own)
-    drive = Trajectory.from_poses(times_s, poses)
-    labelled = recording.read_boxes(recording.key_frames[0]) is not None
-    rows = list(_labelled(recording, float(times_s[-1])) if labelled else _found(seen, drive))
-    driven = [(pose, body) for pose in poses] + [_around(row) for row in rows]
-    cells = _cells(seen, driven)
-    instants_s: Float64 = STEP_S * np.arange(int(times_s[-1] / STEP_S + 1e-6) + 1.0)
-    placed = drive.interpolate_many(instants_s)
-    way = np.column_stack([instants_s, placed[:, :3, 3], convert_rotation_to_euler(placed[:, :3, :3])[:, ::-1]])
-    told = (
-        f"{times_s[-1]:.1f} s; ground of {seen.ground.cell_mask.sum() * SQUARE_M**2:,.0f} m2, {len(cells):,} cells of "
-        f"{CELL_M:g} m that stand, {len({row[1] for row in rows})} movers "
-        f"({'of its labels' if labelled else 'found by rays'})"
+    ego_box = recording.ego_box or DEFAULT_EGO_BOX
+    margin_m = np.array([params.margin_m, params.margin_m, 0.0])
+    excluded_box = BoundingBox.from_points(np.array([ego_box.lower_m - margin_m, ego_box.upper_m + margin_m]))
+    mapped = map_drive(recording, reference, times_s, poses, excluded_box, params)
+    ego_trajectory = Trajectory.from_poses(times_s, poses)
+    is_labeled = recording.read_boxes(recording.key_frames[0]) is not None
+    if is_labeled:
+        track_rows = list(list_labeled_tracks(recording, float(times_s[-1]), params.time_step_s))
+    else:
+        track_rows = list(list_detected_tracks(mapped, ego_trajectory, params.accumulation))
+    occupied_boxes = [(pose, ego_box) for pose in poses]
+    occupied_boxes += [build_row_box(row, params.margin_m) for row in track_rows]
+    cells = find_static_cells(mapped, occupied_boxes, params)
+    meshes = {"ground": mapped.ground.build_mesh()}
+    if len(cells):
+        meshes["static"] = build_cell_mesh(cells)
+    ground_m2 = mapped.ground.cell_mask.sum() * params.ground_cell_m**2
+    summary = (
+        f"{times_s[-1]:.1f} s; ground of {ground_m2:,.0f} m2, {len(cells):,} static cells of {CELL_M:g} m, "
+        f"{len({row[1] for row in track_rows})} moving objects ({'from labels' if is_labeled else 'from points'})"
     )
-    bodies = {"ground": seen.ground.build_mesh(), **({"standing": build_cell_mesh(cells)} if len(cells) else {})}
-    scenario = {
-        "name": re.sub(r"\W+", "_", recording.path.resolve().stem).strip("_") or "recording",
-        "description": f"The drive of the recording {recording.path}: {told}. What no sensor saw is not there.",
-        "ego": {"trajectory": "ego.csv"},
-        "bodies": [
-            {"name": name, "shape": {"type": "mesh", "path": f"{name}.ply"}, "ground": name == "ground"}
-            for name in bodies
-        ],
-        **({"boxes": "movers.csv"} if rows else {}),
-        "time_step_s": STEP_S,
-        "duration_s": round(float(instants_s[-1]), 6),
-    }
-    tables: dict[str, list[TableRow]] = {"ego": [TRAJECTORY_COLUMNS, *map(tuple, way.tolist())]}
-    if rows:
-        tables["movers"] = [("t", "id", "category", *BOX_COLUMNS[1:]), *rows]
-    texts = {f"{name}.csv": format_csv(table) for name, table in tables.items()} | {"scenario.yaml": to_yaml(scenario)}
-    with AtomicOutput(folder) as files:
-        for name, mesh in bodies.items():
-            files.add(f"{name}.ply", partial(_export, mesh))
-        for name, text in texts.items():
-            files.add_text(name, text)
-        files.publish({"recording": str(recording.path), "found": told})
-    return told
+    write_scenario_files(recording, folder, summary, meshes, ego_trajectory, track_rows, params)
+    return summary
 
 
-def _seen(
-    recording: Recording, reference: AccumulatedReference, times_s: Float64, poses: Matrix, own: BoundingBox
+def select_times_s(recording: Recording, num_frames: int | None, params: SceneMappingParams) -> Float64:
+    """Select the frames of a scenario.
+
+    Args:
+        recording: Recording with times.
+        num_frames: Number of key frames, from the first on; all if None.
+        params: Longest interval of two frames.
+
+    Returns:
+        (T,) times of all frames up to the last key frame, relative to the first.
+
+    Raises:
+        ValueError: The recording has no times, or a gap.
+    """
+    if recording.times_s is None:
+        raise ValueError(f"{recording.path}: no times; a scene needs them")
+    key_frames = recording.key_frames if num_frames is None else recording.key_frames[:num_frames]
+    times_s = recording.times_s[: key_frames[-1] + 1] - recording.times_s[0]
+    intervals_s = np.diff(times_s)
+    gaps = np.flatnonzero(intervals_s > params.window_s)
+    if len(gaps):
+        num_frames_before = sum(frame <= gaps[0] for frame in recording.key_frames)
+        raise ValueError(
+            f"{recording.path}: nothing is recorded for {intervals_s[gaps[0]]:,.1f} s after "
+            f"{recording.frame_names[gaps[0]]}, and a scene needs a frame at least every {params.window_s:g} s; record "
+            f"more often, or make a scene of the frames before (--num-frames {num_frames_before})"
+        )
+    return np.asarray(times_s)
+
+
+def map_drive(
+    recording: Recording,
+    reference: AccumulatedReference,
+    times_s: Float64,
+    poses: Matrix,
+    excluded_box: BoundingBox,
+    params: SceneMappingParams,
 ) -> MappedDrive:
-    """What all windows of a drive have seen, one after the other; nothing where the vehicle itself is."""
-    field, sweeps = _Field(poses[:, :2, 3]), reference.sweep_window
-    standing_m, loose, images = np.empty((0, 3)), [], []
-    looked_s, look_every_s, done = dict.fromkeys(recording.sensors, -np.inf), min(LOOK_EVERY_S, times_s[-1] / 20), -1
-    for middle_s in np.arange(0.45, times_s[-1] / WINDOW_S + 0.9, 0.9) * WINDOW_S:
-        index = int(np.abs(times_s - middle_s).argmin())
-        if skipped := sweeps.count_skipped_frames(recording, index):
+    """Map all scans of a drive, window by window.
+
+    Args:
+        recording: The recording.
+        reference: Reference that separates static from dynamic points.
+        times_s: (T,) times of the frames.
+        poses: (T, 4, 4) poses of the vehicle.
+        excluded_box: Box of the vehicle with a margin, in the vehicle frame; points in it are ignored.
+        params: Parameters of the scene.
+
+    Returns:
+        The mapped drive.
+
+    Raises:
+        ValueError: The poses jump, the drive is too large, or no ground is observed.
+    """
+    ground_map, sweeps = GroundMap(poses[:, :2, 3], params), reference.sweep_window
+    static_points_m = np.empty((0, 3))
+    dynamic_scans, range_images = [], []
+    image_times_s = dict.fromkeys(recording.sensors, -np.inf)
+    image_interval_s = min(params.max_image_interval_s, times_s[-1] / 20)
+    last_frame = -1
+    # Windows overlap by a tenth, so that every frame is in one.
+    for center_s in np.arange(0.45, times_s[-1] / params.window_s + 0.9, 0.9) * params.window_s:
+        index = int(np.abs(times_s - center_s).argmin())
+        if num_skipped := sweeps.count_skipped_frames(recording, index):
             raise ValueError(
-                f"{recording.path}: the poses jump within {WINDOW_S / 2:g} s of {recording.frame_names[index]}, by which "
-                f"{skipped} instants are lost, and a world does not; mend them, or make one of fewer frames (--num-frames)"
+                f"{recording.path}: the poses jump within {params.window_s / 2:g} s of "
+                f"{recording.frame_names[index]}, which excludes {num_skipped} frames; repair the poses, or make a "
+                "scene of fewer frames (--num-frames)"
             )
-        parts = [standing_m]
-        for (sensor, instant), (points_m, told) in sorted(reference.classify_points(recording, index).items()):
-            if not done < instant < len(times_s):
+        point_parts_m = [static_points_m]
+        for (sensor, frame), (points_m, point_class) in sorted(reference.classify_points(recording, index).items()):
+            if not last_frame < frame < len(times_s):
                 continue
-            free = np.ones(len(points_m), np.bool_)
-            free[find_points_in_box(transform_points(invert(poses[instant]), points_m), own)] = False
-            parts.append(points_m[free & (told == 0)])
-            loose.append((float(times_s[instant]), points_m[free & (told > 0)], told[free & (told > 0)] == 2))
-            image = sweeps.get_thinned_scan(recording, sensor, instant).range_image
-            if image is not None and times_s[instant] - looked_s[sensor] > look_every_s - 1e-6:
-                images.append(image)
-                looked_s[sensor] = times_s[instant]
-        standing_m = np.concatenate(parts)
-        standing_m = standing_m[find_first_occurrences(compute_voxel_indices(standing_m, CELL_M))]
-        field.add(recording, reference, index, poses[index])
-        done = max(sweeps.find_frames_in_window(recording, index))
-    return MappedDrive(field.slopes(recording), standing_m, sorted(loose, key=lambda scan: scan[0]), images)
+            is_outside = np.ones(len(points_m), np.bool_)
+            is_outside[find_points_in_box(transform_points(invert(poses[frame]), points_m), excluded_box)] = False
+            is_dynamic = is_outside & (point_class > 0)
+            point_parts_m.append(points_m[is_outside & (point_class == 0)])
+            dynamic_scans.append(DynamicScan(float(times_s[frame]), points_m[is_dynamic], point_class[is_dynamic] == 2))
+            image = sweeps.get_thinned_scan(recording, sensor, frame).range_image
+            if image is not None and times_s[frame] - image_times_s[sensor] > image_interval_s - 1e-6:
+                range_images.append(image)
+                image_times_s[sensor] = times_s[frame]
+        static_points_m = np.concatenate(point_parts_m)
+        static_points_m = static_points_m[find_first_occurrences(compute_voxel_indices(static_points_m, CELL_M))]
+        ground_map.add(recording, reference, index, poses[index])
+        last_frame = max(sweeps.find_frames_in_window(recording, index))
+    dynamic_scans.sort(key=lambda scan: scan.time_s)
+    return MappedDrive(ground_map.build_height_field(recording), static_points_m, dynamic_scans, range_images)
 
 
-class _Field:
-    """The ground around a way: each place has the height that was found from nearest to it."""
+class GroundMap:
+    """Ground around a path; each position has the height of the ground model whose center is nearest.
 
-    def __init__(self, way_m: Float64) -> None:
-        self._lower_m = np.floor(way_m.min(axis=0) - AROUND_M)
-        columns, rows = (np.ceil(way_m.max(axis=0) + AROUND_M - self._lower_m) / SQUARE_M).astype(int) + 1
-        if rows * columns > MOST_SQUARES:
+    Args:
+        path_m: (T, 2) positions of the vehicle.
+        params: Size of the cells and margin around the path.
+
+    Raises:
+        ValueError: The path is too long.
+    """
+
+    def __init__(self, path_m: Float64, params: SceneMappingParams) -> None:
+        self._params = params
+        cell_m, margin_m = params.ground_cell_m, params.ground_margin_m
+        self._lower_m = np.floor(path_m.min(axis=0) - margin_m)
+        columns, rows = (np.ceil(path_m.max(axis=0) + margin_m - self._lower_m) / cell_m).astype(int) + 1
+        if rows * columns > params.max_ground_cells:
             raise ValueError(
-                f"the drive covers {columns * SQUARE_M / 1000:.1f} x {rows * SQUARE_M / 1000:.1f} km, too much for one "
-                "world; make one of fewer frames (--num-frames)"
+                f"the drive covers {columns * cell_m / 1000:.1f} x {rows * cell_m / 1000:.1f} km, too much for one "
+                "scene; make a scene of fewer frames (--num-frames)"
             )
-        self._heights_m, self._away_m = np.full((2, rows, columns), np.nan)
-        self._away_m[:] = np.inf
+        self._heights_m = np.full((rows, columns), np.nan)
+        self._distance_m = np.full((rows, columns), np.inf)
 
     def add(self, recording: Recording, reference: AccumulatedReference, index: int, pose: Matrix) -> None:
-        """What is known around an instant."""
+        """Add the ground model around a frame.
+
+        Args:
+            recording: The recording.
+            reference: Reference with the ground models.
+            index: The frame.
+            pose: (4, 4) pose of the vehicle.
+        """
         model = reference.sweep_window.get_ground_model(recording, index)
         if model is None:
             return
-        first = np.maximum(((pose[:2, 3] - AROUND_M - self._lower_m) / SQUARE_M).astype(int), 0)
-        part = tuple(slice(start, start + int(2 * AROUND_M / SQUARE_M)) for start in first[::-1])
+        cell_m, margin_m = self._params.ground_cell_m, self._params.ground_margin_m
+        first = np.maximum(((pose[:2, 3] - margin_m - self._lower_m) / cell_m).astype(int), 0)
+        part = tuple(slice(start, start + int(2 * margin_m / cell_m)) for start in first[::-1])
         rows, columns = self._heights_m[part].shape
-        places_m = self._lower_m + SQUARE_M * (first + np.indices((rows, columns))[::-1].reshape(2, -1).T)
-        heights_m = -model.compute_heights_m(np.column_stack([places_m, np.zeros(len(places_m))])).reshape(
-            rows, columns
+        positions_m = self._lower_m + cell_m * (first + np.indices((rows, columns))[::-1].reshape(2, -1).T)
+        # The ground lies below z = 0 by the height of z = 0 above it.
+        heights_m = -model.compute_heights_m(np.column_stack([positions_m, np.zeros(len(positions_m))]))
+        heights_m = heights_m.reshape(rows, columns)
+        distance_m = np.linalg.norm(positions_m - pose[:2, 3], axis=1).reshape(rows, columns)
+        is_nearer = np.isfinite(heights_m) & (distance_m < self._distance_m[part])
+        self._heights_m[part][is_nearer], self._distance_m[part][is_nearer] = (
+            heights_m[is_nearer],
+            distance_m[is_nearer],
         )
-        away_m = np.linalg.norm(places_m - pose[:2, 3], axis=1).reshape(rows, columns)
-        better = np.isfinite(heights_m) & (away_m < self._away_m[part])
-        self._heights_m[part][better], self._away_m[part][better] = heights_m[better], away_m[better]
 
-    def slopes(self, recording: Recording) -> GroundHeightField:
-        """All of it."""
-        known = np.isfinite(self._heights_m)
-        wanted = known[1:, 1:] & known[1:, :-1] & known[:-1, 1:] & known[:-1, :-1]
-        if not wanted.any():
-            raise ValueError(f"{recording.path}: no ground is seen around the vehicle; is z up, and 0 on the ground?")
-        return GroundHeightField(self._lower_m, self._heights_m, wanted, SQUARE_M)
+    def build_height_field(self, recording: Recording) -> GroundHeightField:
+        """Build the ground of all cells whose corners have heights.
+
+        Args:
+            recording: The recording, for messages.
+
+        Returns:
+            The ground.
+
+        Raises:
+            ValueError: No cell has four corners.
+        """
+        is_observed = np.isfinite(self._heights_m)
+        cell_mask = is_observed[1:, 1:] & is_observed[1:, :-1] & is_observed[:-1, 1:] & is_observed[:-1, :-1]
+        if not cell_mask.any():
+            raise ValueError(
+                f"{recording.path}: no ground is observed around the vehicle; is z up, and 0 on the ground?"
+            )
+        return GroundHeightField(self._lower_m, self._heights_m, cell_mask, self._params.ground_cell_m)
 
 
-def _cells(seen: MappedDrive, driven: Sequence[tuple[Matrix, BoundingBox]]) -> Int64:
-    """(N, 3) the cells, in steps of `CELL_M`, that something fills; none of where anything drives."""
-    field = HeightField(seen.ground.origin_m, seen.ground.corner_heights_m, SQUARE_M)
-    above_m = seen.static_points_m[:, 2] - field.compute_heights_m(seen.static_points_m[:, :2])
-    stands = ~(above_m < ACCUMULATION.max_ground_height_m)
-    places_m, above_m = seen.static_points_m[stands], above_m[stands]
-    cells = np.floor(places_m / CELL_M).astype(np.int64)
-    order = np.lexsort(cells.T[::-1])
-    places_m, above_m, cells = places_m[order], above_m[order], cells[order]
-    again = np.append(False, (cells[1:, :2] == cells[:-1, :2]).all(axis=1))
-    below = np.where(again, np.diff(cells[:, 2], prepend=0) - 1, 0)
-    below[below > HOLE_M / CELL_M] = 0
-    foot = ~again & (above_m < FOOT_M)
-    below[foot] = np.ceil(above_m[foot] / CELL_M)
-    own = np.repeat(np.arange(len(cells)), below)
-    down = np.arange(len(own)) - np.repeat(np.cumsum(below) - below, below) + 1
-    filled = cells[own] - down[:, None] * np.array([0, 0, 1])
-    cells, places_m = np.concatenate([cells, filled]), np.concatenate([places_m, (filled + 0.5) * CELL_M])
+def find_static_cells(
+    mapped: MappedDrive, occupied_boxes: Sequence[tuple[Matrix, BoundingBox]], params: SceneMappingParams
+) -> Int64:
+    """Find the cells that static objects occupy.
+
+    Args:
+        mapped: The drive.
+        occupied_boxes: Poses and boxes of the vehicle and of moving objects; cells in them are free.
+        params: Sizes of holes that are filled.
+
+    Returns:
+        (N, 3) cells in multiples of `CELL_M`.
+    """
+    height_field = HeightField(mapped.ground.origin_m, mapped.ground.corner_heights_m, params.ground_cell_m)
+    height_m = mapped.static_points_m[:, 2] - height_field.compute_heights_m(mapped.static_points_m[:, :2])
+    is_above_ground = ~(height_m < params.accumulation.max_ground_height_m)  # also without ground
+    points_m, height_m = mapped.static_points_m[is_above_ground], height_m[is_above_ground]
+    cells = np.floor(points_m / CELL_M).astype(np.int64)
+    order = np.lexsort(cells.T[::-1])  # by column, then upwards
+    points_m, height_m, cells = points_m[order], height_m[order], cells[order]
+    is_same_column = np.append(False, (cells[1:, :2] == cells[:-1, :2]).all(axis=1))
+    num_filled = np.where(is_same_column, np.diff(cells[:, 2], prepend=0) - 1, 0)
+    num_filled[num_filled > params.max_hole_m / CELL_M] = 0
+    is_foot = ~is_same_column & (height_m < params.max_foot_m)
+    num_filled[is_foot] = np.ceil(height_m[is_foot] / CELL_M)
+    upper = np.repeat(np.arange(len(cells)), num_filled)
+    steps_down = np.arange(len(upper)) - np.repeat(np.cumsum(num_filled) - num_filled, num_filled) + 1
+    filled_cells = cells[upper] - steps_down[:, None] * np.array([0, 0, 1])
+    cells = np.concatenate([cells, filled_cells])
+    points_m = np.concatenate([points_m, (filled_cells + 0.5) * CELL_M])
     votes = np.zeros(len(cells), np.int16)
-    for image in seen.range_images:
-        image.add_votes(places_m, votes)
-    cells = cells[votes < ACCUMULATION.min_votes]
+    for image in mapped.range_images:
+        image.add_votes(points_m, votes)
+    cells = cells[votes < params.accumulation.min_votes]
     cells = cells[np.argsort(cells[:, 0], kind="stable")]
-    free = np.ones(len(cells), np.bool_)
-    for pose, box in driven:
-        reach_m = float(np.linalg.norm(box.corners_m[:, :2], axis=1).max())
-        first, end = np.searchsorted(cells[:, 0], (pose[0, 3] + np.array([-reach_m, reach_m])) / CELL_M)
-        near = first + np.flatnonzero(np.abs((cells[first:end, 1] + 0.5) * CELL_M - pose[1, 3]) < reach_m)
-        free[near[find_points_in_box(transform_points(invert(pose), (cells[near] + 0.5) * CELL_M), box)]] = False
-    filling: Int64 = np.unique(cells[free], axis=0)
-    return filling
+    is_static = np.ones(len(cells), np.bool_)
+    for pose, box in occupied_boxes:
+        radius_m = float(np.linalg.norm(box.corners_m[:, :2], axis=1).max())
+        first, end = np.searchsorted(cells[:, 0], (pose[0, 3] + np.array([-radius_m, radius_m])) / CELL_M)
+        y_m = (cells[first:end, 1] + 0.5) * CELL_M
+        nearby = first + np.flatnonzero(np.abs(y_m - pose[1, 3]) < radius_m)
+        centers_m = transform_points(invert(pose), (cells[nearby] + 0.5) * CELL_M)
+        is_static[nearby[find_points_in_box(centers_m, box)]] = False
+    static_cells: Int64 = np.unique(cells[is_static], axis=0)
+    return static_cells
 
 
-def _around(row: TableRow) -> tuple[Matrix, BoundingBox]:
-    """Where a mover is, with the points beside it that were not seen past."""
-    x, y, z, *size_m, yaw_deg = (float(number) for number in row[3:])
-    length, width, height = np.array(size_m) / 2 + BESIDE_M
-    box = BoundingBox((-length, -width, -height), (length, width, 2 * height))
-    return build_transform(convert_euler_to_rotation(yaw_deg, 0.0, 0.0), [x, y, z]), box
-
-
-def build_cell_mesh(cell_indices: Int64) -> Mesh:
-    """The sides of (N, 3) cells, each once, in steps of `CELL_M`, that no other of them touches.
-
-    Example:
-        >>> mesh = build_cell_mesh(np.array([[0, 0, 0], [0, 0, 1]]))
-        >>> mesh.faces.shape, mesh.vertices_m.max(axis=0).tolist()
-        ((20, 3), [0.2, 0.2, 0.4])
-    """
-    from_m = cell_indices.min(axis=0) - 1
-    size = cell_indices.max(axis=0) - from_m + 3
-
-    def numbered(places: Int64) -> Int64:
-        return np.asarray(np.ravel_multi_index(tuple((places - from_m).T), tuple(size)))
-
-    numbers, corners = np.sort(numbered(cell_indices)), []
-    for side, around in zip(SIDES, AROUND_SIDES, strict=True):
-        beside = numbered(cell_indices + side)
-        at = np.searchsorted(numbers, beside).clip(max=len(numbers) - 1)
-        bare = cell_indices[numbers[at] != beside]
-        corners.append((bare[:, None] + around).reshape(-1, 3))
-    used, of_side = np.unique(numbered(np.concatenate(corners)), return_inverse=True)
-    of_side = of_side.reshape(-1, 4)
-    vertices = np.stack(np.unravel_index(used, tuple(size)), axis=1) + from_m
-    return Mesh(vertices * CELL_M, np.concatenate([of_side[:, [0, 1, 2]], of_side[:, [0, 2, 3]]]))
-
-
-def _labelled(recording: Recording, last_s: float) -> Iterator[TableRow]:
-    """Rows of `movers.csv` of labelled objects."""
-    pose = recording.get_world_T_vehicle(0)
-    assert pose is not None  # as checked
-    first_m = pose[:3, 3]
-    for track in extract_objects(recording).tracks:
-        for number, piece in enumerate(split_at_gaps(track.trajectory, GAP_S)):
-            name = track.name if not number else f"{track.name} #{number + 1}"
-            times_s = np.append(np.arange(piece.times_s[0], piece.times_s[-1] - 1e-6, STEP_S), piece.times_s[-1])
-            times_s = times_s[times_s <= last_s]
-            placed = piece.interpolate_many(times_s)
-            yaw_deg = convert_rotation_to_euler(placed[:, :3, :3])[:, :1]
-            for row in np.column_stack([times_s, placed[:, :3, 3] - first_m, yaw_deg]).tolist():
-                yield (row[0], name, track.category, *row[1:4], *track.size_m, row[4])
-
-
-def _found(seen: MappedDrive, drive: Trajectory) -> Iterator[TableRow]:
-    """Rows of `movers.csv` of what rays tell to move, from one instant to the next."""
-    scan_s = np.array([time_s for time_s, *_ in seen.dynamic_scans])
-    tracks: list[list[tuple[float, Float64, MovingCluster]]] = []
-    before_s = -np.inf
-    for time_s in np.unique(scan_s):
-        if time_s - before_s < FOUND_EVERY_S - 1e-6:
-            continue
-        before_s, ego_m = time_s, drive.interpolate_positions_m(np.array([time_s]))[0]
-        near = np.flatnonzero(np.abs(scan_s - time_s) <= ACCUMULATION.clusters.max_compared_s)
-        scans_m = [seen.dynamic_scans[scan][1] for scan in near]
-        max_range_m = ACCUMULATION.clusters.max_range_m
-        scans_m = [of_m[np.linalg.norm(of_m[:, :2] - ego_m[:2], axis=1) < max_range_m] for of_m in scans_m]
-        _go_on(tracks, time_s, find_moving_clusters(scans_m, scan_s[near] - time_s))
-    number = 0
-    for track in tracks:
-        way_m = track[-1][1] - track[0][1]
-        if len(track) < LEAST_TIMES or np.linalg.norm(way_m) < LEAST_WAY_M:
-            continue
-        if max(len(moved.points_m) for *_, moved in track) < ACCUMULATION.min_cluster_points:
-            continue
-        boxes = _boxes(track, drive, seen.ground)
-        if _seen_past(seen, scan_s, [time_s for time_s, *_ in track], boxes) < PAST:
-            continue
-        number += 1
-        fits = (boxes[0, 3:5] <= sizes_m for sizes_m, _ in CALLED)
-        called = next(name for fit, (_, name) in zip(fits, CALLED, strict=True) if fit.all())
-        for (time_s, *_), box in zip(track, boxes, strict=True):
-            yield (time_s, f"found_{number}", called, *box.tolist())
-
-
-def _seen_past(seen: MappedDrive, scan_s: Float64, times_s: Sequence[float], boxes: Float64) -> float:
-    """The share that is seen past of what lies in the boxes of a track; what only comes into sight never is."""
-    inside = past = 0
-    for time_s, box in zip(times_s, boxes, strict=True):
-        pose, room = _around(("", "", "", *box.tolist()))
-        for scan in np.flatnonzero(scan_s == time_s):
-            _, points_m, is_past = seen.dynamic_scans[scan]
-            rows = find_points_in_box(transform_points(invert(pose), points_m), room)
-            inside, past = inside + len(rows), past + int(is_past[rows].sum())
-    return past / max(inside, 1)
-
-
-def _go_on(
-    tracks: list[list[tuple[float, Float64, MovingCluster]]], time_s: float, found: Sequence[MovingCluster]
+def write_scenario_files(
+    recording: Recording,
+    folder: Path,
+    summary: str,
+    meshes: dict[str, Mesh],
+    ego_trajectory: Trajectory,
+    track_rows: Sequence[TableRow],
+    params: SceneMappingParams,
 ) -> None:
-    """Append what is found to the track of whatever was to be there, else begin another."""
-    middles_m = [moved.points_m[:, :2].mean(axis=0) for moved in found]
-    going = [track for track in tracks if time_s - track[-1][0] <= GAP_S / 2]
-    apart_m = sorted(
-        (float(np.linalg.norm(last_m + (time_s - last_s) * moved.velocity_mps - middle_m)), number, which)
-        for number, track in enumerate(going)
-        for last_s, last_m, moved in track[-1:]
-        for which, middle_m in enumerate(middles_m)
-    )
-    left, open_ = set(range(len(found))), set(range(len(going)))
-    for off_m, number, which in apart_m:
-        if off_m <= AGAIN_M and which in left and number in open_:
-            going[number].append((time_s, middles_m[which], found[which]))
-            left.remove(which)
-            open_.remove(number)
-    tracks += [[(time_s, middles_m[which], found[which])] for which in sorted(left)]
+    """Write `scenario.yaml`, its meshes, `ego.csv` and `moving_objects.csv`.
 
+    Args:
+        recording: The recording, for names.
+        folder: Output folder.
+        summary: Summary of the scenario.
+        meshes: Meshes by the name of the body.
+        ego_trajectory: Trajectory of the vehicle from time 0 on.
+        track_rows: Rows of moving objects.
+        params: Time step.
 
-def _boxes(
-    track: Sequence[tuple[float, Float64, MovingCluster]], drive: Trajectory, ground: GroundHeightField
-) -> Float64:
-    """(K, 7) x, y, z of the bottom, length, width, height and yaw of what was found at each time of a track.
-
-    Of a body the sides are seen that face the vehicle; there its box ends.
+    Raises:
+        OSError: A file cannot be written.
     """
-    times_s = np.array([time_s for time_s, *_ in track])
-    middles_m = np.array([middle_m for _, middle_m, _ in track])
-    way = _steadied(np.array([moved.velocity_mps for *_, moved in track]))
-    goes = np.linalg.norm(way, axis=1) > ACCUMULATION.sweeps.min_object_speed_mps
-    if not goes.any():
-        way[:], goes[:] = middles_m[-1] - middles_m[0], True
-    # Who stands looks where it went, or will go.
-    way = way[np.maximum.accumulate(np.where(goes, np.arange(len(track)), goes.argmax()))]
-    yaw = np.arctan2(way[:, 1], way[:, 0])
-    axes = np.stack([np.stack([np.cos(yaw), np.sin(yaw)], 1), np.stack([-np.sin(yaw), np.cos(yaw)], 1)], axis=1)
-    ends = np.array([[np.quantile(moved.points_m[:, :2] @ axis.T, share, axis=0) for share in (0.02, 0.98)]
-                     for axis, (*_, moved) in zip(axes, track, strict=True)])  # fmt: skip
-    under_m = HeightField(ground.origin_m, ground.corner_heights_m, ground.cell_m).compute_heights_m(middles_m)
-    lowest_m, highest_m = np.array([np.quantile(moved.points_m[:, 2], (0.02, 0.98)) for *_, moved in track]).T
-    under_m = np.where(np.isfinite(under_m), under_m, lowest_m)
-    seen_m = np.column_stack([ends[:, 1] - ends[:, 0], highest_m - under_m])
-    size_m = np.clip(np.quantile(seen_m, USUALLY, axis=0), SMALLEST_M, LARGEST_M)
-    if size_m[1] > CAR_M[1]:
-        size_m[0] = max(size_m[0], CAR_M[0])
-    ego = np.einsum("kij,kj->ki", axes, drive.interpolate_positions_m(times_s)[:, :2])
-    far = np.where(ego < ends[:, 0], 1, np.where(ego > ends[:, 1], -1, 0))
-    near = np.where(far > 0, ends[:, 0], ends[:, 1])
-    middle = np.where(far == 0, ends.mean(axis=1), near + far * size_m[:2] / 2)
-    placed_m = _steadied(np.einsum("kij,ki->kj", axes, middle))
-    return np.column_stack([placed_m, under_m, np.tile(size_m, (len(track), 1)), np.rad2deg(yaw)])
+    num_steps = int(ego_trajectory.times_s[-1] / params.time_step_s + 1e-6)
+    times_s: Float64 = params.time_step_s * np.arange(num_steps + 1.0)
+    poses = ego_trajectory.interpolate_many(times_s)
+    angles_deg = convert_rotation_to_euler(poses[:, :3, :3])[:, ::-1]
+    ego_rows = np.column_stack([times_s, poses[:, :3, 3], angles_deg]).tolist()
+    bodies = []
+    for name in meshes:
+        bodies.append({"name": name, "shape": {"type": "mesh", "path": f"{name}.ply"}, "ground": name == "ground"})
+    scenario: dict[str, Any] = {
+        "name": re.sub(r"\W+", "_", recording.path.resolve().stem).strip("_") or "recording",
+        "description": f"Drive of the recording {recording.path}: {summary}. Contains only what a sensor observed.",
+        "ego": {"trajectory": "ego.csv"},
+        "bodies": bodies,
+    }
+    texts = {"ego.csv": format_csv([TRAJECTORY_COLUMNS, *ego_rows])}
+    if track_rows:
+        scenario["boxes"] = "moving_objects.csv"
+        header = ("t", "id", "category", *BOX_COLUMNS[1:])
+        texts["moving_objects.csv"] = format_csv([header, *track_rows])
+    scenario |= {"time_step_s": params.time_step_s, "duration_s": round(float(times_s[-1]), 6)}
+    texts["scenario.yaml"] = to_yaml(scenario)
+    with AtomicOutput(folder) as files:
+        for name, mesh in meshes.items():
+            files.add(f"{name}.ply", partial(export_ply, mesh))
+        for name, text in texts.items():
+            files.add_text(name, text)
+        files.publish({"recording": str(recording.path), "summary": summary})
 
 
-def _steadied(values: Float64) -> Float64:
-    """(K, 2) values at even times, each the mean of as many before as after it, at most two."""
-    around = [min(2, at, len(values) - 1 - at) for at in range(len(values))]
-    return np.array([values[at - step : at + step + 1].mean(axis=0) for at, step in enumerate(around)])
-
-
-def _export(mesh: Mesh, path: Path) -> None:
+def export_ply(mesh: Mesh, path: Path) -> None:
+    """Export a mesh as a PLY file."""
     import trimesh
 
     trimesh.Trimesh(mesh.vertices_m, mesh.faces, process=False).export(path, file_type="ply")

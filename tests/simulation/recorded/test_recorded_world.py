@@ -6,7 +6,7 @@ import pytest
 from tests.recordings.drives import Drive
 from torchcover.recordings import open_recording
 from torchcover.simulation import Rig, Scenario, SimulatedFrames, write_recording, write_scenario
-from torchcover.simulation.recorded_world import CELL_M, build_cell_mesh
+from torchcover.simulation.cell_mesh import CELL_M, build_cell_mesh
 from torchcover.simulation.scene import SceneGeometry
 from torchcover.simulation.shapes import Box
 
@@ -94,7 +94,7 @@ def test_the_wall_stands_and_nothing_stands_where_anything_drives(made):
 
 def test_who_moves_is_on_its_track(made):
     recording, told, world = made
-    assert "1 movers" in told
+    assert "1 moving objects" in told
     (car,) = world.actors
     times_s = car.trajectory.times_s
     assert times_s[-1] - times_s[0] > SECONDS / 2
@@ -136,12 +136,12 @@ def test_sides_of_cells_are_closed_and_as_large_as_those_of_the_block():
 
 def test_what_no_world_can_be_made_of_is_told():
     alone = Drive(steps=8)
-    with pytest.raises(ValueError, match="no ground is seen around the vehicle"):
+    with pytest.raises(ValueError, match="no ground is observed around the vehicle"):
         write_scenario(alone, alone.path)
     gap = Drive(steps=8)
     gap.times_s = gap.times_s + 60.0 * (np.arange(8) > 3)
     with pytest.raises(
-        ValueError, match=r"nothing is recorded for 60\.1 s after f3, and a world needs .* 5 s; .*\(--num-frames 4\)"
+        ValueError, match=r"nothing is recorded for 60\.1 s after f3, and a scene needs .* 5 s; .*\(--num-frames 4\)"
     ):
         write_scenario(gap, gap.path)
     jumping = Drive(steps=8)
