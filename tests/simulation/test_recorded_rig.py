@@ -102,10 +102,10 @@ class Turning(Drive):
     [
         (Turning(told=("rings", "offsets_s")), "each ray at its own time"),
         (Turning(told=("offsets_s",)), "each ray at its own time"),
-        (Turning(), "motion undone .turns clockwise from"),
-        (Turning(1, -70.0, 1.0), "motion undone .turns counter-clockwise from"),
+        (Turning(), "motion undone .rotates clockwise from"),
+        (Turning(1, -70.0, 1.0), "motion undone .rotates counterclockwise from"),
         (Turning(moved=False), "farthest return[.]$"),
-        (Turning(told=("rings",)), "motion undone .turns clockwise from"),
+        (Turning(told=("rings",)), "motion undone .rotates clockwise from"),
     ],
 )
 def test_rows_of_a_vehicle_in_motion_are_those_of_its_rays(drive, said):
@@ -123,7 +123,7 @@ def test_of_frames_seconds_apart_no_motion_is_undone_and_no_clock_is_blamed():
     drive = Turning(told=("rings",))
     drive.times_s = 100.0 * drive.times_s
     said = build_rig_document(drive)["description"]
-    assert "motion within a turn not undone, for frames are 10 s apart (at most 0.25 s are needed" in said
+    assert "motion within a revolution not undone, frames are 10 s apart (at most 0.25 s are needed" in said
     drive.told_of = ("rings", "offsets_s")
     with pytest.raises(ValueError, match=r"the poses before and after .* are 10 s apart; .* over at most 1 s"):
         build_rig_document(drive)
@@ -345,7 +345,7 @@ def test_what_no_rig_can_be_made_of(tmp_path):
         build_rig_document(drive, lidar_models={"left": "velodyne"})
     (tmp_path / "sensor").mkdir()
     (tmp_path / "sensor" / "a.xyz").write_text("1 2 3\n")
-    with pytest.raises(ValueError, match="where sensor is mounted is not known"):
+    with pytest.raises(ValueError, match="the extrinsics of sensor are unknown"):
         build_rig_document(open_recording(tmp_path), lidar_models={"sensor": "velodyne_vlp16"})
     with pytest.raises(FileNotFoundError, match=r"egovehicle_SE3_sensor.feather: no such file"):
         build_rig_document(open_recording(layouts.argoverse2_log(drive, tmp_path / "av2")))

@@ -1,4 +1,4 @@
-"""The rig of a recording, as a document that can be drawn and simulated."""
+"""Rig of a recording, as a document that can be simulated."""
 
 import math
 import re
@@ -28,16 +28,9 @@ from torchcover.recordings.recording import (
 from torchcover.simulation.bodies import build_actor_mesh, create_body_shape
 from torchcover.simulation.camera_sensor import MOUNT_T_CAMERA
 from torchcover.simulation.lidar import LidarModel
+from torchcover.simulation.motion_compensation import undo_motion_compensation
 from torchcover.simulation.rig import Rig
-from torchcover.simulation.scan_estimate import estimate_scan, undo_motion_compensation
-
-# What is on a roof reaches so far above the highest LiDAR.
-ABOVE_SENSOR_M = 0.2
-# Scans that are looked at, evenly spread.
-SCANS = 5
-# As in the built-in rigs of cameras; no data set tells the depth that a camera gives.
-CAMERA = {"stride": 4, "min_range_m": 0.1, "max_range_m": 200.0}
-ASSUMED = "assumed: depth from 0.1 to 200 m in every fourth pixel"
+from torchcover.simulation.scan_estimate import estimate_scan
 
 
 def build_rig_document(
@@ -47,138 +40,197 @@ def build_rig_document(
     lidar_models: Mapping[str, str] | None = None,
     raw_images: bool = False,
 ) -> dict[str, Any]:
-    """Make a rig of what a recording knows of its sensors, and of what these saw.
+    """Build a rig from the calibrations of a recording and from its scans.
 
-    Mounts and cameras are those of its calibrations. A LiDAR scans as its model does, or as its scans look.
+    Extrinsics and cameras are from the calibrations. The scan pattern of a LiDAR is that of its model, or is estimated
+    from its scans.
 
     Args:
         recording: The recording.
-        sensor_names: LiDARs that are wanted; all if not given.
-        lidar_models: Name of a LiDAR -> a built-in `LidarModel`, or the path of one.
-        raw_images: Whether cameras have the distortion of their lenses where the data set ships undistorted images;
-            by default they are the cameras of the released images.
+        sensor_names: LiDARs of the rig; all if None.
+        lidar_models: Built-in `LidarModel`, or the path of one, for the name of a LiDAR.
+        raw_images: Whether cameras have the lens distortion of the raw images, if the data set provides undistorted
+            images; by default, cameras are those of the provided images.
 
     Returns:
-        The keys of a valid rig; its description says where each number is from.
+        Content of a valid rig; its description names the source of each number.
 
     Raises:
         OSError: A file is missing.
-        ValueError: An unknown sensor or model, a LiDAR whose place is not known or whose points do not lie in rows, or
-            raw images of a recording that knows no other lenses than those of its images.
+        ValueError: An unknown sensor or model, a LiDAR without extrinsics or whose points do not lie in rows, or raw
+            images of a recording that has no other lenses than those of its images.
     """
     lidar_models = lidar_models or {}
-    wanted = tuple(recording.sensors) if sensor_names is None else tuple(sensor_names)
-    unknown = [name for name in (*wanted, *lidar_models) if name not in recording.sensors]
-    if unknown:
+    lidar_names = tuple(recording.sensors) if sensor_names is None else tuple(sensor_names)
+    unknown_names = [name for name in (*lidar_names, *lidar_models) if name not in recording.sensors]
+    if unknown_names:
         raise ValueError(
-            f"{recording.path}: no LiDAR {', '.join(unknown)}; the recording has {', '.join(recording.sensors)}"
+            f"{recording.path}: no LiDAR {', '.join(unknown_names)}; the recording has {', '.join(recording.sensors)}"
         )
-    known = recording.read_calibrations() if isinstance(recording, CalibratedRecording) else SensorCalibrations("", {})
-    cameras = _raw_cameras(recording) if raw_images else known.cameras
-    told, documents = [], []
-    for name in wanted:
-        document, said = _lidar(recording, name, known, lidar_models.get(name))
-        documents.append(document)
-        told.append(f"{name}: {said}.")
-    documents += [_camera(camera) for camera in cameras]
+    calibrations = SensorCalibrations("", {})
+    if isinstance(recording, CalibratedRecording):
+        calibrations = recording.read_calibrations()
+    cameras = read_raw_cameras(recording) if raw_images else calibrations.cameras
+    sentences, sensors = [], []
+    for name in lidar_names:
+        sensor, source = build_lidar_document(recording, name, calibrations, lidar_models.get(name))
+        sensors.append(sensor)
+        sentences.append(f"{name}: {source}.")
+    sensors += [build_camera_document(camera) for camera in cameras]
     if cameras:
-        images = "raw" if raw_images else "released"
         names = ", ".join(camera.name for camera in cameras)
-        told.append(f"{names}: lenses and mounts as calibrated, of the {images} images; {ASSUMED}.")
-    source = f" Calibrations: {known.source}." if known.source else ""
+        sentences.append(
+            f"{names}: lenses and mounts as calibrated, of the {'raw' if raw_images else 'released'} images; assumed: "
+            "depth from 0.1 to 200 m in every fourth pixel."
+        )
+    source = f" Calibrations: {calibrations.source}." if calibrations.source else ""
     rig = {
         "name": re.sub(r"\W+", "_", recording.path.resolve().stem).strip("_") or "recording",
-        "description": f"The sensors of the recording {recording.path}.{source} {' '.join(told)}",
-        "sensors": documents,
+        "description": f"Sensors of the recording {recording.path}.{source} {' '.join(sentences)}",
+        "sensors": sensors,
     }
     Rig.model_validate(rig)
     return rig
 
 
-def _raw_cameras(recording: Recording) -> tuple[Calibration, ...]:
+def read_raw_cameras(recording: Recording) -> tuple[Calibration, ...]:
+    """Read the cameras of raw images.
+
+    Args:
+        recording: The recording.
+
+    Returns:
+        Their calibrations.
+
+    Raises:
+        ValueError: The recording has no other lenses than those of its images.
+    """
     if not isinstance(recording, UndistortedRecording):
         raise ValueError(
-            f"{recording.path}: this recording knows one model of each lens, that of its images; leave out --raw-images"
+            f"{recording.path}: this recording has one model of each lens, that of its images; leave out --raw-images"
         )
     return recording.read_raw_cameras()
 
 
 def build_ego_box(recording: Recording, vehicle: str | Path) -> BoundingBox:
-    """The body of the vehicle that recorded something, and what is mounted on it.
+    """Build the box of a recording's vehicle with its sensors.
 
-    `vehicle` is a built-in one, the YAML file of one or a mesh file; or `x0,x1,y0,y1,z0,z1`, the sides of the body in
-    metres of the vehicle frame.
+    Args:
+        recording: The recording; sensors on the roof are included if it has their extrinsics.
+        vehicle: A built-in vehicle, the YAML file of one, a mesh file, or `x0,x1,y0,y1,z0,z1`, the sides of the body in
+            meters of the vehicle frame.
+
+    Returns:
+        The box in the vehicle frame.
+
+    Raises:
+        ValueError: Invalid sides.
     """
     sides = str(vehicle).split(",")
     if len(sides) > 1:
         try:
-            x0, x1, y0, y1, z0, z1 = map(float, sides)
+            x0, x1, y0, y1, z0, z1 = (float(side) for side in sides)
             return BoundingBox((x0, y0, z0), (x1, y1, z1))
         except ValueError as error:
-            raise ValueError(f"vehicle {vehicle}: x0,x1,y0,y1,z0,z1 in metres are needed, x0 < x1: {error}") from error
-    ego = BoundingBox.from_points(build_actor_mesh("vehicle", create_body_shape(vehicle)).vertices_m)
-    mounts = recording.read_calibrations().mounts if isinstance(recording, RosBag) else {}
-    top_m = max([ego.upper_m[2], *(float(mount[2, 3]) + ABOVE_SENSOR_M for mount in mounts.values())])
-    return BoundingBox((*ego.lower_m[:2], GROUND_CLEARANCE_M), (*ego.upper_m[:2], top_m))
+            raise ValueError(f"vehicle {vehicle}: x0,x1,y0,y1,z0,z1 in meters are needed, x0 < x1: {error}") from error
+    housing_height_m = 0.2  # a LiDAR reaches this far above its origin
+    body_box = BoundingBox.from_points(build_actor_mesh("vehicle", create_body_shape(vehicle)).vertices_m)
+    top_m = body_box.upper_m[2]
+    if isinstance(recording, RosBag):
+        for vehicle_T_sensor in recording.read_calibrations().mounts.values():
+            top_m = max(top_m, float(vehicle_T_sensor[2, 3]) + housing_height_m)
+    return BoundingBox((*body_box.lower_m[:2], GROUND_CLEARANCE_M), (*body_box.upper_m[:2], top_m))
 
 
-def _lidar(recording: Recording, name: str, known: SensorCalibrations, model: str | None) -> tuple[dict[str, Any], str]:
-    """The keys of a LiDAR, and where they are from."""
-    count = min(SCANS, len(recording.key_frames))
-    chosen = [
-        recording.key_frames[position] for position in np.linspace(0, len(recording.key_frames) - 1, count, dtype=int)
-    ]
-    mount = known.mounts.get(name)
-    mounted = "mount as calibrated"
-    if mount is None:
-        mount, mounted = recording.read_scan(name, chosen[0]).vehicle_T_sensor, "mount as recorded"
-    if mount is None:
+def build_lidar_document(
+    recording: Recording, name: str, calibrations: SensorCalibrations, model: str | None, max_scans: int = 5
+) -> tuple[dict[str, Any], str]:
+    """Build the content of one LiDAR.
+
+    Args:
+        recording: The recording.
+        name: Name of the LiDAR.
+        calibrations: Calibrations of the recording.
+        model: LiDAR model; estimated from scans if None.
+        max_scans: Number of scans for the estimate, evenly distributed over the recording.
+
+    Returns:
+        Content of the LiDAR, and the sources of its numbers.
+
+    Raises:
+        ValueError: The extrinsics are unknown, or the points do not lie in rows.
+    """
+    num_scans = min(max_scans, len(recording.key_frames))
+    positions = np.linspace(0, len(recording.key_frames) - 1, num_scans, dtype=int)
+    frames = [recording.key_frames[position] for position in positions]
+    vehicle_T_sensor, source = calibrations.mounts.get(name), "mount as calibrated"
+    if vehicle_T_sensor is None:
+        vehicle_T_sensor, source = recording.read_scan(name, frames[0]).vehicle_T_sensor, "mount as recorded"
+    if vehicle_T_sensor is None:
         raise ValueError(
-            f"{recording.path}: where {name} is mounted is not known, for its clouds are in the vehicle frame; a plain "
-            "folder says it in frames.yaml (vehicle_T_sensor)"
+            f"{recording.path}: the extrinsics of {name} are unknown, because its clouds are in the vehicle frame; a "
+            "plain folder has them in frames.yaml (vehicle_T_sensor)"
         )
+    lidar: dict[str, Any] = {"type": "lidar", "name": name}
     if model is not None:
         LidarModel.load(model)
-        return {"type": "lidar", "name": name, "mount": _pose(mount), "model": model}, f"{mounted}; scans as {model}"
-    clouds, lasers, undone = undo_motion_compensation(recording, name, chosen, mount)
-    found = estimate_scan(clouds, lasers)
-    if found is None:
+        return {**lidar, "mount": build_pose_document(vehicle_T_sensor), "model": model}, f"{source}; scans as {model}"
+    scans, lasers, compensation = undo_motion_compensation(recording, name, frames, vehicle_T_sensor)
+    scan = estimate_scan(scans, lasers)
+    if scan is None:
         raise ValueError(
-            f"{recording.path}: the points of {name} do not lie in rows that can be told apart; name its model (see "
+            f"{recording.path}: the points of {name} do not lie in rows that can be distinguished; name its model (see "
             f"`torchcover list`): --lidar {name}=MODEL"
         )
-    mount = mount @ build_transform(
-        convert_euler_to_rotation(found.center_azimuth_deg, 0.0, 0.0), [0.0, 0.0, found.origin_height_m]
+    rotation = convert_euler_to_rotation(scan.center_azimuth_deg, 0.0, 0.0)
+    vehicle_T_sensor = vehicle_T_sensor @ build_transform(rotation, [0.0, 0.0, scan.origin_height_m])
+    if scan.origin_height_m:
+        source += f", origin of its rays {scan.origin_height_m:+.2f} m higher"
+    source += (
+        f"; estimated from {num_scans} scan{'s' * (num_scans > 1)}: {len(scan.elevations_deg)} rows (with returns), "
+        f"{scan.num_columns:,} columns, the range of the farthest return"
     )
-    mounted += f", its rays' origin {found.origin_height_m:+.2f} m higher" if found.origin_height_m else ""
+    if compensation:
+        source += f"; {compensation}"
     pattern = {
-        "elevations_deg": [round(float(elevation), 3) + 0.0 for elevation in found.elevations_deg],
-        "horizontal_fov_deg": round(found.horizontal_fov_deg, 3),
-        "columns": found.num_columns,
-        "max_range_m": math.ceil(found.max_range_m * 10) / 10,
+        "elevations_deg": [round(float(elevation), 3) + 0.0 for elevation in scan.elevations_deg],
+        "horizontal_fov_deg": round(scan.horizontal_fov_deg, 3),
+        "columns": scan.num_columns,
+        "max_range_m": math.ceil(scan.max_range_m * 10) / 10,
     }
-    return {"type": "lidar", "name": name, "mount": _pose(mount), **pattern}, (
-        f"{mounted}; estimated from {count} scan{'s' * (count > 1)}: {len(found.elevations_deg)} rows (those that "
-        f"returned anything), {found.num_columns:,} columns, the range of the farthest return"
-        + (undone and f"; {undone}")
-    )
+    return {**lidar, "mount": build_pose_document(vehicle_T_sensor), **pattern}, source
 
 
-def _camera(camera: Calibration) -> dict[str, Any]:
-    assert camera.vehicle_T_camera is not None  # recordings give it
+def build_camera_document(camera: Calibration) -> dict[str, Any]:
+    """Build the content of one camera; its depth is assumed as in the built-in rigs.
+
+    Args:
+        camera: Calibration with extrinsics.
+
+    Returns:
+        Content of the camera.
+
+    Raises:
+        ValueError: The extrinsics are missing.
+    """
+    if camera.vehicle_T_camera is None:
+        raise ValueError(f"camera {camera.name!r}: the extrinsics are missing from its calibration")
     lens = {} if camera.model == "pinhole" else {"lens": camera.model, "coefficients": list(camera.coefficients)}
     return {
         "type": "camera",
         "name": camera.name,
-        "mount": _pose(np.asarray(camera.vehicle_T_camera) @ invert(MOUNT_T_CAMERA)),
+        "mount": build_pose_document(np.asarray(camera.vehicle_T_camera) @ invert(MOUNT_T_CAMERA)),
         **{key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy")},
         **lens,
-        **CAMERA,
+        "stride": 4,
+        "min_range_m": 0.1,
+        "max_range_m": 200.0,
     }
 
 
-def _pose(vehicle_T_sensor: Matrix) -> dict[str, float]:
+def build_pose_document(vehicle_T_sensor: Matrix) -> dict[str, float]:
+    """Build the content of a pose from a (4, 4) matrix."""
     yaw, pitch, roll = convert_rotation_to_euler(vehicle_T_sensor[:3, :3])
     x, y, z = vehicle_T_sensor[:3, 3]
-    keys = ("x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg")
-    return {key: round(float(value), 6) + 0.0 for key, value in zip(keys, (x, y, z, yaw, pitch, roll), strict=True)}
+    values = {"x_m": x, "y_m": y, "z_m": z, "yaw_deg": yaw, "pitch_deg": pitch, "roll_deg": roll}
+    return {key: round(float(value), 6) + 0.0 for key, value in values.items()}
