@@ -124,6 +124,11 @@ def test_examples_without_output_run(code, namespace, blank_maps):
 
 def iterate_commands():
     """Yield the words of every shell command, up to the first redirection, as test parameters."""
+    for page in PAGES:
+        for command in re.findall(r"`(torchcover [^`]+)`", page.read_text(encoding="utf-8")):
+            words = shlex.split(command.partition("\\|")[0])
+            if len(words) > 2 and "--help" not in words and not words[1].startswith("--"):
+                yield pytest.param(words, id=f"{page.name} {' '.join(words)}"[:80])
     for block in iterate_blocks("console"):
         for line in re.sub(r"\\\n", " ", block.values[0]).splitlines():
             if line.startswith("$ "):
