@@ -53,7 +53,7 @@ def test_a_scenario_is_drawn_in_the_frame_of_the_ego(torchcover, worlds, drawn):
     assert (ahead.category, far.category) == ("box", "far")
     np.testing.assert_allclose(sorted(ahead.outline_m[:, 0].round(6)), [18.0, 18.0, 22.0, 22.0])
     np.testing.assert_allclose(sorted(ahead.outline_m[:, 1].round(6)), [4.0, 4.0, 6.0, 6.0])
-    assert drawn["title"] == "yard, step 3"
+    assert drawn["title"] == "yard, frame 3"
     # The rig saw the actor, where it is drawn.
     sensor = drawn["sensor_points"]
     on_actor = sensor[sensor[:, 2] > 0.1]
