@@ -56,7 +56,7 @@ COMMAND = (
 OFTEN = """
 import sys
 from torchcover.evaluation import checkpoint
-checkpoint.EVERY_S, checkpoint.MOST_TIME = 0.05, 1.0
+checkpoint.CheckpointManager.params = checkpoint.CheckpointParams(interval_s=0.05, max_time_share=1.0)
 from torchcover.cli.app import main
 main()
 """

@@ -107,11 +107,11 @@ def test_a_run_goes_on_with_the_same_question_only(evaluate, worlds):
     ("options", "message"),
     [
         (["--region", "1,2,3,4"], "--region 1,2,3,4: NAME:x0,x1,y0,y1 is needed"),
-        (["--region", "a:1,2,3"], "--region a:1,2,3: 4 numbers x0,x1,y0,y1 in metres are needed"),
+        (["--region", "a:1,2,3"], "--region a:1,2,3: 4 numbers x0,x1,y0,y1 in meters are needed"),
         (["--region", "a:1,2,3,x"], "--region a:1,2,3,x: 4 numbers"),
         (["--region", "a:2,1,0,1"], "regions.a.x_m: the lower bound must be below the upper one; got 2 to 1 m"),
         (["--region", "a:nan,1,0,1"], "regions.a.x_m.0: a finite number"),
-        (["--region", "a:0,1,0,1", "--region", "a:0,2,0,1"], "the name 'a' is given already"),
+        (["--region", "a:0,1,0,1", "--region", "a:0,2,0,1"], "the name 'a' is repeated"),
         (["--region", "a:0,0.1,0,1"], "region 'a' holds no cell center; use smaller cells than 0.5 m"),
         (["--regions", "nowhere.yaml"], "nowhere.yaml"),
     ],
@@ -185,7 +185,7 @@ def test_the_paper_s_reference_has_bands_over_z(evaluate, worlds):
     assert json.loads((worlds / "out" / "summary.json").read_text())["band_frame"] == "vehicle"
     code, _, errors = evaluate("--reference", "paper", "--set", "band_frame=ground")
     assert (code, len(errors.strip().splitlines())) == (2, 1)
-    assert "band_frame ground: the paper's reference has bands over z of the vehicle; leave it out" in errors
+    assert "band_frame ground: the paper reference has height bands of the vehicle frame; omit it" in errors
 
 
 def test_a_recording_keeps_the_heights(torchcover, worlds):

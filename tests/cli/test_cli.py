@@ -292,7 +292,7 @@ def test_too_few_steps_for_errors_are_told_and_a_recording_has_no_reference_sens
         (["evaluate", "front_roof_128", "--num-rays", "0"], "--num-rays"),
         (
             ["evaluate", "--frames", "recording", "--num-rays", "9"],
-            "reference, rays and frame_interval_s are for simulations",
+            "reference, num_rays and frame_interval_s are for simulations",
         ),
         (["evaluate", "--frames", "recording", "--reference", "paper"], "a recording has `recorded` or `accumulated`"),
         (["evaluate", "--frames", "recording", "--reference", "accumulated"], "has no times of its scans"),
@@ -301,10 +301,10 @@ def test_too_few_steps_for_errors_are_told_and_a_recording_has_no_reference_sens
             ["evaluate", "--frames", "recording", "--reference", "recorded", "--set", "recording.window_s=1"],
             "recorded reference has none",
         ),
-        (["evaluate", "front_roof_128", "--sensors", "roof"], "--sensors: for a recording, which --frames gives"),
+        (["evaluate", "front_roof_128", "--sensors", "roof"], "--sensors: only for a recording, which --frames names"),
         (
             ["evaluate", "front_roof_128", "--set", "recording.units=mm"],
-            "recording.units: for a recording, which --frames",
+            "recording.units: only for a recording, which --frames",
         ),
         (
             ["evaluate", "--frames", "recording", "--set", "recording.time_offset_s=3"],
@@ -375,7 +375,7 @@ def test_list_names_everything_built_in_and_what_it_is_made_of(torchcover):
         assert not said.keys() & of_kind.keys()
         said |= of_kind
     assert said["nuscenes_cameras"].startswith("6 cameras  The six cameras of the nuScenes cars (Renault Zoe)")
-    assert said["velodyne_vlp16"].startswith("16 rows, 100 m   Velodyne VLP-16.")
+    assert said["velodyne_vlp16"].startswith("16 channels, 100 m   Velodyne VLP-16.")
     assert said["courtyard"].startswith("static")
 
 
@@ -386,7 +386,7 @@ def test_list_with_a_word_prints_what_has_it_and_all_that_is_said_of_it(torchcov
     code, _, said = torchcover("list", "no such thing")
     assert (code, said) == (
         2,
-        "torchcover: nothing built in with 'no such thing'; torchcover list prints all there is\n",
+        "torchcover: nothing built in contains 'no such thing'; `torchcover list` prints all names\n",
     )
 
 
@@ -396,6 +396,13 @@ def test_version_and_help(torchcover):
     code, printed, _ = torchcover("evaluate", "--help")
     assert code == 0
     assert "--set" in printed
+
+
+def test_help_of_evaluate_fits_on_one_screen(torchcover, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "120")
+    lines = torchcover("evaluate", "--help")[1].splitlines()
+    assert len(lines) <= 50
+    assert max(len(line) for line in lines) <= 120
 
 
 def test_it_is_a_module_too():
@@ -419,8 +426,8 @@ def test_help_loads_none_of_the_heavy_libraries():
 @pytest.mark.parametrize(
     ("error", "told"),
     [
-        (MemoryError("cuda:0: the search among 7 points"), "(cuda:0: the search among 7 points); ask for less"),
-        (torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 7.00 GiB.\nGPU 0 ..."), "7.00 GiB.); ask"),
+        (MemoryError("cuda:0: the search among 7 points"), "(cuda:0: the search among 7 points); reduce the size"),
+        (torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 7.00 GiB.\nGPU 0 ..."), "7.00 GiB.); reduce"),
     ],
 )
 def test_out_of_memory_on_a_gpu_ends_in_one_line_and_keeps_what_was_measured(
@@ -435,6 +442,6 @@ def test_out_of_memory_on_a_gpu_ends_in_one_line_and_keeps_what_was_measured(
     monkeypatch.setattr("torchcover.coverage.sums.nearest", search)
     code, _, complaints = torchcover("evaluate", "--frames", recording, "--set", "cell_m=4", "--out", tmp_path / "out")
     assert code == 2
-    assert complaints.splitlines()[-1].startswith("torchcover: there is not enough memory (")
+    assert complaints.splitlines()[-1].startswith("torchcover: not enough memory (")
     assert told in complaints.splitlines()[-1]
     assert Coverage.load(tmp_path / "out" / "coverage.npz").counts["num_frames"] == 2

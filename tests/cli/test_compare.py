@@ -207,7 +207,7 @@ def test_what_is_not_in_a_recording_is_told_with_what_is(torchcover, recording, 
     ("arguments", "message"),
     [
         ([], "which rig?"),
-        (["front_roof_128"], "at least two rigs are needed; got front_roof_128 only"),
+        (["front_roof_128"], "at least two rigs are needed; got only front_roof_128"),
         (["front_roof_128", "no_such_rig"], "neither a .yaml file nor one of the built-in rigs; is "),
         (["front_roof_128", "none.yaml"], "none.yaml: no such file"),
         (["front_roof_128", "front_roof_64", "--scenario", "moon"], "one of the built-in scenarios; is "),

@@ -16,7 +16,7 @@ def test_rigs_side_by_side_in_words_and_files(torchcover, worlds, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")  # so that no cell is folded
     (worlds / "two.yaml").write_text(SET)
     arguments = (
-        "--set",
+        "--encounters",
         worlds / "two.yaml",
         "--num-start-offsets",
         "2",
@@ -60,16 +60,16 @@ def test_rigs_side_by_side_in_words_and_files(torchcover, worlds, monkeypatch):
         (SET, ["--deceleration-mps2", "0"], "deceleration_mps2: m/s2 above 0"),
         (SET, ["--latency-s", "-1"], "latency_s: 0 to 10 seconds"),
         (SET, ["--latency-s", "300"], "latency_s: 0 to 10 seconds are needed; got 300, is that milliseconds?"),
-        (SET, ["--set", "crosing_like"], "is 'crossing_like' meant?"),
+        (SET, ["--encounters", "crosing_like"], "is 'crossing_like' meant?"),
         (SET, ["--animation", "a.png"], "an animation is a .gif or .mp4 file"),
-        (SET, ["--num-scenes", "16"], "--num-scenes: of no use with a set; leave it out"),
-        (SET, ["--max-ttc-s", "4"], "--max-ttc-s: of no use with a set"),
-        (SET, ["--scenario", "urban"], "--set: of no use with --scenario"),
+        (SET, ["--num-scenes", "16"], "--num-scenes: has no effect with a set; omit it"),
+        (SET, ["--max-ttc-s", "4"], "--max-ttc-s: has no effect with a set"),
+        (SET, ["--scenario", "urban"], "--encounters: has no effect with --scenario"),
     ],
 )
 def test_a_mistake_is_one_line(torchcover, worlds, text, arguments, message):
     (worlds / "two.yaml").write_text(text)
-    given = ("--set", worlds / "two.yaml", "--num-start-offsets", "1", "--vehicle", "suv", *arguments)
+    given = ("--encounters", worlds / "two.yaml", "--num-start-offsets", "1", "--vehicle", "suv", *arguments)
     ended, _, error = torchcover("encounter", worlds / "low.yaml", *given)
     assert ended == 2
     assert message in error.strip().splitlines()[-1]
@@ -79,14 +79,14 @@ def test_a_mistake_is_one_line(torchcover, worlds, text, arguments, message):
     ("arguments", "message"),
     [
         (["low.yaml", "--scenario", "courtyard"], "nothing moves in it"),
-        (["low.yaml", "--scenario", "urban", "--animation", "a.gif"], "--animation: of no use with --scenario"),
+        (["low.yaml", "--scenario", "urban", "--animation", "a.gif"], "--animation: has no effect with --scenario"),
         (
             ["low.yaml", "--scenario", "urban", "--num-start-offsets", "10"],
-            "--num-start-offsets: of no use with --scenario",
+            "--num-start-offsets: has no effect with --scenario",
         ),
-        (["low.yaml", "--frames", "drive"], "rigs: of no use with --frames, which has rigs and traffic of its own"),
-        (["--frames", "drive", "--scenario", "urban"], "--scenario: of no use with --frames"),
-        (["--frames", "drive", "--vehicle", "suv"], "--vehicle: of no use with --frames"),
+        (["low.yaml", "--frames", "drive"], "rigs: has no effect with --frames, which defines rigs and traffic"),
+        (["--frames", "drive", "--scenario", "urban"], "--scenario: has no effect with --frames"),
+        (["--frames", "drive", "--vehicle", "suv"], "--vehicle: has no effect with --frames"),
         (["--frames", "drive"], "drive"),
         ([], "rigs with different names are needed; got none"),
     ],

@@ -22,7 +22,7 @@ def test_several_scenarios_are_measured_apart_and_mixed(torchcover, worlds):
     ]
     code, printed, told = torchcover("compare", *rigs, *options, "--files", "numbers", "--resume")
     assert code == 0
-    assert told.count("checkpoint.npz is not there") == 2
+    assert told.count("checkpoint.npz does not exist") == 2
     assert "given, not drawn" in " ".join(printed.split())
     titles = [line.strip("─ \n") for line in printed.splitlines() if line.startswith("──")]
     assert titles == ["yard", "plain", "mixture"]
@@ -35,4 +35,4 @@ def test_several_scenarios_are_measured_apart_and_mixed(torchcover, worlds):
     assert not list(worlds.glob("out/*/checkpoint.npz"))
     code, _, told = torchcover("evaluate", rigs[0], "--scenario", "urban=1,urban=2")
     assert code == 2
-    assert told.strip() == "torchcover: scenario: one of urban, urban is given twice"
+    assert told.strip() == "torchcover: scenario: different names are needed (case is ignored); got urban, urban"

@@ -25,7 +25,7 @@ def test_a_recording_has_the_numbers_of_the_simulation(torchcover, worlds, tmp_p
     assert code == 0
     assert "No test targets in the near field: a recording" in " ".join(printed.split())
     code, _, told = torchcover("evaluate", "--frames", recording, "--set", "test_targets=child", "--out", read)
-    assert (code, "test_targets: not for recordings" in told) == (2, True)
+    assert (code, "test_targets are for simulations" in told) == (2, True)
     first, second = (Coverage.load(folder / "coverage.npz") for folder in (measured, read))
     assert first.average == second.average == "area"
     for name in ("radius", "detection", "observed_frames", "point_counts"):
@@ -55,7 +55,7 @@ def test_a_recording_that_was_ended_is_not_evaluated_and_gone_on_with(torchcover
     monkeypatch.setattr(writing, "_step", lambda *given: (given[1] == 1 and signal.raise_signal(2)) or step(*given))
     code, _, said = torchcover(*command, "--out", out)
     assert code == 130
-    assert said.endswith("torchcover: 1 of 3 frames are kept; go on by --resume\ntorchcover: interrupted\n")
+    assert said.endswith("torchcover: 1 of 3 frames are kept; continue with --resume\ntorchcover: interrupted\n")
     code, _, said = torchcover("evaluate", "--frames", out, "--set", "cell_m=8", "--out", worlds / "out")
     assert code == 2
     assert f"{out}: an incomplete recording with 1 frames; continue it with `torchcover record" in said

@@ -23,7 +23,7 @@ def test_a_run_goes_on_to_the_same_files(torchcover, worlds, monkeypatch, comman
     arguments = [*command, "--scenario", "yard.yaml", *SMALL]
     assert torchcover(*arguments, "--num-frames", 5, "--out", "whole")[0] == 0
     code, _, said = torchcover(*arguments, "--num-frames", 2, "--out", "parts", "--resume")
-    assert (code, "parts/checkpoint.npz is not there: the run starts with its first step" in said) == (0, True)
+    assert (code, "parts/checkpoint.npz does not exist: the run starts with its first frame" in said) == (0, True)
     code, _, said = torchcover(*arguments, "--num-frames", 5, "--out", "parts", "--resume")
     assert (code, "is not there" in said, "replaced" in said) == (0, False, False)
     assert files_of(worlds / "parts") == files_of(worlds / "whole")
@@ -33,7 +33,7 @@ def test_a_run_goes_on_to_the_same_files(torchcover, worlds, monkeypatch, comman
     assert "parts/checkpoint.npz: a checkpoint of another run: seed (0 there, 1 here); resume with the" in said
     (worlds / "parts" / "summary.json").unlink()  # as if it had been killed
     code, _, said = torchcover(*arguments, "--num-frames", 1, "--out", "parts")  # anew
-    assert (code, "parts/checkpoint.npz will be replaced; to go on from it, stop now" in said) == (0, True)
+    assert (code, "parts/checkpoint.npz will be replaced; to continue from it, stop now" in said) == (0, True)
     code, _, said = torchcover(*arguments, "--num-frames", 1, "--out", "parts")
     assert (code, "will be replaced" in said) == (0, False)  # the one before was complete
     assert files_of(worlds / "parts") != files_of(worlds / "whole")

@@ -53,7 +53,7 @@ def test_a_search_ends_with_its_gain_and_that_of_random_candidates(torchcover, s
     ("options", "message"),
     [
         (("--budget", "30"), "--budget: a time is needed, as in 90s, 30min or 2h; got '30'"),
-        (("--budget", "1h", "--num-evaluations", "3"), "one of them; both are given"),
+        (("--budget", "1h", "--num-evaluations", "3"), "one of them is needed; got both"),
         (("--num-evaluations", "3", "--sensor-model", "real"), "no LiDAR of the rig 'front_roof_32' has a range_at_10"),
         (("--budget", "0s"), "budget: got 0 s; give more than 0 s"),
         (("--budget", "0.00001s"), "is too short for two evaluations"),
@@ -86,7 +86,7 @@ def test_an_objective_that_no_result_has_is_one_line(torchcover, tmp_path, objec
 def test_a_choice_has_no_budget(torchcover, tmp_path, options):
     code, _, said = torchcover("search", CHOICE, "--out", tmp_path / "found", *options)
     assert code == 2
-    assert f"torchcover: {options[0]}: the candidates of this file are all looked at" in said
+    assert f"torchcover: {options[0]}: has no effect, because all candidates of this file are evaluated" in said
 
 
 def test_times():

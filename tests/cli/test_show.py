@@ -1,5 +1,6 @@
 """`torchcover show`: it finds what is meant, and draws it where it is."""
 
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -80,7 +81,8 @@ def test_a_mesh_and_the_vehicle_of_it_say_their_size_and_what_is_doubtful(torchc
         assert code == 0
         assert told in printed
         half_m = float(size.split()[2]) / 2  # a box of trimesh's is about the origin
-        assert f"Moved by x +0.00, y +0.00, z {half_m:+.2f} m: mounts are measured from the ground" in printed
+        moved = f"Moved by x +0.00, y +0.00, z {half_m:+.2f} m: mounting positions are relative to the ground"
+        assert moved in " ".join(printed.split())
         assert (tmp_path / "car.png").is_file()
         assert doubt in warned
         assert bool(warned) == bool(doubt)
@@ -101,14 +103,14 @@ def test_a_robot_of_urdf_becomes_a_vehicle_and_a_rig_that_can_be_shown(torchcove
     urdf.write_text(f"<robot name='bot'><link name='b'>{box}</link><gazebo reference='b'>{sensor}</gazebo></robot>")
     code, printed, _ = torchcover("robot", urdf, "--out", tmp_path / "bot")
     assert code == 0
-    assert "rig.yaml with 1 sensors; look at it: torchcover show" in " ".join(printed.split())
+    assert "rig.yaml with 1 sensors; plot it: torchcover show" in " ".join(printed.split())
     shown = torchcover("show", tmp_path / "bot" / "rig.yaml", "--out", tmp_path)
     assert shown[0] == 0
-    assert "No ray ends on the own vehicle." in shown[1]
+    assert "No ray hits the ego vehicle." in shown[1]
     urdf.write_text(f"<robot name='bot'><link name='b'>{box}</link></robot>")
     code, printed, _ = torchcover("robot", urdf, "--out", tmp_path / "none")
     assert code == 0
-    assert "no rig, for it has no sensor in a tag of Gazebo" in printed
+    assert "no rig: no Gazebo tag has a sensor" in printed
     code, _, error = torchcover("robot", urdf, "--package", "bot")
     assert (code, error.count("\n"), "--package bot: NAME=VALUE is needed" in error) == (2, 1, True)
 
@@ -319,7 +321,8 @@ def test_it_prints_where_the_numbers_of_a_rig_come_from(torchcover, tmp_path):
 
 
 def test_a_film_shows_what_follows(torchcover, worlds, monkeypatch):
-    monkeypatch.setattr(show, "FILM_S", 0.3)
+    select_frames = partial(show.select_animation_frames, duration_s=0.3)
+    monkeypatch.setattr(show, "select_animation_frames", select_frames)
     code, printed, _ = torchcover(
         "show",
         worlds / "yard.yaml",
@@ -337,9 +340,10 @@ def test_a_film_shows_what_follows(torchcover, worlds, monkeypatch):
             film.seek(number)
             seen.append(np.asarray(film.convert("RGB")))
         pace_s = film.info["duration"] / 1000
-    steps = show._steps_of_film(Scenario.load(worlds / "yard.yaml"), 1)
-    assert len(seen) == len(steps) >= 2
-    assert pace_s == pytest.approx(steps.step * Scenario.load(worlds / "yard.yaml").effective_time_step_s)
+    time_step_s = Scenario.load(worlds / "yard.yaml").effective_time_step_s
+    frame_indices = select_frames(time_step_s, 1)
+    assert len(seen) == len(frame_indices) >= 2
+    assert pace_s == pytest.approx(frame_indices.step * time_step_s)
     assert all((one != other).any() for one, other in pairwise(seen))
 
 

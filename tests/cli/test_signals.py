@@ -103,7 +103,7 @@ def test_one_between_two_rigs_leaves_a_paired_result(
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_one_that_is_sent_again_changes_nothing(torchcover, worlds, at_update, monkeypatch, number):
     """To the process and to its group, by the system and by the shell."""
-    monkeypatch.setattr(progress, "TOGETHER_S", 600.0)  # on a machine that is as slow as it likes
+    monkeypatch.setattr(progress._TerminationHandler, "repeat_interval_s", 600.0)  # on a machine that is as slow as it likes
     at_update(3, lambda: send(number, times=2))
     monkeypatch.setattr(DRAW, lambda *given, **more: (send(number), plot_side_by_side(*given, **more))[1])
     code, _, complaints = torchcover(*arguments(worlds))
@@ -145,14 +145,14 @@ def test_ctrl_c_again_ends_at_once_and_says_what_is_kept(worlds, at_update, monk
     out = worlds / "out"
     kept = ", ".join(str(out / name) for name in ("checkpoint.npz", "coverage", "summary.csv", "summary.json"))
     assert code == 130
-    assert said.splitlines()[-1] == f"torchcover: ended at once: kept is {kept}"
+    assert said.splitlines()[-1] == f"torchcover: stopped immediately: kept {kept}"
     assert steps_of(out) == ([2, 2], False, 0)
 
 
 def test_ctrl_c_again_does_not_wait_for_the_end_of_a_frame(worlds, at_update):
     at_update(1, lambda: (send(signal.SIGINT, times=2), time.sleep(60)))
     code, said = in_a_fork(worlds, worlds / "log")
-    assert (code, said.splitlines()[-1]) == (130, "torchcover: ended at once: nothing of this run is kept")
+    assert (code, said.splitlines()[-1]) == (130, "torchcover: stopped immediately: no file of this run is kept")
     assert not (worlds / "out" / "summary.json").exists()
 
 

@@ -45,7 +45,7 @@ def test_a_small_study_writes_tables_a_diagram_and_an_advice(torchcover, tmp_pat
     code, text, complaints = torchcover("study", "front_roof_32", "--scenario", "courtyard", *options, "--out", out)
     assert code == 0, complaints
     assert "…" not in text
-    for words in ("as given", "error after 8", "For 1 percentage point of every detection"):
+    for words in ("as given", "error after 8", "Standard error of 1 percentage point for every detection rate"):
         assert words in text
     assert (out / "work_precision.png").read_bytes()[:4] == b"\x89PNG"
     study = json.loads((out / "summary.json").read_text())

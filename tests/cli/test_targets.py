@@ -27,7 +27,7 @@ def call(torchcover, worlds):
 def test_what_is_seen_is_said_and_written(call, worlds):
     ended, printed, error = call("--target", "adult", "--scenario", worlds / "yard.yaml")
     assert (ended, error) == (0, "")
-    assert "dome sees adult" in " ".join(printed.split())
+    assert "dome: visibility of adult" in " ".join(printed.split())
     record = json.loads((worlds / "out" / "summary.json").read_text())
     assert list(record["files"]) == ["targets.csv", "targets.npz", "report.html", "targets.png"]
 
@@ -36,7 +36,7 @@ def test_what_is_seen_is_said_and_written(call, worlds):
     ("arguments", "message"),
     [
         (["--target", "moon"], "'moon' is neither"),
-        (["--raster", "1,2,3"], "--raster: x0,x1,y0,y1,step in metres"),
+        (["--raster", "1,2,3"], "--raster: x0,x1,y0,y1,spacing in meters"),
         (["--raster", "-1000,1000,-1000,1000,0.5"], "16,000,000 cells"),
         (["--heading", "up"], "--heading: narrow, wide or degrees"),
         (["--detection-points", "0"], "--detection-points"),

@@ -82,8 +82,7 @@ def path(tmp_path):
 
 @pytest.fixture
 def _at_every_step(monkeypatch):
-    monkeypatch.setattr(checkpoint, "EVERY_S", 0.0)
-    monkeypatch.setattr(checkpoint, "MOST_TIME", 1e9)
+    monkeypatch.setattr(checkpoint.CheckpointManager, "params", checkpoint.CheckpointParams(0.0, 1e9))
 
 
 def measured(source, path=None, *, seen=None, **settings):
@@ -278,7 +277,7 @@ class Odd(Seen):
     ("observer", "message"),
     [
         (Mute, "observer seen: a Mute without state_dict and load_state_dict, which a checkpoint needs"),
-        (Odd, "observer seen: its state_dict cannot be kept in a checkpoint: .* got set in it"),
+        (Odd, "observer seen: its state_dict cannot be saved in a checkpoint: .* got set in it"),
     ],
 )
 def test_an_observer_that_cannot_be_kept_is_refused_before_the_run(frame_of, path, observer, message):
@@ -363,7 +362,7 @@ def test_a_damaged_checkpoint_is_named(frame_of, path):
         with pytest.raises(BadFileError, match=r"checkpoint\.npz: "):
             measured(Drive(frame_of), path, num_frames=3)
     np.savez(path, header=np.array("{}"))
-    with pytest.raises(BadFileError, match="checkpoint format None; this torchcover reads format 2"):
+    with pytest.raises(BadFileError, match="checkpoint format None; this torchcover reads format 3"):
         measured(Drive(frame_of), path, num_frames=3)
 
 
@@ -380,5 +379,5 @@ def test_an_edited_checkpoint_is_refused(frame_of, path):
         for comment in (b"", seal):
             with zipfile.ZipFile(path, "a") as archive:
                 archive.comment = comment
-            with pytest.raises(BadFileError, match="it was edited, or is damaged; begin anew"):
+            with pytest.raises(BadFileError, match="the file was edited or is damaged; start again"):
                 measured(Drive(frame_of), path, num_frames=3)

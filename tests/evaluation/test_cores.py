@@ -14,7 +14,7 @@ from torchcover.evaluation import cpu_cores as module
 from torchcover.evaluation import evaluate, measurement
 from torchcover.evaluation.cpu_cores import compute_num_workers, count_cores, set_threads, warn_about_spinning
 
-SAID = (*module.WAITING, "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+SAID = (*module.WAIT_VARIABLES, "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
 
 @pytest.fixture
@@ -22,9 +22,9 @@ def nothing_said(monkeypatch):
     for name in SAID:
         monkeypatch.setenv(name, "")  # what was there comes back
         monkeypatch.delenv(name)
-    module._warn_once.cache_clear()
+    module._warn_about_spinning_once.cache_clear()
     yield monkeypatch
-    module._warn_once.cache_clear()
+    module._warn_about_spinning_once.cache_clear()
 
 
 @pytest.mark.parametrize(
@@ -50,7 +50,7 @@ def test_a_container_has_the_cores_that_it_is_given(tmp_path, monkeypatch, files
     assert count_cores() == expected
 
 
-@pytest.mark.parametrize("said", [{}, {"OMP_NUM_THREADS": "7"}, *({name: "active"} for name in module.WAITING)])
+@pytest.mark.parametrize("said", [{}, {"OMP_NUM_THREADS": "7"}, *({name: "active"} for name in module.WAIT_VARIABLES)])
 def test_the_command_line_says_what_the_environment_does_not(nothing_said, said):
     for name, value in said.items():
         nothing_said.setenv(name, value)
@@ -88,7 +88,7 @@ def test_it_points_at_the_line_of_the_user(nothing_said, monkeypatch):
     assert [one.filename for one in said] == [__file__]
 
 
-@pytest.mark.parametrize("said", [None, *module.WAITING])
+@pytest.mark.parametrize("said", [None, *module.WAIT_VARIABLES])
 def test_who_does_not_is_told_nothing(nothing_said, said):
     if said:
         nothing_said.setenv(said, "0")

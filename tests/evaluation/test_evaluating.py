@@ -252,16 +252,16 @@ def test_settings_have_one_form_whatever_they_are_given_as():
 @pytest.mark.parametrize(
     ("settings", "error", "message"),
     [
-        ({"num_frames": 0}, ValueError, "steps: at least 1 is needed; got 0"),
-        ({"num_frames": -1}, ValueError, "steps: at least 1 is needed; got -1"),
-        ({"thresholds_m": "0.4"}, TypeError, "thresholds_m: metres are needed, as in 0.4"),
+        ({"num_frames": 0}, ValueError, "num_frames: at least 1 is needed; got 0"),
+        ({"num_frames": -1}, ValueError, "num_frames: at least 1 is needed; got -1"),
+        ({"thresholds_m": "0.4"}, TypeError, "thresholds_m: meters are needed, as in 0.4"),
         ({"target_error": 0.1}, TypeError, "target error: numbers with their units"),
         ({"aggregations": Maximum()}, TypeError, "aggregations: names such as maximum"),
         ({"aggregations": "minimum"}, ValueError, "aggregation minimum: one of maximum"),
-        ({"only_detection": True}, ValueError, "only_detection: for simulations; a recording has all its points"),
-        ({"only_detection": True, "redundancy": True}, ValueError, "only_detection: there are no radii"),
-        ({"only_detection": True, "target_error": "0.02m"}, ValueError, "only_detection: there are no radii"),
-        ({"only_detection": True, "thresholds_m": ()}, ValueError, "there has to be a threshold"),
+        ({"only_detection": True}, ValueError, "only_detection is for simulations; a recording contains all its points"),
+        ({"only_detection": True, "redundancy": True}, ValueError, "only_detection: excludes radii"),
+        ({"only_detection": True, "target_error": "0.02m"}, ValueError, "only_detection: excludes radii"),
+        ({"only_detection": True, "thresholds_m": ()}, ValueError, "needs a threshold"),
         ({"frames": [1, 2]}, TypeError, "FrameSource is needed; got list, which has no rigs, "),
     ],
 )

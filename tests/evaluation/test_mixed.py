@@ -162,19 +162,19 @@ def test_each_scenario_has_its_own_checkpoint(mixed, yards, tmp_path):
 @pytest.mark.parametrize(
     ("scenario", "message"),
     [
-        ("urban,highway,urban", "given twice"),
-        (["near.yaml", "Near.yaml"], "called alike"),
+        ("urban,highway,urban", "different names are needed .*; got urban, highway, urban"),
+        (["near.yaml", "Near.yaml"], "got near, Near"),
         ("urbn=0.5,highway", "'urbn' is neither a .yaml file nor .* is 'urban' meant"),
         ("urban=-1,highway=2", "0 or more are needed, not all 0; got urban=-1, highway=2"),
         ("urban=0,highway=0", "not all 0"),
         ("urban=nan,highway=1", "not all 0"),
         ("urban=much,highway=1", "got urban=much, highway=1"),
         ({"urban": None, "highway": 1}, "weights"),
-        ("urban=1,highway", "every one needs a weight, or none"),
+        ("urban=1,highway", "a weight for every scenario is needed, or none"),
         ("urban,", "no name"),
         ([], "no scenario"),
         (["urban", "nowhere"], "nowhere"),
-        (["urban", "."], "a folder; a recording is no scenario"),
+        (["urban", "."], "a folder; evaluate a recording on its own"),
     ],
 )
 def test_invalid_mixtures_are_rejected_before_the_run(scenario, message, monkeypatch):
@@ -196,7 +196,7 @@ def test_scenarios_with_different_regions_cannot_be_mixed(yards, monkeypatch):
         evaluate(RIGS[0], [near, "courtyard"], observers={"any": None}, **SMALL)
     with pytest.raises(ValueError, match="exclude each other"):
         evaluate(RIGS[0], [near, "courtyard"], frames="recording", **SMALL)
-    with pytest.raises(ValueError, match="one at a time here; got near, courtyard"):
+    with pytest.raises(ValueError, match="a single one is needed here; got near, courtyard"):
         _ = Settings(RIGS[0], [near, "courtyard"]).single_scenario
 
 

@@ -43,20 +43,20 @@ def test_the_first_sentence_is_the_share_of_places_near_the_vehicle(found):
     words = found.verdict[0]
     assert words.startswith("A child of 1.10 m is seen (5 points or more) at ")
     for rig, seen in found.targets.items():
-        near = seen.free & (seen.distance_m <= NEAR_M)
-        share = (near & (seen.least_points >= seen.hits)).sum() / near.sum()
+        near = seen.free_mask & (seen.distance_m <= NEAR_M)
+        share = (near & (seen.min_points >= seen.detection_points)).sum() / near.sum()
         assert f"at {100 * share:.0f} % " in words.partition(rig)[0]
     assert words.index(NASTY) < words.index("one")  # who sees most comes first
 
 
 def test_a_sensor_that_fails_takes_what_it_alone_sees(found):
     seen = found.targets[NASTY]
-    for k, (sensor, lost_m2) in enumerate(seen.losses_m2(NEAR_M).items()):
+    for k, (sensor, lost_m2) in enumerate(seen.compute_failure_effects_m2(NEAR_M).items()):
         others = np.delete(seen.sensor_points, k, axis=0).sum(axis=0)
-        lost = seen.free & (seen.distance_m <= NEAR_M) & (seen.points >= seen.hits) & (others < seen.hits)
+        lost = seen.free_mask & (seen.distance_m <= NEAR_M) & (seen.points >= seen.detection_points) & (others < seen.detection_points)
         assert seen.sensor_names[k] == sensor
         assert lost_m2 == pytest.approx(lost.sum() * 0.04)
-    worst = max(seen.losses_m2(NEAR_M).values())
+    worst = max(seen.compute_failure_effects_m2(NEAR_M).values())
     (words,) = [one for one in found.verdict if one.startswith(f"{NASTY} most needs")]
     assert f"{worst:.1f} m² more" in words
     assert "one has one sensor: without it, it sees nothing." in found.verdict
@@ -80,16 +80,16 @@ def test_sensors_that_cells_cannot_tell_apart_are_named_together():
 def test_a_plan_tells_by_how_many_sensors_each_place_is_seen(found):
     for seen in found.targets.values():
         plan = build_target_plan(seen)
-        assert ((plan.sensor_counts == -1) == ~seen.free).all()
-        assert ((plan.sensor_counts > 0) == seen.enough).all()
-        assert ((plan.sensor_counts > 1) == (seen.enough & (seen.least_sensors >= 2))).all()
-        near = seen.free & (seen.distance_m <= NEAR_M)
+        assert ((plan.sensor_counts == -1) == ~seen.free_mask).all()
+        assert ((plan.sensor_counts > 0) == seen.detected_mask).all()
+        assert ((plan.sensor_counts > 1) == (seen.detected_mask & (seen.min_sensors >= 2))).all()
+        near = seen.free_mask & (seen.distance_m <= NEAR_M)
         assert f"{(near & (plan.sensor_counts == 0)).sum():,} of {near.sum():,} places" in plan.title
 
 
 def test_what_was_asked_too_is_told(found):
     assert "Always detected in time: " in " ".join(found.verdict)
-    assert found.verdict[-1].startswith("Of the 1 bounds of needs: one keeps 1; ")
+    assert found.verdict[-1].startswith("Of the 1 bounds of needs: one meets 1; ")
 
 
 def test_the_page_answers_before_anything_else_and_names_are_text(found, tmp_path):
@@ -118,20 +118,20 @@ def test_areas_of_the_plan_are_those_of_its_cells(found):
 def test_a_budget_ends_the_traffic_once_it_has_intervals():
     found = report(ONE, "courtyard", num_frames=64, budget_s=0.01, num_workers=0)
     assert found.result.table.first_conditions.counts["num_frames"] == 8
-    assert found.verdict[-1] == "The budget was over after 8 of 64 steps of traffic."
+    assert found.verdict[-1] == "The time budget ended after 8 of 64 frames of traffic."
     assert not found.record["complete"]
 
 
 def test_of_too_few_steps_no_range_is_told_but_how_many_are_needed():
-    words = "Not enough frames for ranges: 4 form 4 blocks of time, intervals need about 11, which are 11 frames"
-    assert f"{words} (`--num-frames`)." in report(ONE, "courtyard", num_frames=4, num_workers=0).verdict
+    words = "4 frames form 4 blocks, 11 are needed (about 11 frames; `--num-frames`)."
+    assert f"Not enough frames for ranges: {words}" in report(ONE, "courtyard", num_frames=4, num_workers=0).verdict
 
 
 def test_where_no_place_is_free_nothing_is_claimed(found):
 
     seen = found.targets["one"]
     nowhere = replace(seen, state=np.full_like(seen.state, 2))
-    assert math.isnan(nowhere.share_seen(NEAR_M))
+    assert math.isnan(nowhere.compute_detected_share(NEAR_M))
     assert summarize_target_maps({"one": nowhere}) == ("No place within 2 m is free: what is seen there is unknown.",)
     assert "Not seen at 0 of 0 places" in build_target_plan(nowhere).title
 
@@ -140,7 +140,7 @@ def test_where_no_place_is_free_nothing_is_claimed(found):
     ({"rigs": []}, "1 to 8 rigs fit on a page; got 0"),
     ({"rigs": [ONE] * 1000}, "1 to 8 rigs fit on a page; got 1000"),
     ({"rigs": ONE, "budget_s": 0.0}, "seconds above 0 are needed; got 0.0"),
-    ({"rigs": ONE, "scenario": "urban,highway"}, "one kind of world is needed"),
+    ({"rigs": ONE, "scenario": "urban,highway"}, "a single scenario is needed"),
 ])  # fmt: skip
 def test_what_fits_on_no_page_is_refused(given, words):
     with pytest.raises(ValueError, match=re.escape(words)):

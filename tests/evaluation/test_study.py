@@ -60,7 +60,7 @@ def test_a_study_says_of_the_same_steps_what_an_evaluation_says(study):
             number = rows[one.region, one.band][one.quantity.key]
             assert (one.value == number.value) or math.isnan(one.value)
             if not math.isnan(number.error):
-                assert one.error.error_after(8) == pytest.approx(math.hypot(number.error, one.error.bias), rel=1e-9)
+                assert one.error.estimate_error(8) == pytest.approx(math.hypot(number.error, one.error.bias), rel=1e-9)
     assert all(one.difference is None and one.error.bias == 0.0 for one in first.numbers)
     assert any(one.difference.value != 0.0 for one in fewer.numbers)
 
@@ -73,11 +73,11 @@ def test_numbers_of_another_definition_are_not_held_against_each_other(study):
 
 def test_times_are_those_of_a_whole_command(study):
     first = study.trials[0]
-    assert first.estimate_duration_s(16, study.start_s) - first.estimate_duration_s(8, study.start_s) == pytest.approx(
-        first.seconds
+    assert first.estimate_duration_s(16, study.startup_s) - first.estimate_duration_s(8, study.startup_s) == pytest.approx(
+        first.duration_s
     )
-    assert study.start_s == pytest.approx(100.0 - first.seconds / 8)
-    assert first.processor_s > 0
+    assert study.startup_s == pytest.approx(100.0 - first.duration_s / 8)
+    assert first.cpu_s > 0
 
 
 def test_the_worst_awaited_number_decides_and_what_prints_no_error_is_not_recommended():
@@ -99,10 +99,11 @@ def test_another_setting_is_recommended_only_where_it_saves_a_fifth():
     assert biased.find_recommended(0.01)[0].options == ""
     assert Study(plan, [trial(math.nan)], 1.0).find_recommended(0.01) is None
     assert Study(plan, [trial(math.nan)], 1.0).format_recommendation(0.01) == (
-        "For 1 percentage point of every detection: not known, for 64 steps say no error of 20m ground."
+        "Standard error of 1 percentage point for every detection rate: unknown; 64 frames give no standard error of "
+        "20m ground."
     )
     assert Study(plan, [trial(0.04)], 1.0).format_recommendation(0.01) == (
-        "For 1 percentage point of every detection: front_roof_32 --set scenario=courtyard --set cell_m=4.0 "
+        "Standard error of 1 percentage point for every detection rate: front_roof_32 --set scenario=courtyard --set cell_m=4.0 "
         "--set num_rays=256 --num-frames=400 (401 s)."
     )
 

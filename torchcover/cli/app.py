@@ -1,4 +1,4 @@
-"""The command line as a program: its commands, and how they end."""
+"""Program `torchcover`: its commands, signals and exit codes."""
 
 import gc
 import io
@@ -16,46 +16,38 @@ from typing import Annotated, Any, TextIO
 
 import typer
 
-from torchcover.cli import commands
+from torchcover.cli import commands, recording_commands
 from torchcover.cli.evaluate import compare, evaluate
 from torchcover.evaluation.cpu_cores import set_threads
 from torchcover.evaluation.progress import handle_termination
 
 
 class ExitCode(IntEnum):
-    """Exit codes of every command; a signal ends a command with 128 + its number."""
+    """Exit codes of all commands; a signal ends a command with 128 + its number."""
 
     SUCCESS = 0
     REQUIREMENT_NOT_MET = 1
     USER_ERROR = 2
     INTERNAL_ERROR = 70  # EX_SOFTWARE of sysexits.h
-    BROKEN_PIPE = 128 + 13  # SIGPIPE, as of programs that this signal ends
+    BROKEN_PIPE = 128 + 13  # like a program that SIGPIPE ends
 
 
 EXIT_CODE_HELP = (
     "Exit codes: 0 success, or all requirements met; 1 a requirement is not met (`check`); 2 user error; "
-    "70 internal error; 141 the reader of the output is gone; 128 + n ended by signal n."
+    "70 internal error; 141 the reader of the output has closed it; 128 + n ended by signal n."
 )
 
 app = typer.Typer(
     name="torchcover",
-    help="Blind spots and coverage of a vehicle's sensor rig, measured against a random reference sensor.",
+    help="Coverage and blind spots of the sensor rig of a vehicle, relative to a reference sensor.",
     epilog=EXIT_CODE_HELP,
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
 )
 
-ENDED_BY = {"SIGINT": "interrupted", "SIGTERM": "terminated", "SIGHUP": "hung up"}
-
-# What is raised for any mistake in options and arguments. Typer names only descendants of it.
+# Base class of all errors in options and arguments, which typer does not export.
 USAGE_ERROR: type[Exception] = typer.BadParameter.__bases__[0]
-
-# A run holds hardly anything in circles: looking for these as often as Python does takes a fortieth of it.
-OBJECTS_BETWEEN_LOOKS = 100_000
-
-# Of what a mistake is told in: whoever gave a name of thousands does not want it back.
-MAX_LINE_CHARS = 2000
 
 
 def main() -> None:
@@ -63,14 +55,16 @@ def main() -> None:
     open_closed_streams()
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="replace")  # where there is no –, a result with ? is better than none
+            stream.reconfigure(errors="replace")  # characters outside the encoding become question marks
     set_threads()
-    gc.set_threshold(OBJECTS_BETWEEN_LOOKS)
+    # A run creates few reference cycles; searching them as often as by default takes 2.5 % of its time.
+    gc.set_threshold(100_000)
     signals: Sequence[int] = ()
     try:
-        with warnings.catch_warnings(), handle_termination(_on_signals()) as signals:
-            warnings.showwarning = _warn
-            warnings.filterwarnings("ignore", "The run was cut short", RuntimeWarning)  # the last line says it
+        with warnings.catch_warnings(), handle_termination(_make_signal_callback()) as signals:
+            warnings.showwarning = _print_warning
+            # The last line of the program reports the interruption.
+            warnings.filterwarnings("ignore", "The run was cut short", RuntimeWarning)
             code = run_command(sys.argv[1:])
             sys.stdout.flush()
     except (Exception, KeyboardInterrupt) as error:
@@ -84,10 +78,13 @@ def main() -> None:
 
 
 def run_command(arguments: Sequence[str]) -> int:
-    """Run the command of a command line; typer's own `main` would end a broken pipe with the code of a verdict.
+    """Run one command; in contrast to `main` of typer, a broken pipe has an exit code of its own.
+
+    Args:
+        arguments: Arguments of the program.
 
     Returns:
-        The exit code that the command asks for.
+        Exit code of the command.
     """
     command = typer.main.get_command(app)
     try:
@@ -99,28 +96,29 @@ def run_command(arguments: Sequence[str]) -> int:
 
 
 def resolve_exit_code(error: BaseException, signals: Sequence[int] = ()) -> tuple[int, str]:
-    """Decide how the program ends after an error.
+    """Determine exit code and message after an error.
 
     Args:
-        error: The exception that ended the command.
+        error: Exception that ended the command.
         signals: Numbers of the signals that arrived.
 
     Returns:
-        The exit code, and the line for stderr; empty if there is nothing to say.
+        The exit code, and the line for stderr, which may be empty.
     """
     if isinstance(error, KeyboardInterrupt):
-        first = signals[0] if signals else signal.SIGINT
-        return 128 + first, ENDED_BY[signal.Signals(first).name]
+        number = signal.Signals(signals[0] if signals else signal.SIGINT)
+        descriptions = {"SIGINT": "interrupted", "SIGTERM": "terminated", "SIGHUP": "hung up"}
+        return 128 + number, descriptions[number.name]
     if isinstance(error, BrokenPipeError):
         return ExitCode.BROKEN_PIPE, ""
-    message = _mistake(error)
+    message = _explain_user_error(error)
     if message is not None:
         return ExitCode.USER_ERROR, message
     return ExitCode.INTERNAL_ERROR, f"internal error ({type(error).__name__}: {error}); please report the lines above"
 
 
 def open_closed_streams() -> None:
-    """Connect closed standard streams to the null device; a file that is opened later would take their place."""
+    """Connect closed standard streams to the null device; otherwise files that are opened later take their numbers."""
     for number, (name, mode) in enumerate((("stdin", "r"), ("stdout", "w"), ("stderr", "w"))):
         try:
             os.fstat(number)
@@ -131,11 +129,11 @@ def open_closed_streams() -> None:
                 os.close(null)
             os.set_inheritable(number, True)
         if getattr(sys, name) is None:
-            setattr(sys, name, open(os.devnull, mode, encoding="utf-8"))  # noqa: SIM115  (for the whole process)
+            setattr(sys, name, open(os.devnull, mode, encoding="utf-8"))  # noqa: SIM115  (open as long as the process)
 
 
 def flush_or_discard(stream: TextIO) -> None:
-    """Write what a stream holds, or drop it if nobody can take it: Python would fail with code 120 at exit."""
+    """Flush a stream, or discard its buffer if it cannot be written; otherwise Python fails at exit with code 120."""
     try:
         stream.flush()
     except OSError:
@@ -143,43 +141,45 @@ def flush_or_discard(stream: TextIO) -> None:
             os.dup2(null.fileno(), stream.fileno())
 
 
-def _on_signals() -> Callable[[Sequence[int]], None]:
-    """What to do at once when a signal comes: with a terminal that is gone, and when Ctrl-C comes again."""
-    start_s, terminals = time.time(), [stream for stream in (1, 2) if os.isatty(stream)]
+def _make_signal_callback() -> Callable[[Sequence[int]], None]:
+    """Make a function that reacts at once to a closed terminal and to a second Ctrl-C."""
+    start_s = time.time()
+    terminals = [stream for stream in (1, 2) if os.isatty(stream)]
 
-    def told(arrived: Sequence[int]) -> None:
+    def handle_signal(arrived: Sequence[int]) -> None:
         name = signal.Signals(arrived[-1]).name
         if name == "SIGHUP":
-            nowhere = os.open(os.devnull, os.O_WRONLY)
-            for stream in terminals:  # or an error in writing would be the end
-                os.dup2(nowhere, stream)
+            null = os.open(os.devnull, os.O_WRONLY)
+            for stream in terminals:  # writing to a closed terminal would end the program
+                os.dup2(null, stream)
         if name == "SIGINT" and len(arrived) > 1:
-            from torchcover.files import list_written  # which nobody needs who asks for help
+            from torchcover.files import list_written  # imports NumPy, which `--help` does not need
 
-            files = list_written(start_s)
-            kept = f"kept is {', '.join(map(str, files))}" if files else "nothing of this run is kept"
-            cursor = "\x1b[?25h" * (2 in terminals)  # a bar hides it
-            os.write(2, f"{cursor}\ntorchcover: ended at once: {kept}\n".encode())
+            files = ", ".join(str(path) for path in list_written(start_s))
+            text = f"kept {files}" if files else "no file of this run is kept"
+            show_cursor = "\x1b[?25h" if 2 in terminals else ""  # a progress bar hides the cursor
+            os.write(2, f"{show_cursor}\ntorchcover: stopped immediately: {text}\n".encode())
             os._exit(128 + signal.SIGINT)
 
-    return told
+    return handle_signal
 
 
-def _mistake(error: BaseException) -> str | None:
-    """What a user did wrong, or lacks; None if it is a mistake of ours."""
+def _explain_user_error(error: BaseException) -> str | None:
+    """Explain an error of the user or of his installation; None for an internal error."""
     if isinstance(error, USAGE_ERROR):
-        # The typed name is private; of a choice it tells the kind of the exception, too.
+        # `str(error)` lacks the name of the option; pydantic adds the kind of its exception.
         return str(error.format_message()).replace("Value error, ", "")  # type: ignore[attr-defined]
     if isinstance(error, ValueError | TypeError | OSError):
         return str(error)
-    if isinstance(error, ImportError) and "pip install" in str(error):
-        return str(error)  # of an extra
+    if isinstance(error, ImportError) and "pip install" in str(error):  # a missing extra
+        return str(error)
     if isinstance(error, MemoryError):
-        return f"there is not enough memory ({error or 'for what was asked'}); ask for less, or use a larger machine"
-    if type(error).__name__ == "OutOfMemoryError":  # of torch, which most mistakes are told without
-        return f"there is not enough memory ({str(error).splitlines()[0]}); ask for less, or use --device cpu"
+        detail = f" ({error})" if str(error) else ""
+        return f"not enough memory{detail}; reduce the size of the run, or use a larger machine"
+    if type(error).__name__ == "OutOfMemoryError":  # of torch, which many errors occur without
+        return f"not enough memory ({str(error).splitlines()[0]}); reduce the size of the run, or use --device cpu"
     if isinstance(error, OverflowError | RecursionError):
-        return f"a number is too large, or a file nested too deeply ({error})"
+        return f"a number is too large, or a file is nested too deeply ({error})"
     return None
 
 
@@ -188,12 +188,12 @@ def handle_global_options(
     show_version: Annotated[bool, typer.Option("--version", help="Print the version and stop.")] = False,
     allow_links: Annotated[
         list[Path] | None,
-        typer.Option("--allow-links", help="Folder that links in a recording may lead to; may be repeated."),
+        typer.Option("--allow-links", help="Folder to which links in a recording may lead; may be repeated."),
     ] = None,
 ) -> None:
-    """Blind spots and coverage of a vehicle's sensor rig, measured against a random reference sensor."""
+    """Coverage and blind spots of the sensor rig of a vehicle, relative to a reference sensor."""
     if allow_links:
-        from torchcover.files import common_link_roots  # with NumPy, which help does not need
+        from torchcover.files import common_link_roots  # imports NumPy, which `--help` does not need
 
         common_link_roots[:] = allow_links
     if show_version:
@@ -203,28 +203,34 @@ def handle_global_options(
         raise typer.Exit
 
 
-for command in (commands.report, evaluate, compare, commands.study, commands.config, commands.record, commands.rig,
-                commands.robot, commands.calibrate, commands.world, commands.show, commands.targets, commands.check,
-                commands.encounter, commands.search):  # fmt: skip
-    app.command(epilog=EXIT_CODE_HELP)(command)
-app.command("list", epilog=EXIT_CODE_HELP)(commands.list_builtin)
+for command in (commands.report, evaluate, compare, commands.study, commands.config, recording_commands.record,
+                recording_commands.rig, recording_commands.robot, recording_commands.calibrate,
+                recording_commands.world, commands.show, commands.targets, commands.check, commands.encounter,
+                commands.search):  # fmt: skip
+    app.command(epilog=EXIT_CODE_HELP if command is commands.check else None)(command)
+app.command("list")(commands.list_builtin)
 
 
-def _warn(message: Warning | str, *_: Any, **__: Any) -> None:  # noqa: ANN401  (where in our code: of no use to a user)
-    typer.echo(f"torchcover: warning: {_one_line(str(message))}", err=True)
+def _print_warning(message: Warning | str, *_: Any, **__: Any) -> None:  # noqa: ANN401  (the line of code)
+    typer.echo(f"torchcover: warning: {_join_lines(str(message))}", err=True)
 
 
-def print_error(message: str) -> None:
-    """Print one line on stderr: none where no command was given, for which the help was printed."""
-    line = _one_line(message)
+def print_error(message: str, max_chars: int = 2000) -> None:
+    """Print one line on stderr; nothing for an empty message, as after `torchcover` without a command.
+
+    Args:
+        message: The message; line breaks become blanks.
+        max_chars: Maximum length; the remainder becomes "...".
+    """
+    line = _join_lines(message)
+    if len(line) > max_chars:
+        line = f"{line[:max_chars]} ..."
     if line:
-        with suppress(OSError):  # a terminal that is gone
-            typer.echo(
-                f"torchcover: {line if len(line) <= MAX_LINE_CHARS else line[:MAX_LINE_CHARS] + ' ...'}", err=True
-            )
+        with suppress(OSError):  # a closed terminal
+            typer.echo(f"torchcover: {line}", err=True)
 
 
-def _one_line(words: str) -> str:
-    from torchcover.files import escape_control_chars  # with NumPy, which nobody needs who asks for help
+def _join_lines(text: str) -> str:
+    from torchcover.files import escape_control_chars  # imports NumPy, which `--help` does not need
 
-    return escape_control_chars(" ".join(words.split()))
+    return escape_control_chars(" ".join(text.split()))

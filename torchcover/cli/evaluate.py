@@ -1,4 +1,4 @@
-"""The commands `evaluate` and `compare`; and what else is run and shared like them. Heavy things are imported late."""
+"""Commands `evaluate` and `compare`; heavy modules are imported when a command runs."""
 
 import inspect
 from contextlib import contextmanager, nullcontext
@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from torchcover.cli import options
-from torchcover.cli.options import build_setting_options, get_parameters, with_options
+from torchcover.cli.options import build_setting_options, format_option_name, get_parameters, with_options
 from torchcover.evaluation.config import load_config
 from torchcover.evaluation.settings import Settings
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Iterator, Sequence
 
     from torchcover.evaluation import Checkpoint, Ranks, Result
     from torchcover.evaluation.rerun_log import RerunLog
@@ -21,63 +21,54 @@ if TYPE_CHECKING:
     from torchcover.recordings import RecordingSettings
 
 
-def _measure(
+def _run_evaluation(
     rigs: list[str] | None,
-    at_least: int,
+    min_rigs: int,
     frames: Annotated[
-        Path | None, typer.Option(help="A recording instead of a simulation, of any layout in docs/recordings.md.")
+        Path | None, typer.Option(help="Recording instead of a simulation; formats: docs/recordings.md.")
     ] = None,
     sensors: Annotated[
         list[str] | None,
-        typer.Option(
-            help="With --frames: sensors of a rig, as in `roof,left`; once for each rig. Not given: those of the "
-            "recording."
-        ),
+        typer.Option(help="Sensors of the recording that form a rig, as in `roof,left`; may be repeated (all)."),
     ] = None,
     region: Annotated[
         list[str] | None,
-        typer.Option(
-            help="Region NAME:x0,x1,y0,y1 in metres, forward and to the left; may be repeated, and replaces those of "
-            "--regions.",
-        ),
+        typer.Option(help="Region NAME:x0,x1,y0,y1 in meters instead of --regions; may be repeated."),
     ] = None,
     out: options.OutOption = Path("out"),
     files: options.FilesOption = options.ALL_FILES,
     explain: Annotated[
-        bool, typer.Option("--explain", help="Say what was left out because the scene did not need it.")
+        bool, typer.Option("--explain", help="Print the work that was skipped because the scene did not need it.")
     ] = False,
     resume: Annotated[
-        bool,
-        typer.Option(
-            "--resume",
-            help="Go on from the checkpoint in --out, whatever ended that run, and keep it at the end, so that more "
-            "--num-frames can follow.",
-        ),
+        bool, typer.Option("--resume", help="Continue from the checkpoint in --out, also with more --num-frames.")
     ] = False,
     config: options.ConfigOption = None,
     assignments: options.AssignmentsOption = None,
-    **given: Any,  # noqa: ANN401
+    **option_values: Any,  # noqa: ANN401
 ) -> None:
-    """Measure rigs in the same frames, save what was measured, and print it."""
-    from torchcover.evaluation import evaluate as evaluate_
+    """Evaluate rigs in the same frames, save the result, and print it."""
+    from torchcover import evaluation
 
-    loaded = load_config(config, assignments or (), options.find_changed_settings(given))
+    loaded = load_config(config, assignments or (), options.find_changed_settings(option_values))
     settings = {**loaded.config.get_changed_settings(), "config_record": loaded.record}
     recording = open_frames(frames, settings, loaded.config.recording, sensors)
-    named = list(rigs or (() if recording is None else recording.rigs))
-    if len(named) == 1 and at_least > 1 and len(settings.get("weather") or ()) == 1:
-        settings["weather"] = ["clear", *settings["weather"]]
-    if 0 < len(named) * max(1, len(settings.get("weather") or ())) < at_least:
+    rig_names = list(rigs or (() if recording is None else recording.rigs))
+    weather = settings.get("weather") or ()
+    if len(rig_names) == 1 and min_rigs > 1 and len(weather) == 1:
+        weather = settings["weather"] = ["clear", *weather]
+    if 0 < len(rig_names) * max(1, len(weather)) < min_rigs:
         raise ValueError(
-            f"compare: at least two rigs are needed; got {named[0]} only (for one: `evaluate`; of a recording, each "
-            "--sensors makes a rig)"
+            f"compare: at least two rigs are needed; got only {rig_names[0]} (use `evaluate` for one; each --sensors "
+            "makes a rig of a recording)"
         )
-    if (asked := options.combine_regions(settings.get("regions"), region)) is not None:
-        settings["regions"] = asked
+    regions = options.combine_regions(settings.get("regions"), region)
+    if regions is not None:
+        settings["regions"] = regions
     with join_run(out) as ranks:
         log = open_rerun_log(loaded.config.rerun, ranks)
         checkpoint = prepare_checkpoint(out, Settings(scenario=settings.get("scenario")), resume=resume)
-        result = evaluate_(
+        result = evaluation.evaluate(
             rigs,
             frames=recording,
             checkpoint=checkpoint,
@@ -89,8 +80,8 @@ def _measure(
         save_and_print(result, out, ranks, log, checkpoint, file_kinds=files, explain=explain)
 
 
-MEASURING = [
-    *(each for each in get_parameters(_measure) if each.default is not inspect.Parameter.empty),
+EVALUATION_OPTIONS = [
+    *(item for item in get_parameters(_run_evaluation) if item.default is not inspect.Parameter.empty),
     *build_setting_options(
         "scenario",
         "vehicle",
@@ -107,81 +98,83 @@ MEASURING = [
         "num_workers",
     ),
 ]
-DEFAULTS = {each.name: each.default for each in MEASURING}
-# Options that measure nothing.
-SAVING = ("out", "files", "explain")
 
 
-@with_options(MEASURING)
+@with_options(EVALUATION_OPTIONS)
 def evaluate(
     rigs: Annotated[
         list[str] | None,
-        typer.Argument(
-            help="A rig, or several in the same frames: built-in names (see `list`) or YAML files. With --frames those "
-            "in it, all if not given."
-        ),
+        typer.Argument(help="Rigs: built-in names (see `list`) or YAML files; with --frames, rigs of it (all)."),
     ] = None,
-    **given: Any,  # noqa: ANN401
+    **option_values: Any,  # noqa: ANN401
 ) -> None:
-    """Measure the coverage of a rig, or of several: a table, maps, and files to compare and to log."""
-    _measure(rigs, 1, **given)
+    """Evaluate the coverage of one or more rigs: table, maps, and files for `compare`."""
+    _run_evaluation(rigs, 1, **option_values)
 
 
-@with_options(MEASURING)
+@with_options(EVALUATION_OPTIONS)
 def compare(
     rigs: Annotated[
         list[str] | None,
-        typer.Argument(
-            help="Rigs as in `evaluate`, two or more. Or coverage.npz files of runs over the same frames: nothing is "
-            "measured then."
-        ),
+        typer.Argument(help="Two or more rigs as in `evaluate`, or coverage.npz files of runs over the same frames."),
     ] = None,
-    **given: Any,  # noqa: ANN401
+    **option_values: Any,  # noqa: ANN401
 ) -> None:
-    """Compare rigs in the same frames: a table with the better values marked, maps side by side, differences."""
-    if saved := [rig for rig in rigs or () if Path(rig).suffix == ".npz"]:
-        _compare_saved(
-            saved, {each.name: each.default for each in MEASURING} | given, only=len(saved) == len(rigs or ())
-        )
-    else:
-        _measure(rigs, 2, **given)
-
-
-def _compare_saved(files: list[str], given: dict[str, Any], *, only: bool) -> None:
-    from torchcover.evaluation import compare
-
-    changed = [
-        f"--{name.replace('_', '-')}" for name, value in DEFAULTS.items() if given[name] != value and name not in SAVING
-    ]
-    if changed or not only:
+    """Compare rigs in the same frames: table with the better values marked, maps side by side, differences."""
+    files = [rig for rig in rigs or () if Path(rig).suffix == ".npz"]
+    if not files:
+        _run_evaluation(rigs, 2, **option_values)
+        return
+    defaults = {item.name: item.default for item in EVALUATION_OPTIONS}
+    values = {**defaults, **option_values}
+    changed = []
+    for name, value in values.items():
+        if value != defaults[name] and name not in ("out", "files", "explain"):
+            changed.append(format_option_name(name))
+    if changed or len(files) < len(rigs or ()):
         raise ValueError(
             f"{files[0]} is measured already: compare coverage files with each other, without "
             f"{', '.join(changed) or 'rigs'}; or `evaluate` rigs in the same frames first"
         )
-    with join_run(given["out"]) as ranks:
-        result = compare(files)
-        save_and_print(result, given["out"], ranks, file_kinds=given["files"], explain=given["explain"])
+    _compare_files(files, values["out"], file_kinds=values["files"], explain=values["explain"])
+
+
+def _compare_files(files: list[str], out: Path, *, file_kinds: str, explain: bool) -> None:
+    """Compare coverage files."""
+    from torchcover import evaluation
+
+    with join_run(out) as ranks:
+        save_and_print(evaluation.compare(files), out, ranks, file_kinds=file_kinds, explain=explain)
 
 
 def open_frames(
     frames: Path | None, settings: dict[str, Any], recording_settings: "RecordingSettings", sensors: list[str] | None
 ) -> "FrameSource | None":
-    """The recording of a command line, if it names one; `vehicle` and `reference` are taken out of the settings then.
+    """Open the recording of `--frames`.
+
+    Args:
+        frames: Folder or file of the recording; None: no recording.
+        settings: Settings of the run; `vehicle` and `reference` are removed from it if there is a recording.
+        recording_settings: Settings of the recording.
+        sensors: Texts with names of sensors, one for each rig; None: all sensors.
+
+    Returns:
+        The frames; None without a recording.
 
     Raises:
-        ValueError: Settings of a recording without one; what `open_recording` raises.
+        ValueError: Settings of a recording without one, or as in `open_recording`.
     """
     if frames is None:
         given = [f"recording.{name}" for name in recording_settings.model_fields_set]
         if sensors or given:
-            raise ValueError(f"{', '.join(given) or '--sensors'}: for a recording, which --frames gives")
+            raise ValueError(f"{', '.join(given) or '--sensors'}: only for a recording, which --frames names")
         return None
     from rich.markup import escape
 
     from torchcover.recordings import RecordedFrames, create_reference, merge_recording_settings
     from torchcover.report import Terminal
 
-    with Terminal(stderr=True).status(f"opening {escape(str(frames))}"):  # seconds, where there are 100,000 frames
+    with Terminal(stderr=True).status(f"opening {escape(str(frames))}"):  # takes seconds for 100,000 frames
         recording = options.open_recording(frames, recording_settings, settings.pop("vehicle", None))
     window_s = merge_recording_settings(frames, recording_settings).window_s
     return RecordedFrames(
@@ -192,33 +185,44 @@ def open_frames(
 
 
 def prepare_checkpoint(out: Path, settings: Settings, *, resume: bool) -> "Checkpoint":
-    """The checkpoint in the folder of the results; one line if it is not what the user may think."""
+    """Create the checkpoint in the folder of the results.
+
+    A line on stderr reports a missing checkpoint to resume, and an incomplete one that will be replaced.
+
+    Args:
+        out: Folder of the results.
+        settings: Settings with the scenario.
+        resume: Continue from the checkpoint.
+    """
     from torchcover.evaluation import Checkpoint
-    from torchcover.report import build_file_stems
+    from torchcover.files import SUMMARY, read_manifest
 
     checkpoint = Checkpoint(out / "checkpoint.npz", resume, keep=resume)
-    for each in (
-        map(checkpoint.in_folder, build_file_stems(list(settings.mixture))) if settings.mixture else [checkpoint]
-    ):
-        if resume and not each.path.exists():
-            typer.echo(f"torchcover: {each.path} is not there: the run starts with its first step", err=True)
-        elif each.path.exists() and not resume and not _complete(out):
-            typer.echo(
-                f"torchcover: {each.path} will be replaced; to go on from it, stop now and add --resume", err=True
-            )
+    is_complete = (read_manifest(out / SUMMARY) or {}).get("complete") is True
+    for path in _list_checkpoint_paths(checkpoint, list(settings.mixture or ())):
+        if resume and not path.exists():
+            typer.echo(f"torchcover: {path} does not exist: the run starts with its first frame", err=True)
+        elif path.exists() and not resume and not is_complete:
+            typer.echo(f"torchcover: {path} will be replaced; to continue from it, stop now and add --resume", err=True)
     return checkpoint
 
 
-def _complete(out: Path) -> bool:
-    """Whether the run of a folder has come to its end; nothing of it is lost if another one takes its place."""
-    from torchcover.files import SUMMARY, read_manifest
+def _list_checkpoint_paths(checkpoint: "Checkpoint", scenario_names: "Sequence[str]") -> list[Path]:
+    """List the files of a checkpoint: one for each of several scenarios."""
+    from torchcover.report import build_file_stems
 
-    return (read_manifest(out / SUMMARY) or {}).get("complete") is True
+    if not scenario_names:
+        return [checkpoint.path]
+    return [checkpoint.in_folder(stem).path for stem in build_file_stems(scenario_names)]
 
 
 @contextmanager
 def join_run(out: Path) -> "Iterator[Ranks | None]":
-    """The folder, kept for this run; and the processes that share it, the first of which writes."""
+    """Join the processes that share the run, and lock the folder of the results in the process that writes.
+
+    Args:
+        out: Folder of the results.
+    """
     from torchcover.evaluation import join_ranks
     from torchcover.files import lock_folder
 
@@ -227,7 +231,11 @@ def join_run(out: Path) -> "Iterator[Ranks | None]":
 
 
 def open_rerun_log(path: str | None, ranks: "Ranks | None") -> "RerunLog | None":
-    """The recording for the Rerun viewer, if there is to be one.
+    """Open the file for the Rerun viewer.
+
+    Args:
+        path: The file; None: no file.
+        ranks: Processes that share the run.
 
     Raises:
         ValueError: Several processes share the run, or rerun-sdk is not installed.
@@ -254,29 +262,36 @@ def save_and_print(
     file_kinds: str,
     explain: bool,
 ) -> None:
-    """Results are safe before anything is printed; then the command ends as the run did."""
+    """Save a result, print it, and raise the error that ended the run, if any.
+
+    Args:
+        result: The result.
+        out: Folder of the results.
+        ranks: Processes that share the run; only rank 0 saves and prints.
+        rerun_log: File for the Rerun viewer.
+        checkpoint: Checkpoint of the run; a complete run deletes it unless it is to be kept.
+        file_kinds: Files in addition to `summary.json`.
+        explain: Print the omissions.
+    """
     from torchcover.cli.printing import print_result
     from torchcover.evaluation import MixedResult
-    from torchcover.report import build_file_stems
 
+    is_mixed = isinstance(result, MixedResult)
+    results = result.scenario_results if isinstance(result, MixedResult) else {"": result}
     if ranks is None or ranks.rank == 0:
-        for world in result.scenario_results.values() if isinstance(result, MixedResult) else [result]:
-            if announcement := world.describe_rendering_cost(file_kinds):
+        for scenario_result in results.values():
+            if announcement := scenario_result.describe_rendering_cost(file_kinds):
                 typer.echo(f"torchcover: {announcement}", err=True)
         written = result.save(out, file_kinds=file_kinds)
         print_result(result, written, out, explain=explain)
-        if rerun_log is not None and not isinstance(result, MixedResult):
+        if rerun_log is not None and not is_mixed:
             rerun_log.finish(result)
-    if isinstance(result, MixedResult):  # complete, for else there was none
-        for each in (
-            map(checkpoint.in_folder, build_file_stems(list(result.scenario_results)))
-            if checkpoint and not checkpoint.keep
-            else ()
-        ):
-            each.path.unlink(missing_ok=True)
-        return
-    if result.run is None:
-        return
-    if checkpoint and result.run.is_complete and not checkpoint.keep:
-        checkpoint.for_rank(ranks.rank if ranks else 0).path.unlink(missing_ok=True)
-    result.run.raise_failure()
+    delete_checkpoint = checkpoint is not None and not checkpoint.keep
+    if is_mixed:  # an incomplete mixture has no result
+        if checkpoint is not None and delete_checkpoint:
+            for path in _list_checkpoint_paths(checkpoint, list(results)):
+                path.unlink(missing_ok=True)
+    elif result.run is not None:
+        if checkpoint is not None and delete_checkpoint and result.run.is_complete:
+            checkpoint.for_rank(ranks.rank if ranks else 0).path.unlink(missing_ok=True)
+        result.run.raise_failure()

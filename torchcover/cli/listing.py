@@ -1,41 +1,44 @@
-"""`torchcover list`."""
+"""Command `torchcover list`."""
 
 import re
 import shutil
 import sys
 import textwrap
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import typer
 
 from torchcover.simulation import load_builtin_documents
 
+Document = Mapping[str, Any]
+
 
 def print_builtin(search_text: str | None) -> None:
-    """Print what is built in: the names of each kind.
+    """Print what is built in.
 
     Args:
-        search_text: A kind: what each of it consists of, and its first sentence. Or only those with it in a column, and all
-            that is said of them.
+        search_text: None: the names of all kinds. A kind: its items with properties and first sentence of their
+            descriptions. Another text: items that contain it, with complete descriptions.
 
     Raises:
-        ValueError: There is none with that word.
+        ValueError: No item contains the text.
     """
     width = shutil.get_terminal_size().columns if sys.stdout.isatty() else None
-    kinds = {
-        "rigs": _sensors,
-        "scenarios": _traffic,
-        "lidars": _rows,
+    # Kind -> function that describes the properties of an item; None for a kind without properties.
+    kinds: dict[str, Callable[[Document], str] | None] = {
+        "rigs": _describe_sensors,
+        "scenarios": _describe_traffic,
+        "lidars": _describe_lidar,
         "vehicles": None,
-        "materials": lambda material: str(material["reflectivity"]),
+        "materials": _describe_material,
         "weather": None,
         "encounters": None,
         "requirements": None,
     }
-    found = False
-    for kind, what_of in kinds.items():
+    has_match = False
+    for kind, describe in kinds.items():
         if search_text in kinds and search_text != kind:
             continue
         documents = load_builtin_documents(kind)
@@ -45,45 +48,57 @@ def print_builtin(search_text: str | None) -> None:
             continue
         rows = []
         for name, document in documents.items():
-            cells = [name, what_of(document)] if what_of else [name]
+            cells = [name, describe(document)] if describe else [name]
             description = " ".join(document["description"].split())
-            if search_text == kind or search_text.lower() in " ".join((*cells, description)).lower():
-                rows.append((*cells, _first_sentence(description) if search_text == kind else description))
+            if search_text == kind:
+                rows.append((*cells, _get_first_sentence(description)))
+            elif search_text.lower() in " ".join((*cells, description)).lower():
+                rows.append((*cells, description))
         if rows:
-            typer.echo("\n".join((kind, *_lines(rows, width, one_line_each=search_text == kind))) + "\n")
-            found = True
+            lines = _format_rows(rows, width, is_shortened=search_text == kind)
+            typer.echo("\n".join((kind, *lines)) + "\n")
+            has_match = True
     if search_text is None:
-        typer.echo("What each of a kind is: torchcover list rigs; all that is said of one: torchcover list NAME")
-    elif not found:
-        raise ValueError(f"nothing built in with {search_text!r}; torchcover list prints all there is")
+        typer.echo("Items of a kind: torchcover list rigs; description of an item: torchcover list NAME")
+    elif not has_match:
+        raise ValueError(f"nothing built in contains {search_text!r}; `torchcover list` prints all names")
 
 
-def _lines(rows: list[tuple[str, ...]], width: int | None, *, one_line_each: bool) -> Iterator[str]:
-    """The rows under each other; what does not fit is cut off, or goes on in the last column."""
-    *short, _ = zip(*rows, strict=True)
-    widths = [max(map(len, cells)) for cells in short]
+def _format_rows(rows: list[tuple[str, ...]], width: int | None, *, is_shortened: bool) -> Iterator[str]:
+    """Format rows in columns; a description that does not fit is shortened to one line, or continues on the next."""
+    columns = list(zip(*rows, strict=True))[:-1]
+    widths = [max(len(cell) for cell in column) for column in columns]
     for *cells, description in rows:
-        before = "  ".join(("", *(f"{cell:{most}}" for cell, most in zip(cells, widths, strict=True)), ""))
-        room = max(20, width - len(before)) if width else max(1, len(description))
-        shown = f"{description[: room - 1]}…" if one_line_each and len(description) > room else description
-        yield textwrap.fill(shown, len(before) + room, initial_indent=before, subsequent_indent=" " * len(before))
+        padded = [f"{cell:{cell_width}}" for cell, cell_width in zip(cells, widths, strict=True)]
+        start = "  ".join(("", *padded, ""))
+        room = max(20, width - len(start)) if width else max(1, len(description))
+        text = f"{description[: room - 1]}…" if is_shortened and len(description) > room else description
+        yield textwrap.fill(text, len(start) + room, initial_indent=start, subsequent_indent=" " * len(start))
 
 
-def _sensors(rig: Mapping[str, Any]) -> str:
-    types = Counter(sensor["type"] for sensor in rig["sensors"])
-    words = {"lidar": "LiDAR", "camera": "camera"}
-    return ", ".join(f"{count} {words.get(kind, kind)}{'s' * (count > 1)}" for kind, count in types.items())
+def _describe_sensors(rig: Document) -> str:
+    labels = {"lidar": "LiDAR", "camera": "camera"}
+    counts = Counter(sensor["type"] for sensor in rig["sensors"])
+    items = []
+    for sensor_type, count in counts.items():
+        plural = "s" if count > 1 else ""
+        items.append(f"{count} {labels.get(sensor_type, sensor_type)}{plural}")
+    return ", ".join(items)
 
 
-def _traffic(scenario: Mapping[str, Any]) -> str:
+def _describe_traffic(scenario: Document) -> str:
     return f"{scenario['traffic']['type']} traffic" if "traffic" in scenario else "static"
 
 
-def _rows(lidar: Mapping[str, Any]) -> str:
-    rows = lidar["channels"] if "channels" in lidar else len(lidar["elevations_deg"])
-    return f"{rows} rows, {lidar['max_range_m']:g} m"
+def _describe_lidar(lidar: Document) -> str:
+    num_channels = lidar["channels"] if "channels" in lidar else len(lidar["elevations_deg"])
+    return f"{num_channels} channels, {lidar['max_range_m']:g} m"
 
 
-def _first_sentence(text: str) -> str:
-    # A full stop inside a number or an abbreviation is not followed by a blank and a capital.
+def _describe_material(material: Document) -> str:
+    return f"reflectivity {material['reflectivity']}"
+
+
+def _get_first_sentence(text: str) -> str:
+    # The full stop of a number or an abbreviation is not followed by a blank and a capital.
     return re.split(r"(?<=[.:;]) (?=[A-Z])", text, maxsplit=1)[0]

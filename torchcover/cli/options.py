@@ -1,4 +1,4 @@
-"""Options: those of `evaluate`, as its settings declare them, and those that the command line adds."""
+"""Options of commands: settings of `evaluate`, and those that only the command line has."""
 
 import inspect
 import os
@@ -20,16 +20,17 @@ if TYPE_CHECKING:
 Command = Callable[..., None]
 
 
-# The groups of `--help`, by the names of options; what is in none stands under "Options".
-PANELS = {
-    "What": "scenario frames sensors vehicle sensor_model weather target heading encounters requirements "
-    "redundancy thresholds_m threshold_m detection_points reference average num_start_offsets num_scenes",
-    "Where": "regions region raster",
-    "How exact": "num_frames num_rays frame_interval_s seed target_error budget num_evaluations num_held_out_scenes frames_per_scene",
+# Headings of `--help` in their order, each with the names of its options; other options are below the last heading.
+OPTION_GROUPS = {
+    "Scene and sensors": "scenario frames sensors vehicle sensor_model weather target heading encounters requirements "
+    "num_start_offsets num_scenes",
+    "Measurement": "regions region raster thresholds_m threshold_m detection_points reference average redundancy",
+    "Accuracy": "num_frames num_rays frame_interval_s seed target_error budget num_evaluations num_held_out_scenes "
+    "frames_per_scene",
     "Output": "out files explain animation",
-    "How it runs": "config assignments device num_workers resume",
+    "Execution": "config assignments device num_workers resume",
 }
-# Types of options that are no texts.
+# Types of options that are not derived from their defaults.
 OPTION_TYPES: dict[str, Any] = {
     "num_frames": int,
     "num_rays": int,
@@ -42,90 +43,114 @@ OPTION_TYPES: dict[str, Any] = {
     "sensor_model": Literal["ideal", "real"],
     "average": Literal["area", "cells"],
 }
-PANEL_OF = {name: panel for panel, names in PANELS.items() for name in names.split()}
 
 
 def with_options(parameters: Sequence[inspect.Parameter]) -> Callable[[Command], Command]:
-    """A decorator: the command has these options, too, and gets those that were given as keywords.
+    """Decorate a command so that it has more options, which it receives as keyword arguments.
 
     Args:
         parameters: From `build_setting_options`, `build_criterion_options` or `get_parameters`.
+
+    Returns:
+        A decorator. The command receives only those of these options that have a value.
     """
-    shared = {each.name for each in parameters}
+    added = {parameter.name for parameter in parameters}
 
     def decorate(command: Command) -> Command:
-        def called(**given: Any) -> None:  # noqa: ANN401  (as typer has read them)
-            command(**{name: value for name, value in given.items() if name not in shared or value is not None})
+        def call_with_values(**values: Any) -> None:  # noqa: ANN401  (values of typer)
+            command(**{name: value for name, value in values.items() if name not in added or value is not None})
 
-        own = [each for each in get_parameters(command) if each.kind is not inspect.Parameter.VAR_KEYWORD]
-        update_wrapper(called, command)
-        for each in (*own, *parameters):
-            for said in get_args(each.annotation)[1:]:
-                said.rich_help_panel = PANEL_OF.get(each.name, said.rich_help_panel)
-        # What typer reads.
-        called.__signature__ = inspect.Signature([*own, *parameters])  # type: ignore[attr-defined]
-        called.__annotations__ = {each.name: each.annotation for each in (*own, *parameters)}
-        return called
+        own = [item for item in get_parameters(command) if item.kind is not inspect.Parameter.VAR_KEYWORD]
+        keywords = [item.replace(kind=inspect.Parameter.KEYWORD_ONLY) for item in (*own, *parameters)]
+        all_parameters = sorted(keywords, key=_assign_group)
+        update_wrapper(call_with_values, command)
+        # Typer reads both attributes.
+        call_with_values.__signature__ = inspect.Signature(all_parameters)  # type: ignore[attr-defined]
+        call_with_values.__annotations__ = {item.name: item.annotation for item in all_parameters}
+        return call_with_values
 
     return decorate
 
 
+def _assign_group(parameter: inspect.Parameter) -> int:
+    """Set the heading of a parameter in `--help` and return the index of its group; arguments come first."""
+    for info in get_args(parameter.annotation)[1:]:
+        if isinstance(info, typer.models.OptionInfo):
+            for index, (heading, names) in enumerate(OPTION_GROUPS.items()):
+                if parameter.name in names.split():
+                    info.rich_help_panel = heading
+                    return index
+            return len(OPTION_GROUPS)
+    return -1
+
+
 def build_setting_options(*names: str) -> list[inspect.Parameter]:
-    """Options of settings of `EvaluateConfig`: their names there, with dashes for underscores."""
-    return [_parameter(name) for name in names]
+    """Build options of settings of `EvaluateConfig`, with the first sentence of their descriptions.
+
+    Args:
+        names: Names of the settings; an option has dashes for underscores.
+    """
+    options = []
+    for name in names:
+        field = EvaluateConfig.model_fields[name]
+        default = field.default if type(field.default) in (bool, int, str) else None
+        value_type: Any = OPTION_TYPES.get(name, str if default is None else type(default))
+        minimum = None
+        if value_type is int:
+            minimum = 0 if name in ("seed", "num_workers") else 1
+        help_text = shorten_help(field.description or "")
+        info = typer.Option(format_option_name(name), help=help_text, min=minimum)
+        annotation: Any = Annotated[value_type | None if default is None else value_type, info]
+        options.append(inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation))
+    return options
 
 
 def build_criterion_options() -> list[inspect.Parameter]:
-    """What `Criterion` declares."""
-    return _of_document(Criterion)
-
-
-def _of_document(document: type) -> list[inspect.Parameter]:
-    found = []
-    for name, said in document.__annotations__.items():
-        kind, words = get_args(said)
-        option = f"--{name.replace('_', '-')}"
-        annotation: Any = Annotated[kind, typer.Option(option, help=words)]
-        usual = getattr(document, name)
-        found.append(inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=usual, annotation=annotation))
-    return found
+    """Build options of the fields of `Criterion`."""
+    options = []
+    for name, annotation in Criterion.__annotations__.items():
+        value_type, description = get_args(annotation)
+        option: Any = Annotated[value_type, typer.Option(format_option_name(name), help=description)]
+        default = getattr(Criterion, name)
+        options.append(inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=option))
+    return options
 
 
 def get_parameters(command: Command) -> list[inspect.Parameter]:
-    """What a command takes."""
+    """Return the parameters of a command with resolved annotations."""
     hints = get_type_hints(command, include_extras=True)
-    return [each.replace(annotation=hints[each.name]) for each in inspect.signature(command).parameters.values()]
+    return [item.replace(annotation=hints[item.name]) for item in inspect.signature(command).parameters.values()]
+
+
+def format_option_name(name: str) -> str:
+    """Format the name of a setting as an option, as in `--num-frames`."""
+    return f"--{name.replace('_', '-')}"
 
 
 def shorten_help(description: str) -> str:
-    """The first sentence of a description; `torchcover config` has all of it."""
+    """Return the first sentence of a description; `torchcover config` prints all of it."""
     return description.partition(". ")[0].removesuffix(".") + "."
 
 
-def _parameter(name: str) -> inspect.Parameter:
-    field = EvaluateConfig.model_fields[name]
-    default = field.default if type(field.default) in (bool, int, str) else None
-    kind: Any = OPTION_TYPES.get(name, type(default) if default is not None else str)
-    minimum = 0 if name in ("seed", "num_workers") else 1 if kind is int else None
-    option = typer.Option(f"--{name.replace('_', '-')}", help=shorten_help(field.description or ""), min=minimum)
-    annotation: Any = Annotated[kind if default is not None else kind | None, option]
-    return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
-
-
 def check_out(folder: Path) -> Path:
-    """Find out before the run, not after it, whether its results can be written.
+    """Check before a run that its results can be written.
+
+    Args:
+        folder: Folder of the results, which may not exist yet.
+
+    Returns:
+        The folder.
 
     Raises:
-        ValueError: The folder, or the first of its parents that exists, is a file, a link to nothing, or may not be
-            written to.
+        ValueError: The folder, or the first of its parents that exists, is a file, a broken link, or not writable.
     """
-    nearest = next(place for place in (folder, *folder.absolute().parents) if os.path.lexists(place))
+    nearest = next(path for path in (folder, *folder.absolute().parents) if os.path.lexists(path))
     if not nearest.exists():
-        raise ValueError(f"--out {folder}: {nearest} is a link to what is not there")
+        raise ValueError(f"--out {folder}: {nearest} is a broken link")
     if not nearest.is_dir():
         raise ValueError(f"--out {folder}: {nearest} is a file, not a folder")
     if not os.access(nearest, os.W_OK):
-        raise ValueError(f"--out {folder}: {nearest} may not be written to; choose another folder")
+        raise ValueError(f"--out {folder}: {nearest} is not writable; choose another folder")
     return folder
 
 
@@ -135,48 +160,57 @@ def _check_files(files: str) -> str:
 
 
 RigArgument = Annotated[str, typer.Argument(help="Rig: a built-in name (see `list`) or a YAML file.")]
-ConfigOption = Annotated[
-    Path | None, typer.Option(help="YAML file of settings; `torchcover config` writes all of them with their defaults.")
-]
+RigsArgument = Annotated[list[str], typer.Argument(help="Rigs: built-in names (see `list`) or YAML files.")]
+ConfigOption = Annotated[Path | None, typer.Option(help="YAML file of settings; `torchcover config` prints all.")]
 AssignmentsOption = Annotated[
     list[str] | None,
-    typer.Option(
-        "--set",
-        help="KEY=VALUE: any setting of `torchcover config`, as in cell_m=0.5, or of the recording, as in "
-        "recording.units=mm; may be repeated, and wins over --config.",
-    ),
+    typer.Option("--set", help="KEY=VALUE of --config, as in cell_m=0.5 or recording.units=mm."),
 ]
 OutOption = Annotated[Path, typer.Option(help="Folder for the results.", callback=check_out)]
+FilesOption = Annotated[str, typer.Option(help="Kinds of files besides `summary.json`.", callback=_check_files)]
 ALL_FILES = ",".join(FILES)
-FilesOption = Annotated[
-    str, typer.Option(help="What to write beside `summary.json`: any of numbers, maps, page.", callback=_check_files)
-]
 
 
 def find_changed_settings(option_values: Mapping[str, Any]) -> dict[str, Any]:
-    """The options that differ from their defaults, as values of `EvaluateConfig`."""
-    fields = EvaluateConfig.model_fields
-    values = {name: str(value) if isinstance(value, Path) else value for name, value in option_values.items()}
-    values = {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
-    return {name: value for name, value in values.items() if value not in (None, fields[name].default)}
+    """Select the options that differ from their defaults, as values of `EvaluateConfig`.
+
+    Args:
+        option_values: Name of a setting -> value of its option.
+    """
+    changed = {}
+    for name, value in option_values.items():
+        converted = str(value) if isinstance(value, Path) else tuple(value) if isinstance(value, list) else value
+        if converted not in (None, EvaluateConfig.model_fields[name].default):
+            changed[name] = converted
+    return changed
 
 
 def load_recording_settings(assignments: Sequence[str] | None) -> "RecordingSettings":
-    """The settings of the recording that `--set recording.KEY=VALUE` gives, for commands that take no others.
+    """Load the settings of a recording for commands that have no other settings.
+
+    Args:
+        assignments: Values of `--set`, as in recording.units=mm.
 
     Raises:
-        ValueError: Another setting, or as `load_config`.
+        ValueError: A setting of something else, or as in `load_config`.
     """
-    if others := [text for text in assignments or () if not text.startswith("recording.")]:
-        raise ValueError(f"--set {others[0]}: here only settings of the recording, as in recording.units=mm")
+    for text in assignments or ():
+        if not text.startswith("recording."):
+            raise ValueError(f"--set {text}: this command only has settings of the recording, as in recording.units=mm")
     return load_config(None, assignments or ()).config.recording
 
 
-def open_recording(frames: Path, settings: "RecordingSettings", vehicle: str | None = None) -> "Recording":
-    """Open the recording that a command line names, with the body of its vehicle if that is given."""
-    from torchcover.recordings import open_recording as open_
+def open_recording(path: Path, settings: "RecordingSettings", vehicle: str | None = None) -> "Recording":
+    """Open the recording of a command line.
 
-    recording = open_(frames, settings)
+    Args:
+        path: Folder or file of the recording.
+        settings: Settings of the recording.
+        vehicle: Body of the ego vehicle; None: the recording defines it.
+    """
+    from torchcover import recordings
+
+    recording = recordings.open_recording(path, settings)
     if vehicle is not None:
         from torchcover.simulation.recorded_rig import build_ego_box
 
@@ -185,15 +219,18 @@ def open_recording(frames: Path, settings: "RecordingSettings", vehicle: str | N
 
 
 def combine_regions(regions_file: Path | None, regions: Sequence[str] | None) -> "RegionsOfInterest | None":
-    """The regions of interest of a command line; None if it names none.
+    """Combine `--regions` and `--region`.
 
     Args:
-        regions_file: YAML file of `RegionsOfInterest`; options replace its regions.
-        regions: NAME:x0,x1,y0,y1 each.
+        regions_file: YAML file of `RegionsOfInterest`; `--region` replaces its regions.
+        regions: Texts NAME:x0,x1,y0,y1.
+
+    Returns:
+        The regions of interest; None if there are none.
 
     Raises:
         FileNotFoundError: No such file.
-        ValueError: A text that cannot be read or makes no sense, or a name that is given twice.
+        ValueError: An invalid text or region, or a repeated name.
     """
     if regions_file is None and not regions:
         return None
@@ -204,31 +241,27 @@ def combine_regions(regions_file: Path | None, regions: Sequence[str] | None) ->
 
     content = {} if regions_file is None else RegionsOfInterest.load(regions_file).model_dump(exclude_unset=True)
     if regions:
-        sides = _named("--region", regions, ("x0", "x1", "y0", "y1"))
-        content["regions"] = {name: {"x_m": side[:2], "y_m": side[2:]} for name, side in sides.items()}
+        content["regions"] = {}
+    for text in regions or ():
+        name, bounds_m = _parse_region(text)
+        if name in content["regions"]:
+            raise ValueError(f"--region {text}: the name {name!r} is repeated; choose another")
+        content["regions"][name] = {"x_m": bounds_m[:2], "y_m": bounds_m[2:]}
     try:
         return RegionsOfInterest.model_validate(content)
     except ValidationError as error:
         raise ValueError(explain_document_error(error)) from error
 
 
-def _named(option: str, given: Sequence[str], bounds: Sequence[str]) -> dict[str, tuple[float, ...]]:
-    found: dict[str, tuple[float, ...]] = {}
-    for text in given:
-        name, colon, numbers = text.rpartition(":")
-        if not (colon and name):
-            raise ValueError(f"{option} {text}: NAME:{','.join(bounds)} is needed, in metres")
-        if name in found:
-            raise ValueError(f"{option} {text}: the name {name!r} is given already; choose another")
-        found[name] = _numbers(option, text, numbers, bounds)
-    return found
-
-
-def _numbers(option: str, text: str, numbers: str, bounds: Sequence[str]) -> tuple[float, ...]:
+def _parse_region(text: str) -> tuple[str, list[float]]:
+    """Parse NAME:x0,x1,y0,y1."""
+    name, _, numbers = text.rpartition(":")
+    if not name:
+        raise ValueError(f"--region {text}: NAME:x0,x1,y0,y1 is needed, in meters")
     try:
-        found = tuple(float(number) for number in numbers.split(","))
+        bounds_m = [float(number) for number in numbers.split(",")]
     except ValueError:
-        found = ()
-    if len(found) != len(bounds):
-        raise ValueError(f"{option} {text}: {len(bounds)} numbers {','.join(bounds)} in metres are needed")
-    return found
+        bounds_m = []
+    if len(bounds_m) != 4:
+        raise ValueError(f"--region {text}: 4 numbers x0,x1,y0,y1 in meters are needed")
+    return name, bounds_m

@@ -1,4 +1,4 @@
-"""What `torchcover search` does and prints."""
+"""Implementation of `torchcover search`."""
 
 import math
 from pathlib import Path
@@ -6,7 +6,7 @@ from typing import Any
 
 import typer
 
-from torchcover.cli.printing import print_files
+from torchcover.cli.printing import print_files, print_verdict
 from torchcover.evaluation.cpu_cores import compute_num_workers
 from torchcover.files import SUMMARY, lock_folder
 from torchcover.placement import (
@@ -24,10 +24,8 @@ from torchcover.placement.running import JOURNAL
 from torchcover.report import Terminal, print_page_tables
 from torchcover.simulation.documents import read_mapping
 
-CHOICE_KEY = "candidates"
-# Of a search, if nothing is given.
-BUDGET_S = 30 * 60.0
-FRAMES = 1000  # approximate number of frames that a search scores
+# Key that only a file of sensor candidates has.
+SELECTION_KEY = "candidates"
 
 
 def run_search_command(
@@ -38,48 +36,58 @@ def run_search_command(
     file_kinds: str,
     **settings: Any,  # noqa: ANN401  (those of `SearchPlan`)
 ) -> None:
-    """Search, write and print what was found: better values of what is free, or a choice of candidates.
+    """Run a search or a sensor selection, save the result and print it.
+
+    Args:
+        space_file: YAML file of the search space or of the candidates.
+        out: Folder of the results.
+        resume: Continue the search whose journal is in the folder.
+        file_kinds: Files in addition to `summary.json`.
+        settings: Arguments of `SearchPlan`.
 
     Raises:
-        ValueError: A space, an option or a budget that cannot be used.
-        FileNotFoundError: An unknown name or file.
+        ValueError: Invalid file, option or budget.
+        FileNotFoundError: Unknown name or file.
     """
-    find = _chosen if CHOICE_KEY in read_mapping(space_file) else _searched
-    settings = {
-        "num_workers": compute_num_workers(
-            FRAMES, settings.get("num_scenes", SearchPlan.num_scenes), sends_frames=False
-        ),
-        **settings,
-    }
+    run = _select if SELECTION_KEY in read_mapping(space_file) else _search
+    if "num_workers" not in settings:
+        num_scenes = settings.get("num_scenes", SearchPlan.num_scenes)
+        # A search scores about 1,000 frames.
+        settings["num_workers"] = compute_num_workers(1000, num_scenes, sends_frames=False)
     with lock_folder(out):
-        report = find(space_file, out, resume=resume, **settings).report
+        report = run(space_file, out, resume=resume, **settings).report
         written = report.save(out, files=file_kinds)
     print_page_tables(report.tables[:2])
     console = Terminal()
     print_files(written, out, console)
-    console.print(report.summary, markup=False, soft_wrap=True)
+    print_verdict([report.summary], console)
 
 
-def _searched(path: Path, out: Path, *, resume: bool, **settings: Any) -> SearchResult:  # noqa: ANN401
+def _search(path: Path, out: Path, *, resume: bool, **settings: Any) -> SearchResult:  # noqa: ANN401
+    """Search a space, for 30 minutes by default."""
     if settings["budget_s"] is None and settings["num_evaluations"] is None:
-        settings["budget_s"] = BUDGET_S
+        settings["budget_s"] = 30 * 60.0
     search = PlacementSearch(SearchSpace.load(path), SearchPlan(**settings))
     journal = out / JOURNAL
     if resume and not journal.exists():
-        typer.echo(f"torchcover: {journal} is not there: the search starts with its first candidate", err=True)
+        typer.echo(f"torchcover: {journal} does not exist: the search starts with its first candidate", err=True)
     elif not resume and journal.exists() and not (out / SUMMARY).exists():
-        typer.echo(f"torchcover: {journal} will be replaced; to go on from it, stop now and add --resume", err=True)
+        typer.echo(f"torchcover: {journal} will be replaced; to continue from it, stop now and add --resume", err=True)
     return run_search(search, out, resume=resume, progress=True)
 
 
-def _chosen(path: Path, out: Path, *, resume: bool, **settings: Any) -> SelectionResult:  # noqa: ANN401
-    asked = {
+def _select(path: Path, out: Path, *, resume: bool, **settings: Any) -> SelectionResult:  # noqa: ANN401
+    """Select sensors from candidates."""
+    unused = {
         "--budget": settings["budget_s"] is not None,
         "--num-evaluations": settings["num_evaluations"] is not None,
         "--resume": resume,
     }
-    if useless := [option for option, given in asked.items() if given]:
-        raise ValueError(f"{', '.join(useless)}: the {CHOICE_KEY} of this file are all looked at; leave it out")
+    given = [option for option, is_given in unused.items() if is_given]
+    if given:
+        raise ValueError(
+            f"{', '.join(given)}: has no effect, because all {SELECTION_KEY} of this file are evaluated; omit it"
+        )
     space, plan = SelectionSpace.load(path), SearchPlan(**settings | {"budget_s": math.inf})
     with make_common_frames(space, plan, plan.seed, plan.num_scenes) as frames:
         return run_selection(

@@ -1,4 +1,4 @@
-"""What `torchcover targets` does and prints."""
+"""Implementation of `torchcover targets`."""
 
 import math
 import warnings
@@ -25,14 +25,24 @@ def run_targets_command(
     file_kinds: str,
     **settings: Any,  # noqa: ANN401  (those of `map_target_visibility`)
 ) -> None:
-    """Survey a target, write and print what is seen.
+    """Map the visibility of a target, save the map and print a summary.
+
+    Args:
+        rig: Built-in name or YAML file.
+        target: Built-in name or file.
+        scenario: Built-in name or YAML file; None: flat ground.
+        raster: Text for `parse_raster`; None: the default positions.
+        heading: Text for `parse_heading`.
+        out: Folder of the results.
+        file_kinds: Files in addition to `summary.json`.
+        settings: Further arguments of `map_target_visibility`.
 
     Raises:
-        ValueError: An option or a file that cannot be used.
-        FileNotFoundError: An unknown name or file.
+        ValueError: Invalid option or file.
+        FileNotFoundError: Unknown name or file.
     """
     with lock_folder(out):
-        seen = map_target_visibility(
+        target_map = map_target_visibility(
             rig,
             target,
             scenario,
@@ -40,40 +50,56 @@ def run_targets_command(
             heading=parse_heading(heading),
             **settings,
         )
-        written = save_target_map(seen, out, Rig.load(rig).sensors, file_kinds=file_kinds)
-    _print(seen)
+        written = save_target_map(target_map, out, Rig.load(rig).sensors, file_kinds=file_kinds)
+    _print_map(target_map)
     print_files(written, out, Terminal())
-    print_verdict(summarize_target_maps({seen.rig: seen}), Terminal())
+    print_verdict(summarize_target_maps({target_map.rig: target_map}), Terminal())
 
 
 def parse_raster(text: str) -> Raster:
-    """The raster of `x0,x1,y0,y1,step`, in metres; up to a step larger, with a warning, if the step does not divide it.
+    """Parse a raster of positions; a side that is no multiple of the spacing becomes longer, with a warning.
+
+    Args:
+        text: `x0,x1,y0,y1,spacing` in meters.
+
+    Returns:
+        The raster.
 
     Raises:
-        ValueError: Other than five numbers, or what `Raster` refuses.
+        ValueError: Not five numbers, or as in `Raster`.
 
     Example:
         >>> parse_raster("-4,4,-3,3,0.5").shape
         (12, 16)
     """
     try:
-        x0, x1, y0, y1, step_m = map(float, text.split(","))
+        x0, x1, y0, y1, spacing_m = (float(number) for number in text.split(","))
     except ValueError as error:
-        raise ValueError(f"--raster: x0,x1,y0,y1,step in metres, as in -8,8,-5,5,0.2; got {text!r}") from error
-    if 0 < step_m < math.inf and math.isfinite(x0 + x1 + y0 + y1):
-        most_x, most_y = (low + step_m * math.ceil((high - low) / step_m - 1e-6) for low, high in ((x0, x1), (y0, y1)))
-        if max(abs(most_x - x1), abs(most_y - y1)) > 1e-6:
-            told = f"--raster {text}: no whole number of steps; it ends at x {most_x:g} and y {most_y:g} m instead"
-            warnings.warn(told, stacklevel=2)
-            x1, y1 = most_x, most_y
-    return Raster((x0, x1), (y0, y1), step_m)
+        raise ValueError(
+            f"--raster: x0,x1,y0,y1,spacing in meters is needed, as in -8,8,-5,5,0.2; got {text!r}"
+        ) from error
+    if 0 < spacing_m < math.inf and math.isfinite(x0 + x1 + y0 + y1):
+        # The tolerance keeps a side that is a multiple of the spacing except for rounding.
+        end_x = x0 + spacing_m * math.ceil((x1 - x0) / spacing_m - 1e-6)
+        end_y = y0 + spacing_m * math.ceil((y1 - y0) / spacing_m - 1e-6)
+        if max(abs(end_x - x1), abs(end_y - y1)) > 1e-6:
+            warnings.warn(
+                f"--raster {text}: the sides are no multiples of the spacing; the raster ends at x = {end_x:g} and "
+                f"y = {end_y:g} m instead",
+                stacklevel=2,
+            )
+            x1, y1 = end_x, end_y
+    return Raster((x0, x1), (y0, y1), spacing_m)
 
 
 def parse_heading(text: str) -> Heading:
-    """`narrow`, `wide`, or degrees.
+    """Parse the heading of a target.
+
+    Args:
+        text: `narrow`, `wide`, or a yaw in degrees.
 
     Raises:
-        ValueError: Anything else.
+        ValueError: Another text.
     """
     if text in ("narrow", "wide"):
         return text  # type: ignore[return-value]  # one of the two literals
@@ -83,14 +109,20 @@ def parse_heading(text: str) -> Heading:
         raise ValueError(f"--heading: narrow, wide or degrees are needed; got {text!r}") from error
 
 
-def _print(seen: TargetMap) -> None:
+def _print_map(target_map: TargetMap) -> None:
+    """Print the tables of a map."""
     console = Terminal()
     console.print(
-        f"{seen.rig} sees {seen.target} ({seen.target_description}), in {seen.scenario}, sensor model {seen.sensor_model}",
+        f"{target_map.rig}: visibility of {target_map.target} ({target_map.target_description}) in "
+        f"{target_map.scenario}, sensor model {target_map.sensor_model}",
         markup=False,
         soft_wrap=True,
     )
-    worst = build_positions_table(seen.find_worst_positions(), "The places with the fewest points, 1 m apart")
-    print_page_tables([build_sides_table(seen), worst])
-    if unknown := seen.counts["surface_share_unobserved"]:
-        console.print(f"{unknown:,} places show no surface to any random place: their share is unknown.")
+    worst = build_positions_table(
+        target_map.find_worst_positions(), "Positions with the fewest points, at least 1 m from each other"
+    )
+    print_page_tables([build_sides_table(target_map), worst])
+    if num_unobserved := target_map.counts["surface_share_unobserved"]:
+        console.print(
+            f"Surface share unknown at {num_unobserved:,} positions: the reference observed no surface of the target."
+        )

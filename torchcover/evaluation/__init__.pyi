@@ -33,8 +33,8 @@ from .scene_figures import plot_scenario as plot_scenario
 from .scene_figures import plot_vehicle_figure as plot_vehicle_figure
 from .settings import Settings as Settings
 from .study import Study as Study
-from .study import StudyPlan as StudyPlan
-from .study import Trial as Trial
+from .study_plan import StudyPlan as StudyPlan
+from .study_plan import Trial as Trial
 from .study import measure_error_against_time as measure_error_against_time
 from .target_error import ConvergenceStatus as ConvergenceStatus
 from .target_error import TargetError as TargetError

@@ -1,4 +1,4 @@
-"""Arguments that are declared once: as fields of a dataclass, which a function takes and is documented with."""
+"""Arguments that are declared once, as fields of a dataclass, and become the parameters of a function."""
 
 import inspect
 import textwrap
@@ -6,21 +6,23 @@ from collections.abc import Callable, Mapping
 from functools import update_wrapper
 from typing import Annotated, Any, Generic, ParamSpec, TypeVar, get_args, get_origin
 
-GivenT = TypeVar("GivenT")
+InputT = TypeVar("InputT")
 ValueT = TypeVar("ValueT")
-DocumentT = TypeVar("DocumentT")
+SettingsT = TypeVar("SettingsT")
 ReturnT = TypeVar("ReturnT")
 Arguments = ParamSpec("Arguments")
 
 
-class ConvertedField(Generic[GivenT, ValueT]):
-    """A field of a dataclass that takes more forms than one, and has one from then on.
+class ConvertedField(Generic[InputT, ValueT]):
+    """Field of a dataclass that accepts several forms and stores one.
 
-    `read`: makes it of what was given; `default`: as it may be given.
+    Args:
+        convert: Function from an accepted form to the stored form.
+        default: Default, in an accepted form.
     """
 
-    def __init__(self, convert: Callable[[GivenT], ValueT], default: GivenT) -> None:
-        self._read = convert
+    def __init__(self, convert: Callable[[InputT], ValueT], default: InputT) -> None:
+        self._convert = convert
         self._default: Any = default
 
     def __set_name__(self, owner: type, name: str) -> None:
@@ -30,52 +32,59 @@ class ConvertedField(Generic[GivenT, ValueT]):
         value: ValueT = self._default if settings is None else vars(settings)[self._name]
         return value
 
-    def __set__(self, settings: object, given: GivenT) -> None:
-        vars(settings)[self._name] = self._read(given)
+    def __set__(self, settings: object, value: InputT) -> None:
+        vars(settings)[self._name] = self._convert(value)
 
 
 def accept_fields(
-    settings_class: Callable[Arguments, DocumentT], descriptions: Mapping[str, str]
-) -> Callable[[Callable[[DocumentT], ReturnT]], Callable[Arguments, ReturnT]]:
-    """Decorate a function of one document: it is called with the document's fields, and documented with them.
+    settings_class: Callable[Arguments, SettingsT], descriptions: Mapping[str, str]
+) -> Callable[[Callable[[SettingsT], ReturnT]], Callable[Arguments, ReturnT]]:
+    """Decorate a function of one settings object so that it takes the fields of the object as parameters.
 
     Args:
-        settings_class: A dataclass; the annotation of a field may hold its description.
-        descriptions: Name of a field -> its description, for the others.
+        settings_class: Dataclass of the settings; the annotation of a field may contain its description.
+        descriptions: Name of a field -> its description, for fields without one in the annotation.
+
+    Returns:
+        A decorator; the signature and the docstring of its result list the fields.
     """
 
-    def decorate(function: Callable[[DocumentT], ReturnT]) -> Callable[Arguments, ReturnT]:
+    def decorate(function: Callable[[SettingsT], ReturnT]) -> Callable[Arguments, ReturnT]:
         signature = inspect.signature(settings_class)
 
-        def called(*args: Arguments.args, **kwargs: Arguments.kwargs) -> ReturnT:
+        def call_with_fields(*args: Arguments.args, **kwargs: Arguments.kwargs) -> ReturnT:
             try:
                 signature.bind(*args, **kwargs)
             except TypeError as error:
                 raise TypeError(f"{function.__name__}: {error}") from None
             return function(settings_class(*args, **kwargs))
 
-        update_wrapper(called, function)
-        parameters = [each.replace(annotation=_plain(each.annotation)) for each in signature.parameters.values()]
-        returns = inspect.signature(function).return_annotation
-        called.__signature__ = signature.replace(  # type: ignore[attr-defined]
-            parameters=parameters, return_annotation=returns
+        update_wrapper(call_with_fields, function)
+        parameters = []
+        for parameter in signature.parameters.values():
+            parameters.append(parameter.replace(annotation=_get_input_type(parameter.annotation)))
+        return_type = inspect.signature(function).return_annotation
+        call_with_fields.__signature__ = signature.replace(  # type: ignore[attr-defined]
+            parameters=parameters, return_annotation=return_type
         )
-        called.__annotations__ = {**{each.name: each.annotation for each in parameters}, "return": returns}
-        before, returns_line, rest = inspect.cleandoc(function.__doc__ or "").partition("\n\nReturns:")
-        called.__doc__ = f"{before}\n\nArgs:\n{_described(signature, descriptions)}{returns_line}{rest}"
-        return called
+        annotations = {parameter.name: parameter.annotation for parameter in parameters}
+        call_with_fields.__annotations__ = {**annotations, "return": return_type}
+        summary, heading, remainder = inspect.cleandoc(function.__doc__ or "").partition("\n\nReturns:")
+        call_with_fields.__doc__ = f"{summary}\n\nArgs:\n{_format_args(signature, descriptions)}{heading}{remainder}"
+        return call_with_fields
 
     return decorate
 
 
-def _plain(annotation: Any) -> Any:  # noqa: ANN401  (a type)
-    """What may be given, without the words about it."""
-    kind = get_args(annotation)[0] if get_origin(annotation) is Annotated else annotation
-    given = get_args(kind)[0] if get_origin(kind) is ConvertedField else kind
-    return getattr(given, "__forward_arg__", given)
+def _get_input_type(annotation: Any) -> Any:  # noqa: ANN401  (a type)
+    """Return the type that a field accepts, without its description."""
+    field_type = get_args(annotation)[0] if get_origin(annotation) is Annotated else annotation
+    input_type = get_args(field_type)[0] if get_origin(field_type) is ConvertedField else field_type
+    return getattr(input_type, "__forward_arg__", input_type)
 
 
-def _described(signature: inspect.Signature, descriptions: Mapping[str, str]) -> str:
+def _format_args(signature: inspect.Signature, descriptions: Mapping[str, str]) -> str:
+    """Format the section "Args:" of a docstring."""
     lines = []
     for name, parameter in signature.parameters.items():
         description = descriptions.get(name) or parameter.annotation.__metadata__[0]

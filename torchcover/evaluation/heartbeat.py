@@ -1,4 +1,4 @@
-"""Signs of life of the ranks that share a run: a rank that is stopped or dead is reported."""
+"""Heartbeats of the ranks of a distributed run; stopped and dead ranks are reported."""
 
 import time
 import warnings
@@ -12,11 +12,11 @@ from torch.distributed.distributed_c10d import Store
 
 @dataclass(frozen=True)
 class HeartbeatParams:
-    """Times of the signs of life.
+    """Times of the heartbeats.
 
     Args:
-        interval_s: Seconds between two signs of life of a rank.
-        timeout_s: A rank without one for so long is reported; longer than the interpreter is ever held by one call.
+        interval_s: Time between two heartbeats of a rank.
+        timeout_s: Silence after which a rank is reported; longer than any call that holds the interpreter lock.
     """
 
     interval_s: float = 3.0
@@ -24,62 +24,71 @@ class HeartbeatParams:
 
 
 class Heartbeat:
-    """Signs of life of one rank, and what it knows of the others.
+    """Heartbeats of one rank, and the last heartbeats of all others.
 
     Args:
-        store: The store of the ranks, which rank 0 keeps.
+        store: Store of the ranks, in the process of rank 0.
         rank: This rank.
-        size: Number of ranks.
+        num_ranks: Number of ranks.
         params: Times.
     """
 
     def __init__(self, store: Store, rank: int, num_ranks: int, params: HeartbeatParams) -> None:
         self._store, self._rank, self._params = store, rank, params
-        self._signs = {other: b"" for other in range(num_ranks) if other != rank}
+        self._heartbeats = {peer: b"" for peer in range(num_ranks) if peer != rank}
         now_s = time.monotonic()
-        self._changed_s = dict.fromkeys(self._signs, now_s)
+        self._changed_s = dict.fromkeys(self._heartbeats, now_s)
         self._exchanged_s = now_s
         self._reported: set[int] = set()
         self._ended = Event()
 
     def exchange_heartbeats(self) -> None:
-        """Send signs of life and read those of the others, until the rank leaves; the last sign is "left"."""
-        with suppress(RuntimeError):  # the store has ended
+        """Send heartbeats and read those of the other ranks until this rank leaves; the last heartbeat is "left"."""
+        with suppress(RuntimeError):  # the store has closed
             count = 0
             while not self._ended.wait(self._params.interval_s):
                 count += 1
                 self._store.set(f"alive {self._rank}", str(count))
-                for other, sign in self._signs.items():
-                    now = self._store.get(f"alive {other}") if self._store.check([f"alive {other}"]) else b""
-                    if now != sign or now == b"left":
-                        self._signs[other], self._changed_s[other] = now, time.monotonic()
-                        self._reported.discard(other)
+                for peer, previous in self._heartbeats.items():
+                    heartbeat = self._store.get(f"alive {peer}") if self._store.check([f"alive {peer}"]) else b""
+                    if heartbeat != previous or heartbeat == b"left":
+                        self._heartbeats[peer] = heartbeat
+                        self._changed_s[peer] = time.monotonic()
+                        self._reported.discard(peer)
                 self._exchanged_s = time.monotonic()
             self._store.set(f"alive {self._rank}", "left")
 
     def watch(self) -> None:
-        """Warn about ranks without signs of life, until the rank leaves."""
-        looked_s = time.monotonic()
+        """Warn about silent ranks until this rank leaves."""
+        checked_s = time.monotonic()
         while not self._ended.wait(self._params.interval_s):
             now_s = time.monotonic()
-            if now_s - looked_s > 2 * self._params.interval_s:  # this process itself was stopped
-                self._exchanged_s, self._changed_s = now_s, dict.fromkeys(self._signs, now_s)
-            looked_s = now_s
-            for other in self.find_silent(now_s):
-                self._reported.add(other)
+            if now_s - checked_s > 2 * self._params.interval_s:  # this process itself was stopped
+                self._exchanged_s, self._changed_s = now_s, dict.fromkeys(self._heartbeats, now_s)
+            checked_s = now_s
+            for peer in self.find_silent(now_s):
+                self._reported.add(peer)
                 warnings.warn(
-                    f"rank {other} has been silent for {self._params.timeout_s:g} s, and the others wait for it: it is "
+                    f"rank {peer} has been silent for {self._params.timeout_s:g} s, and the others wait for it: it is "
                     "stopped or dead; continue it, or end all ranks",
                     RuntimeWarning,
                     stacklevel=2,
                 )
 
     def find_silent(self, now_s: float) -> list[int]:
-        """Find the ranks without signs of life that were not reported; rank 0 if the store does not answer."""
+        """Find the silent ranks that were not reported; rank 0 if the store does not answer.
+
+        Args:
+            now_s: Time on the monotonic clock.
+
+        Returns:
+            Their numbers.
+        """
         latest_s = now_s - self._params.timeout_s
         if self._exchanged_s < latest_s:
             return [] if self._rank == 0 or 0 in self._reported else [0]
-        return [other for other, at_s in self._changed_s.items() if at_s < latest_s and other not in self._reported]
+        silent = [peer for peer, changed_s in self._changed_s.items() if changed_s < latest_s]
+        return [peer for peer in silent if peer not in self._reported]
 
     def stop(self) -> None:
         """End both loops."""
@@ -90,10 +99,10 @@ class Heartbeat:
 def report_silent_ranks(
     store: Store, rank: int, num_ranks: int, params: HeartbeatParams | None = None
 ) -> Iterator[None]:
-    """Send signs of life to the other ranks, and warn about those that send none.
+    """Send heartbeats to the other ranks within a block, and warn about silent ranks.
 
     Args:
-        store: The store of the ranks, which rank 0 keeps.
+        store: Store of the ranks, in the process of rank 0.
         rank: This rank.
         num_ranks: Number of ranks.
         params: Times; the defaults if not given.

@@ -18,7 +18,7 @@ from torch.utils.data import DataLoader, Dataset, get_worker_info
 from torchcover.evaluation.checkpoint import CheckpointManager
 from torchcover.evaluation.cpu_cores import count_cores, get_start_method, warn_about_spinning
 from torchcover.evaluation.observers import AnyObserver, CoverageObserver
-from torchcover.evaluation.progress import ENDS, Progress, defer_signals
+from torchcover.evaluation.progress import END_SIGNALS, Progress, defer_signals
 from torchcover.evaluation.ranks import Ranks
 from torchcover.files import end_with_parent, is_stopped, report_stopped_processes
 from torchcover.frames import BadFrameError, Frame, FrameSource, build_scene_lookup
@@ -287,7 +287,7 @@ class _ObservationLoop:
             clear_frames(error.__traceback__)  # its references would keep the workers alive
             killed = find_killed_worker(error, self.num_workers, self.run.num_frames)
             # Schedulers end the workers together with this process, and perhaps first.
-            is_ended_from_outside = killed and not set(signals).isdisjoint(ENDS)
+            is_ended_from_outside = killed and not set(signals).isdisjoint(END_SIGNALS)
             signals.clear()
             return KeyboardInterrupt() if is_ended_from_outside else killed or error
 

@@ -1,4 +1,4 @@
-"""Who waits for a run: a bar that says how far it is, and signals that end it, never within a frame."""
+"""Progress bar of a run, and signals that end it between two frames."""
 
 import math
 import signal
@@ -11,81 +11,83 @@ from datetime import timedelta
 from types import FrameType
 from typing import Self
 
-# Ctrl-C, a scheduler, and a terminal that is gone.
-ENDS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
-# Those that come so soon after another one mean the same.
-TOGETHER_S = 1.0
-# The end of a worker too, which torch turns into an error.
-HELD_BACK = [*ENDS, *([signal.SIGCHLD] if hasattr(signal, "SIGCHLD") else [])]
+# Signals that end a run: Ctrl-C, the end of a job or container, and a closed terminal.
+END_SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 
 
 class Progress:
-    """Is told of every step of a run: a bar with steps a second, the worst error and the time that is left, or nothing.
+    """Progress bar of a run: frames, rate, largest error and remaining time; a context manager around the run.
 
-    A context manager around the run. The bar is on stderr, in a notebook below the cell.
+    The bar is on stderr, in a notebook below the cell.
 
     Args:
-        steps: Steps that the run is thought to have.
-        title: What stands before it.
-        done: Steps that are done before.
-        shown: Whether anybody sees it.
-        workers: Processes that make the steps, whose first ones arrive together.
+        total: Expected number of frames.
+        title: Text in front of the bar.
+        num_done: Frames that are done before the start.
+        is_shown: Show the bar; otherwise calls have no effect.
+        num_workers: Worker processes, whose first frames arrive at the same time.
     """
 
     def __init__(self, total: int, title: str, *, num_done: int = 0, is_shown: bool, num_workers: int = 0) -> None:
-        self._rich = None
-        # The rate is a mean over several rounds of all workers; before those, since the run began.
+        self._bar = None
+        # The rate is averaged over several rounds of all workers, or since the start if that is shorter.
         self._times_s = deque([time.monotonic()], maxlen=1 + max(20, 4 * num_workers))
         if not is_shown:
             return
-        # rich takes 0.1 s to import, which nobody should wait for who wants no bar.
+        # Importing rich takes 0.1 s, which only runs with a bar need.
         from rich import progress
 
         from torchcover.report import Terminal
 
-        self._rich = progress.Progress(
+        self._bar = progress.Progress(
             progress.TextColumn("{task.description}", markup=False),
             progress.BarColumn(),
             progress.MofNCompleteColumn(),
             progress.TextColumn("{task.fields[rate]}"),
-            progress.TextColumn("{task.fields[words]}", markup=False),
-            progress.TextColumn("{task.fields[left]}"),
+            progress.TextColumn("{task.fields[status]}", markup=False),
+            progress.TextColumn("{task.fields[remaining]}"),
             console=Terminal(stderr=True),
         )
-        self._task = self._rich.add_task(title, total=total, completed=num_done, rate="", words="", left="")
+        self._task = self._bar.add_task(title, total=total, completed=num_done, rate="", status="", remaining="")
 
     def __enter__(self) -> Self:
-        if self._rich:
-            self._rich.start()
+        if self._bar:
+            self._bar.start()
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._rich:
-            self._rich.stop()
+        if self._bar:
+            self._bar.stop()
 
     def advance(self, expected_total: int, status: str = "") -> None:
-        """A step is done.
+        """Count one more frame.
 
         Args:
-            expected_total: Steps that the run is thought to have in all.
-            status: How good its numbers are, if anybody looks.
+            expected_total: Expected number of frames in total.
+            status: Text behind the rate, such as the largest error.
         """
-        if self._rich:
-            self._times_s.append(time.monotonic())
-            rate = (len(self._times_s) - 1) / max(self._times_s[-1] - self._times_s[0], 1e-9)
-            self._rich.advance(self._task)
-            seconds = max(0.0, expected_total - self._rich.tasks[0].completed) / rate
-            left = f"{timedelta(seconds=math.ceil(seconds))} left"
-            self._rich.update(self._task, total=expected_total, rate=f"{rate:.2f} steps/s", words=status, left=left)
+        if not self._bar:
+            return
+        self._times_s.append(time.monotonic())
+        frames_per_s = (len(self._times_s) - 1) / max(self._times_s[-1] - self._times_s[0], 1e-9)
+        self._bar.advance(self._task)
+        remaining_s = max(0.0, expected_total - self._bar.tasks[0].completed) / frames_per_s
+        self._bar.update(
+            self._task,
+            total=expected_total,
+            rate=f"{frames_per_s:.2f}/s",
+            status=status,
+            remaining=f"{timedelta(seconds=math.ceil(remaining_s))} left",
+        )
 
 
 @contextmanager
 def show_wait(title: str, *, is_shown: bool) -> Iterator[None]:
-    """Show on stderr, if that is a terminal, for how long a block without steps has run.
+    """Show the elapsed time of a block without frames, on stderr if it is a terminal.
 
     Args:
-        title: What the block does.
-        is_shown: Whether anybody sees it.
+        title: Description of the block.
+        is_shown: Show it; otherwise the call has no effect.
     """
     if not is_shown:
         yield
@@ -106,68 +108,81 @@ def show_wait(title: str, *, is_shown: bool) -> Iterator[None]:
 
 @contextmanager
 def handle_termination(on_signal: Callable[[Sequence[int]], object]) -> Iterator[list[int]]:
-    """Treat SIGTERM, as a scheduler or `docker stop` sends it, and SIGHUP, of a lost connection, as Ctrl-C.
+    """Treat SIGTERM (from a scheduler or `docker stop`) and SIGHUP (from a lost connection) like Ctrl-C.
 
-    For a program: a library leaves them alone. What is ignored stays so, as under `nohup`.
+    For programs only; a library does not change signals. Ignored signals remain ignored, as under `nohup`.
 
-    `on_signal`: called whenever one comes, at once, with all that have come. Returns a list of those that have come.
+    Args:
+        on_signal: Function that is called at once at every signal, with the numbers of all signals that arrived.
+
+    Returns:
+        Context manager with the list of the signals that arrived.
     """
-    program = _Program(on_signal)
-    taken = [number for number in ENDS if signal.getsignal(number) not in (signal.SIG_IGN, None)]
-    with _handled(taken, program):
-        yield program.arrived
+    handler = _TerminationHandler(on_signal)
+    numbers = [number for number in END_SIGNALS if signal.getsignal(number) not in (signal.SIG_IGN, None)]
+    with _set_handlers(numbers, handler):
+        yield handler.arrived
 
 
 @contextmanager
 def defer_signals() -> Iterator[list[int]]:
-    """Hold them back until the block is done: no frame may count for some observers, or some sums, only.
+    """Defer signals to the end of the block, so that no frame counts for some observers or sums only.
 
-    Returns a list of those that have come; who clears it has them forgotten.
+    Returns:
+        Context manager with the list of the signals that arrived; clearing the list drops them.
     """
     arrived: list[int] = []
-    if threading.current_thread() is not threading.main_thread():  # where they never arrive
+    if threading.current_thread() is not threading.main_thread():  # other threads never receive signals
         yield arrived
         return
-    before = {number: signal.getsignal(number) for number in HELD_BACK}
+    # The end of a worker is deferred too: torch turns it into an error.
+    deferred = [*END_SIGNALS, *([signal.SIGCHLD] if hasattr(signal, "SIGCHLD") else [])]
+    handlers = {number: signal.getsignal(number) for number in deferred}
 
-    def hold(number: int, _: FrameType | None) -> None:
-        handler = before[number]
-        if not isinstance(handler, _Program) or handler.ends(number):
+    def record_signal(number: int, _: FrameType | None) -> None:
+        handler = handlers[number]
+        if not isinstance(handler, _TerminationHandler) or handler.register(number):
             arrived.append(number)
 
-    with _handled([number for number, handler in before.items() if handler is not None], hold):
+    with _set_handlers([number for number, handler in handlers.items() if handler is not None], record_signal):
         yield arrived
     for number in arrived:
-        if isinstance(before[number], _Program):
+        if isinstance(handlers[number], _TerminationHandler):
             raise KeyboardInterrupt
-        signal.raise_signal(number)  # what it would have done: nothing, where it is ignored
+        signal.raise_signal(number)  # the original handler decides; it may ignore the signal
 
 
 @contextmanager
-def _handled(numbers: Sequence[int], handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
-    before = {number: signal.signal(number, handler) for number in numbers}
+def _set_handlers(numbers: Sequence[int], handler: Callable[[int, FrameType | None], None]) -> Iterator[None]:
+    """Set a handler of signals within a block."""
+    previous = {number: signal.signal(number, handler) for number in numbers}
     try:
         yield
     finally:
-        for number, own in before.items():
-            signal.signal(number, own)
+        for number, previous_handler in previous.items():
+            signal.signal(number, previous_handler)
 
 
-class _Program:
-    def __init__(self, told: Callable[[Sequence[int]], object]) -> None:
+class _TerminationHandler:
+    """Handler that turns signals into KeyboardInterrupt, one for several signals in a short time."""
+
+    # Some programs send a signal twice, to the process and to its group, or SIGTERM and SIGHUP together.
+    repeat_interval_s = 1.0
+
+    def __init__(self, on_signal: Callable[[Sequence[int]], object]) -> None:
         self.arrived: list[int] = []
-        self._told = told
+        self._on_signal = on_signal
         self._ignored_until_s = 0.0
 
-    def ends(self, number: int) -> bool:
-        """Whether it ends the program; some send it twice, to the process and to its group, or another one with it."""
+    def register(self, number: int) -> bool:
+        """Register a signal; return True if it ends the program, False if it repeats the previous one."""
         self.arrived.append(number)
-        self._told(self.arrived)
+        self._on_signal(self.arrived)
         now_s = time.monotonic()
-        again = number != signal.SIGINT and now_s < self._ignored_until_s
-        self._ignored_until_s = now_s + TOGETHER_S
-        return not again
+        is_repeated = number != signal.SIGINT and now_s < self._ignored_until_s
+        self._ignored_until_s = now_s + self.repeat_interval_s
+        return not is_repeated
 
     def __call__(self, number: int, _: FrameType | None) -> None:
-        if self.ends(number):
+        if self.register(number):
             raise KeyboardInterrupt

@@ -1,4 +1,4 @@
-"""One page that answers first: all that is asked of some rigs, measured one after the other within a budget."""
+"""Report on rigs for a meeting: one page with findings first, from several evaluations within a time budget."""
 
 import math
 import time
@@ -16,7 +16,7 @@ from torchcover.evaluation.progress import Progress, defer_signals
 from torchcover.evaluation.requirements import Requirements
 from torchcover.evaluation.requirements_check import CheckResult, check
 from torchcover.evaluation.result import Result
-from torchcover.evaluation.settings import DEFAULT_STEPS, FILES, Settings, parse_file_kinds
+from torchcover.evaluation.settings import DEFAULT_NUM_FRAMES, FILES, Settings, parse_file_kinds
 from torchcover.evaluation.target_visibility import (
     build_flat_ground,
     build_sides_table,
@@ -30,6 +30,7 @@ from torchcover.files import AtomicOutput
 from torchcover.notebooks import build_result_html
 from torchcover.report import (
     Page,
+    TargetVisibilityMap,
     build_detection_shares,
     build_file_stems,
     describe_range,
@@ -41,20 +42,20 @@ from torchcover.simulation import Rig
 from torchcover.simulation.scenario import ActorDescription
 from torchcover.targets import Target, TargetMap, write_arrays, write_csv
 
-# As many as anybody compares on a page.
-MOST_RIGS = 8
+# Maximum number of rigs that can be compared on one page.
+MAX_RIGS = 8
 
 
 @dataclass(frozen=True, eq=False)
 class Report:
-    """What `report` returns.
+    """Result of `report`.
 
     Args:
-        result: What the rigs see in traffic, with bodies beside them, and what is lost with each sensor.
-        targets: By the name of the rig, where it sees the body in free space.
-        num_frames: How many steps of traffic were asked for; fewer are measured if the budget was over.
-        encounters: When they see whom they are about to collide with; None if that was not asked.
-        check_result: Whether they see what they must; likewise.
+        result: Coverage in traffic, with test targets and the loss if a sensor fails.
+        targets: Name of the rig -> map of the positions on flat ground at which it detects the test target.
+        num_frames: Requested frames of traffic; fewer are evaluated if the budget is used up.
+        encounters: Times to collision at first detection; None if not requested.
+        check_result: Verdicts of the requirements; None if not requested.
     """
 
     result: Result
@@ -65,48 +66,53 @@ class Report:
 
     @property
     def verdict(self) -> tuple[str, ...]:
-        """The answer in sentences, the first of which says most; each has its rule, and none tells what is chance."""
-        first, *losses = summarize_target_maps(self.targets)
-        range_words = describe_range(self.result.table) or explain_missing_intervals(self.result.table, "ranges")
-        asked = [*self._met.findings, *(self.check_result.verdict if self.check_result else ())]
-        told = [first, range_words, *self.result.sensor_model_notes, *losses, *asked, self.cut_short]
-        return tuple(filter(None, told))
+        """Findings in sentences, the most important first; each states only significant differences."""
+        main_finding, *losses = summarize_target_maps(self.targets)
+        ranges = describe_range(self.result.table) or explain_missing_intervals(self.result.table, "ranges")
+        sentences = [main_finding, ranges, *self.result.sensor_model_notes, *losses, *self._encounters_page.findings]
+        if self.check_result:
+            sentences += self.check_result.verdict
+        sentences.append(self.cut_short)
+        return tuple(sentence for sentence in sentences if sentence)
 
     @property
     def cut_short(self) -> str:
-        """That fewer steps were measured than asked for; no words where all were."""
-        done = self.result.table.first_conditions.counts["num_frames"]
-        over = f"The budget was over after {done:,} of {self.num_frames:,} steps of traffic." * (done < self.num_frames)
-        return self.result.cut_short or over
+        """Sentence about missing frames; empty if all requested frames were evaluated."""
+        num_evaluated = self.result.table.first_conditions.counts["num_frames"]
+        if self.result.cut_short or num_evaluated >= self.num_frames:
+            return self.result.cut_short
+        return f"The time budget ended after {num_evaluated:,} of {self.num_frames:,} frames of traffic."
 
     @property
-    def _met(self) -> Page:
+    def _encounters_page(self) -> Page:
         return build_encounters_page(self.encounters) if self.encounters else Page("", "")
 
     @property
     def page(self) -> Page:
-        """The answer and what shows it; below it the tables and maps that it comes from."""
-        target, *_ = self.targets.values()
-        steps = f"{self.result.table.first_conditions.counts['num_frames']:,} steps of {self.result.source['scenario']}"
-        lead = f"{target.target}, {target.detection_points} points or more, on flat ground with nothing else; {steps}."
-        of_targets = [build_target_page(one) for one in self.targets.values()]
-        sides = [
-            replace(build_sides_table(one), title=f"{rig}: {build_sides_table(one).title}")
-            for rig, one in self.targets.items()
-        ]
-        tables = [
-            *self._met.tables,
-            *(self.check_result.build_tables() if self.check_result else ()),
-            *sides,
-            *self.result.tables,
-        ]
+        """Page with the findings, their pictures, and the tables and maps from which they follow."""
+        first_map = next(iter(self.targets.values()))
+        num_evaluated = self.result.table.first_conditions.counts["num_frames"]
+        lead = (
+            f"{first_map.target}, {first_map.detection_points} points or more, on flat ground with nothing else; "
+            f"{num_evaluated:,} frames of {self.result.source['scenario']}."
+        )
+        encounters_page = self._encounters_page
+        tables = list(encounters_page.tables)
+        if self.check_result:
+            tables += self.check_result.build_tables()
+        maps: list[TargetVisibilityMap] = []
+        for rig, target_map in self.targets.items():
+            sides = build_sides_table(target_map)
+            tables.append(replace(sides, title=f"{rig}: {sides.title}"))
+            maps += build_target_page(target_map).target_maps
+        tables += self.result.tables
         return replace(
             self.result.page,
             lead=lead,
             findings=self.verdict,
-            target_maps=[plan for page in of_targets for plan in page.target_maps],
+            target_maps=maps,
             detection_shares=build_detection_shares(self.result.table),
-            pictures=self._met.pictures,
+            pictures=encounters_page.pictures,
             tables=tables,
         )
 
@@ -115,53 +121,55 @@ class Report:
 
     @property
     def markdown(self) -> str:
-        """The verdict, for a merge request."""
-        first, *others = map(escape_markdown, self.verdict)
-        return "\n".join([f"**{first}**", "", *(f"- {words}" for words in others), ""])
+        """Findings as Markdown, for a merge request."""
+        first, *further = [escape_markdown(sentence) for sentence in self.verdict]
+        return "\n".join([f"**{first}**", "", *(f"- {sentence}" for sentence in further), ""])
 
     @property
     def record(self) -> dict[str, Any]:
-        """All of it, for JSON."""
+        """Content of `summary.json`."""
         return {
             "verdict": list(self.verdict),
             "complete": not self.cut_short,
             "traffic": self.result.record,
-            "targets": {rig: build_target_record(one) for rig, one in self.targets.items()},
+            "targets": {rig: build_target_record(target_map) for rig, target_map in self.targets.items()},
             "encounters": self.encounters.to_record() if self.encounters else None,
             "requirements": self.check_result.record if self.check_result else None,
         }
 
     def save(self, folder: str | Path, *, file_kinds: str | Iterable[str] = FILES) -> list[Path]:
-        """Write the files of the command line: the numbers first, then the page.
+        """Write the files of `torchcover report`: first the numbers, then the page.
 
         Args:
-            folder: Where to write `report.html`, `report.md` with the verdict, `summary.json`, and the files that
-                `evaluate`, `targets`, `encounter` and `check` write. Made if it does not exist; files of an earlier run
-                that its `summary.json` lists are deleted.
-            file_kinds: What to write beside `summary.json` and `report.md`, as in `Result.save`.
+            folder: Folder for `report.html`, `report.md` with the findings, `summary.json`, and the files that
+                `evaluate`, `targets`, `encounter` and `check` write. Created if it does not exist; files of an earlier
+                run that its `summary.json` lists are deleted.
+            file_kinds: Files in addition to `summary.json` and `report.md`, as in `Result.save`.
 
         Returns:
             The files.
         """
-        wanted, record = parse_file_kinds(file_kinds), self.record
-        with AtomicOutput(Path(folder)) as written:
-            with defer_signals():  # the numbers are safe before anything ends this
-                if "numbers" in wanted:
-                    self._add_numbers(written)
-                written.add_text("report.md", self.markdown)
-                written.publish(record)
-            if "page" in wanted:
-                written.add_text("report.html", render_page(self.page))
-            for stem, figure in self.result.plot_maps() if "maps" in wanted else ():
-                written.add_figure(f"maps/{stem}.png", figure)
-            written.publish(record)
-        return written.paths
+        kinds = parse_file_kinds(file_kinds)
+        record = self.record
+        with AtomicOutput(Path(folder)) as files:
+            with defer_signals():  # a signal does not interrupt the numbers
+                if "numbers" in kinds:
+                    self._add_numbers(files)
+                files.add_text("report.md", self.markdown)
+                files.publish(record)
+            if "page" in kinds:
+                files.add_text("report.html", render_page(self.page))
+            if "maps" in kinds:
+                for stem, figure in self.result.plot_maps():
+                    files.add_figure(f"maps/{stem}.png", figure)
+            files.publish(record)
+        return files.paths
 
     def _add_numbers(self, files: AtomicOutput) -> None:
         self.result.add_numbers(files)
-        for stem, one in zip(build_file_stems(list(self.targets)), self.targets.values(), strict=True):
-            files.add(f"targets/{stem}.csv", partial(write_csv, one))
-            files.add(f"targets/{stem}.npz", partial(write_arrays, one))
+        for stem, target_map in zip(build_file_stems(list(self.targets)), self.targets.values(), strict=True):
+            files.add(f"targets/{stem}.csv", partial(write_csv, target_map))
+            files.add(f"targets/{stem}.npz", partial(write_arrays, target_map))
         if self.encounters:
             files.add("encounters.csv", self.encounters.write_csv)
         if self.check_result:
@@ -177,34 +185,35 @@ def report(
     requirements: Requirements | str | Path | None = None,
     vehicle: str | Path | None = None,
     sensor_model: Literal["ideal", "real"] | None = None,
-    num_frames: int = DEFAULT_STEPS,
+    num_frames: int = DEFAULT_NUM_FRAMES,
     seed: int = 0,
     num_workers: int | None = None,
     budget_s: float = math.inf,
     show_progress: bool = False,
 ) -> Report:
-    """Measure what a meeting asks about rigs: where a body beside them is seen, what fails, how far, how soon.
+    """Report on rigs: detection of a test target, loss if a sensor fails, range, and time to collision at detection.
 
     Args:
-        rigs: A rig or several, at most 8: each one itself, its built-in name, or its YAML file.
-        scenario: The traffic: one kind of world, as for `evaluate`.
-        target: What is put beside the vehicle, in free space, as for `map_target_visibility`.
-        encounters: A set of encounters, as for `encounter`; none if not given.
-        requirements: What the rigs must see, as for `check`; likewise.
-        vehicle: What carries the rigs, as for `evaluate`.
+        rigs: A rig or several, at most 8: objects, built-in names, or YAML files.
+        scenario: Traffic: a single scenario, as for `evaluate`.
+        target: Test target on flat ground, as for `map_target_visibility`.
+        encounters: Set of encounters, as for `encounter`; None: no encounters.
+        requirements: Requirements, as for `check`; None: no requirements.
+        vehicle: Host vehicle, as for `evaluate`.
         sensor_model: As for `evaluate`.
-        num_frames: Of the traffic.
-        seed: Of the simulation.
+        num_frames: Frames of the traffic.
+        seed: Seed of the simulation.
         num_workers: As for `evaluate`.
-        budget_s: Seconds: traffic, which comes last, ends when they are over, but not before it has intervals.
-        show_progress: Whether to show a bar.
+        budget_s: Time in seconds after which the traffic ends, which comes last; not before it has confidence
+            intervals.
+        show_progress: Show a progress bar.
 
     Returns:
-        Its answer in `verdict`; `save` writes the page.
+        Report with the findings in `verdict`; `save` writes the page.
 
     Raises:
-        FileNotFoundError: An unknown name or file.
-        ValueError: A file that cannot be used, a number out of its bounds, no rig or too many, several kinds of world.
+        FileNotFoundError: Unknown name or file.
+        ValueError: Invalid file or number, no rig, too many rigs, or several scenarios.
 
     Example:
         >>> result = report("front_roof_128", "courtyard", num_frames=8)
@@ -212,52 +221,69 @@ def report(
         A child of 1.10 m is seen (5 points or more) at 35 % of the places within 2 m by front_roof_128.
     """
     start_s = time.monotonic()
-    given = [rigs] if isinstance(rigs, str | Path | Rig) else list(rigs)
-    if not 1 <= len(given) <= MOST_RIGS:
-        raise ValueError(f"report: 1 to {MOST_RIGS} rigs fit on a page; got {len(given)}: choose, or use `compare`")
+    inputs = [rigs] if isinstance(rigs, str | Path | Rig) else list(rigs)
+    if not 1 <= len(inputs) <= MAX_RIGS:
+        raise ValueError(f"report: 1 to {MAX_RIGS} rigs fit on a page; got {len(inputs)}: omit some, or use `compare`")
     if not budget_s > 0:
         raise ValueError(f"budget: seconds above 0 are needed; got {budget_s}")
-    called = [load_rig(rig).model_copy(update={"name": n}) for rig, n in zip(given, make_rig_names(given), strict=True)]
-    own: dict[str, Any] = {"vehicle": vehicle, "sensor_model": sensor_model}
+    named_rigs = []
+    for rig, name in zip(inputs, make_rig_names(inputs), strict=True):
+        named_rigs.append(load_rig(rig).model_copy(update={"name": name}))
+    vehicle_and_model: dict[str, Any] = {"vehicle": vehicle, "sensor_model": sensor_model}
     settings = Settings(
-        called, scenario, num_frames=num_frames, seed=seed, redundancy=True, num_workers=num_workers, **own
+        named_rigs,
+        scenario,
+        num_frames=num_frames,
+        seed=seed,
+        redundancy=True,
+        num_workers=num_workers,
+        **vehicle_and_model,
     )
     if settings.mixture is not None:
-        raise ValueError("report: one kind of world is needed; for several use `compare`")
+        raise ValueError("report: a single scenario is needed; use `compare` for several")
     task = build_simulation_task(settings)
-    body = target if isinstance(target, Target) else Target.load(target)
-    carrier = task.frames.scenario.ego
-    assert carrier is not None  # simulated
-    ground = build_flat_ground().model_copy(update={"ego": ActorDescription(shape=carrier.shape)})
-    whole = len(called) + (encounters is not None) + (requirements is not None) + num_frames
-    with Progress(whole, "report", is_shown=show_progress) as bar:
-        seen = {}
-        for rig in called:
-            seen[rig.name] = map_target_visibility(rig, body, ground, sensor_model=sensor_model, seed=seed)
-            bar.advance(whole)
-        met = checked = None
+    loaded_target = target if isinstance(target, Target) else Target.load(target)
+    ego = task.frames.scenario.ego
+    assert ego is not None  # every simulation task has an ego vehicle
+    ground = build_flat_ground().model_copy(update={"ego": ActorDescription(shape=ego.shape)})
+    num_steps = len(named_rigs) + (encounters is not None) + (requirements is not None) + num_frames
+    with Progress(num_steps, "report", is_shown=show_progress) as bar:
+        target_maps = {}
+        for rig in named_rigs:
+            target_maps[rig.name] = map_target_visibility(
+                rig, loaded_target, ground, sensor_model=sensor_model, seed=seed
+            )
+            bar.advance(num_steps)
+        encounter_results = check_result = None
         if encounters is not None:
-            met = evaluate_encounters(called, encounters, seed=seed, **own)
-            bar.advance(whole)
+            encounter_results = evaluate_encounters(named_rigs, encounters, seed=seed, **vehicle_and_model)
+            bar.advance(num_steps)
         if requirements is not None:
-            checked = check(called, requirements, seed=seed, num_workers=num_workers, **own)
-            bar.advance(whole)
-        result = measure_coverage(task, settings, _Pace(bar, whole, start_s + budget_s))
-    return Report(result, seen, num_frames, met, checked)
+            check_result = check(named_rigs, requirements, seed=seed, num_workers=num_workers, **vehicle_and_model)
+            bar.advance(num_steps)
+        result = measure_coverage(task, settings, _BudgetRule(bar, num_steps, start_s + budget_s))
+    return Report(result, target_maps, num_frames, encounter_results, check_result)
 
 
 @dataclass(frozen=True)
-class _Pace:
-    """Tells the bar of every step of the traffic, and ends it when the time is over: a `StoppingRule`."""
+class _BudgetRule:
+    """Stopping rule that advances the bar at every frame and ends the traffic when the time is over.
+
+    Args:
+        bar: Progress bar.
+        num_steps: Total number of its steps.
+        end_s: End of the budget on the monotonic clock.
+        progress_text: Text of the rule for other progress bars.
+    """
 
     bar: Progress
-    whole: int
-    until_s: float
+    num_steps: int
+    end_s: float
     progress_text: str = ""
 
     def is_reached(self, num_frames: int) -> bool:
-        self.bar.advance(self.whole)
-        return num_frames >= MIN_BLOCKS and time.monotonic() >= self.until_s
+        self.bar.advance(self.num_steps)
+        return num_frames >= MIN_BLOCKS and time.monotonic() >= self.end_s
 
     def estimate_num_frames(self, max_frames: int) -> int:
         return max_frames

@@ -1,4 +1,4 @@
-"""The arguments of `evaluate`, read into one form each; `EvaluateConfig` describes those that a file can hold."""
+"""Arguments of `evaluate`, converted to one form each; `EvaluateConfig` describes those that a file can contain."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -26,21 +26,29 @@ if TYPE_CHECKING:
 
     AnyRig: TypeAlias = Rig | str | Path
     AnyScenario: TypeAlias = Scenario | str | Path
+    Mixture: TypeAlias = dict[str, tuple[AnyScenario, float]]
 
 DEFAULT_SCENARIO = "courtyard"
-DEFAULT_STEPS = 64
-# With a target error; as many as the paper averages.
-MAX_STEPS = 4096
-# A process with torch and the geometry of a small scenario.
+DEFAULT_NUM_FRAMES = 64
+# Maximum number of frames with a target error; the paper averages as many.
+MAX_NUM_FRAMES = 4096
+# Memory of a worker process: torch and the geometry of a small scenario.
 BYTES_PER_WORKER = 300e6
-# Beside `summary.json`.
+# Kinds of files that a result can write in addition to `summary.json`.
 FILES = ("numbers", "maps", "page")
 
 
 def parse_file_kinds(file_kinds: str | Iterable[str]) -> frozenset[str]:
-    """What is to be written of a result.
+    """Parse the kinds of files that a result writes.
 
-    `file_kinds`: of `FILES`: names, or a text as in `numbers,page`. ValueError: another name, or none.
+    Args:
+        file_kinds: Names of `FILES`, or a text such as `numbers,page`.
+
+    Returns:
+        The names.
+
+    Raises:
+        ValueError: Another name, or no name.
 
     Example:
         >>> sorted(parse_file_kinds("page, numbers"))
@@ -52,49 +60,65 @@ def parse_file_kinds(file_kinds: str | Iterable[str]) -> frozenset[str]:
     return frozenset(names)
 
 
-def load_contrib() -> Any:  # noqa: ANN401  (a package that nothing imports)
-    """Load the metrics of others, which only runs that name one need."""
+def load_contrib() -> Any:  # noqa: ANN401  (a package that no other module may import)
+    """Import the published metrics, which only runs with `metrics` need."""
     return import_module("torchcover.contrib")
 
 
-def _rigs(given: "AnyRig | Sequence[AnyRig] | None") -> "tuple[AnyRig, ...]":
-    if given is None:
+def _convert_rigs(rigs: "AnyRig | Sequence[AnyRig] | None") -> "tuple[AnyRig, ...]":
+    if rigs is None:
         return ()
-    return (given,) if isinstance(given, str) or not isinstance(given, Sequence) else tuple(given)
+    return (rigs,) if isinstance(rigs, str) or not isinstance(rigs, Sequence) else tuple(rigs)
 
 
-def _mixture(given: object) -> "dict[str, tuple[AnyScenario, float]] | None":
-    """Several scenarios and their shares.
+def _convert_mixture(scenario: object) -> "Mixture | None":
+    """Convert several scenarios to a mixture.
 
-    ValueError: one that is given twice, a recording, or weights that are no numbers, negative, or all 0.
+    Args:
+        scenario: A sequence of scenarios, a mapping to weights, or a text such as `urban=0.7,highway=0.3`.
+
+    Returns:
+        Name of each scenario -> the scenario and its share, which sum up to 1; None for a single scenario.
+
+    Raises:
+        ValueError: A repeated scenario, a recording, or weights that are not numbers, negative, or all 0.
     """
-    if isinstance(given, str) and any(sign in given for sign in ",=") and not Path(given).exists():
-        parts = [part.strip().partition("=") for part in given.split(",")]
-        for name, *_ in parts:
-            _named(name)
-        if len({sign for _, sign, _ in parts}) > 1:
-            raise ValueError(f"scenario {given}: every one needs a weight, or none")
-        given = {name: weight or 1.0 for name, _, weight in parts} if parts[0][1] else [name for name, *_ in parts]
-        if len(given) < len(parts):
-            raise ValueError(f"scenario: one of {', '.join(name for name, *_ in parts)} is given twice")
-    if isinstance(given, str) or not isinstance(given, Mapping | Sequence):
+    if isinstance(scenario, str) and ("," in scenario or "=" in scenario) and not Path(scenario).exists():
+        scenario = _parse_mixture(scenario)
+    if isinstance(scenario, str) or not isinstance(scenario, Mapping | Sequence):
         return None
-    weights = dict(given) if isinstance(given, Mapping) else {}
-    names = [_named(one) for one in given]
+    scenarios = list(scenario)
+    weights = list(scenario.values()) if isinstance(scenario, Mapping) else [1.0] * len(scenarios)
+    names = [_get_scenario_name(item) for item in scenarios]
     if len({name.lower() for name in names}) < len(names):
-        raise ValueError(f"scenario: one of {', '.join(names)} is given twice, or two are called alike")
+        raise ValueError(f"scenario: different names are needed (case is ignored); got {', '.join(names)}")
     try:
-        numbers = [float(weights.get(one, 1.0)) for one in given] if weights else [1.0] * len(names)
+        numbers = [float(weight) for weight in weights]
     except (TypeError, ValueError):
         numbers = []
-    if not (all(math.isfinite(number) and number >= 0.0 for number in numbers) and 0.0 < sum(numbers) < math.inf):
-        said = ", ".join(f"{name}={weight}" for name, weight in zip(names, weights.values(), strict=False))
-        raise ValueError(f"scenario: weights of 0 or more are needed, not all 0; got {said or 'no scenario'}")
-    return {name: (one, number / sum(numbers)) for name, one, number in zip(names, given, numbers, strict=True)}
+    are_valid = all(math.isfinite(number) and number >= 0.0 for number in numbers)
+    if not (are_valid and 0.0 < sum(numbers) < math.inf):
+        text = ", ".join(f"{name}={weight}" for name, weight in zip(names, weights, strict=True))
+        raise ValueError(f"scenario: weights of 0 or more are needed, not all 0; got {text or 'no scenario'}")
+    shares = [number / sum(numbers) for number in numbers]
+    return {name: (item, share) for name, item, share in zip(names, scenarios, shares, strict=True)}
 
 
-def _named(scenario: object) -> str:
-    """What a kind of world is called; one that there is not is refused."""
+def _parse_mixture(text: str) -> dict[str, str] | list[str]:
+    """Parse names separated by commas, all with weights as in `urban=0.7` or all without."""
+    parts = [part.strip().partition("=") for part in text.split(",")]
+    names = [name for name, _, _ in parts]
+    for name in names:
+        _get_scenario_name(name)  # a misspelled name is reported before its weight
+    if len({equals for _, equals, _ in parts}) > 1:
+        raise ValueError(f"scenario {text}: a weight for every scenario is needed, or none")
+    if len(set(names)) < len(names):
+        raise ValueError(f"scenario: different names are needed (case is ignored); got {', '.join(names)}")
+    return {name: weight or "1" for name, _, weight in parts} if parts[0][1] else names
+
+
+def _get_scenario_name(scenario: object) -> str:
+    """Return the name of a scenario; an unknown one is rejected."""
     if not isinstance(scenario, str | Path):
         name: object = getattr(scenario, "name", None)
         if not isinstance(name, str):
@@ -103,74 +127,77 @@ def _named(scenario: object) -> str:
     if not str(scenario):
         raise ValueError("scenario: one of several has no name")
     if Path(scenario).is_dir():
-        raise ValueError(f"scenario {scenario}: a folder; a recording is no scenario: measure it apart, by `frames`")
+        raise ValueError(f"scenario {scenario}: a folder; evaluate a recording on its own, with `frames`")
     from torchcover.simulation.documents import find_document
 
     return find_document("scenarios", scenario).stem
 
 
-def _thresholds(given: "float | Iterable[float]") -> tuple[float, ...]:
-    each = tuple(given) if isinstance(given, Iterable) else (given,)
-    if not all(isinstance(threshold, Real) for threshold in each):
-        raise TypeError(f"thresholds_m: metres are needed, as in 0.4 or (0.4, 1.0); got {given!r}")
-    return tuple(float(threshold) for threshold in each)
+def _convert_thresholds(thresholds_m: "float | Iterable[float]") -> tuple[float, ...]:
+    values = tuple(thresholds_m) if isinstance(thresholds_m, Iterable) else (thresholds_m,)
+    if not all(isinstance(value, Real) for value in values):
+        raise TypeError(f"thresholds_m: meters are needed, as in 0.4 or (0.4, 1.0); got {thresholds_m!r}")
+    return tuple(float(value) for value in values)
 
 
-def _aggregations(given: "str | Sequence[Aggregation | str]") -> "tuple[Aggregation, ...]":
-    if not given:
+def _convert_aggregations(aggregations: "str | Sequence[Aggregation | str]") -> "tuple[Aggregation, ...]":
+    if not aggregations:
         return ()
     from torchcover.coverage import parse_aggregation
 
-    each = [given] if isinstance(given, str) else given
-    if not isinstance(each, Sequence):  # what is in it the metric checks
+    items = [aggregations] if isinstance(aggregations, str) else aggregations
+    if not isinstance(items, Sequence):  # the metric checks the items
         raise TypeError(
             f"aggregations: names such as maximum, or a sequence of them or of objects such as Maximum(), are needed; "
-            f"got {given!r}"
+            f"got {aggregations!r}"
         )
-    return tuple(parse_aggregation(one) if isinstance(one, str) else one for one in each)
+    return tuple(parse_aggregation(item) if isinstance(item, str) else item for item in items)
 
 
-def _metrics(given: str | Iterable[str]) -> tuple[str, ...]:
-    if not given:
+def _convert_metrics(metrics: str | Iterable[str]) -> tuple[str, ...]:
+    if not metrics:
         return ()
-    names: tuple[str, ...] = load_contrib().parse_metric_names(given)
+    names: tuple[str, ...] = load_contrib().parse_metric_names(metrics)
     return names
 
 
-def _asked(given: "RegionsOfInterest | str | Path | None") -> "RegionsOfInterest | None":
-    if given is None:
+def _convert_regions(regions: "RegionsOfInterest | str | Path | None") -> "RegionsOfInterest | None":
+    if regions is None:
         return None
     from torchcover.simulation import RegionsOfInterest
 
-    if isinstance(given, str | Path):
-        return RegionsOfInterest.load(given)
-    if not isinstance(given, RegionsOfInterest):
-        raise TypeError(f"ask: RegionsOfInterest(...) or the path of a YAML file is needed; got {given!r}")
-    return given
+    if isinstance(regions, str | Path):
+        return RegionsOfInterest.load(regions)
+    if not isinstance(regions, RegionsOfInterest):
+        raise TypeError(f"regions: RegionsOfInterest(...) or the path of a YAML file is needed; got {regions!r}")
+    return regions
 
 
-def _target(given: "TargetError | str | Sequence[str] | None") -> "TargetError | None":
-    if given is None:
+def _convert_target_error(target_error: "TargetError | str | Sequence[str] | None") -> "TargetError | None":
+    if target_error is None:
         return None
     from torchcover.evaluation.target_error import TargetError
 
-    return given if isinstance(given, TargetError) else TargetError.parse(given)
+    return target_error if isinstance(target_error, TargetError) else TargetError.parse(target_error)
 
 
-def _weather(given: "Weather | str | Path | Sequence[Weather | str | Path]") -> "tuple[Weather, ...]":
-    if not given:
+def _convert_weather(weather: "Weather | str | Path | Sequence[Weather | str | Path]") -> "tuple[Weather, ...]":
+    if not weather:
         return ()
     from torchcover.simulation import Weather
 
-    each = [given] if isinstance(given, (Weather, str, Path)) else given
-    return tuple(one if isinstance(one, Weather) else Weather.load(one) for one in each)
+    items = [weather] if isinstance(weather, (Weather, str, Path)) else weather
+    return tuple(item if isinstance(item, Weather) else Weather.load(item) for item in items)
 
 
-def _probes(given: "str | Path | Iterable[str | Path] | None") -> "tuple[str | Path, ...] | None":
-    each = (given,) if isinstance(given, str | Path) else None if given is None else tuple(given)
-    if each and "none" in each and len(each) > 1:
-        raise ValueError(f"test_targets: none, or targets; got {', '.join(map(str, each))}")
-    return () if each == ("none",) else each
+def _convert_test_targets(targets: "str | Path | Iterable[str | Path] | None") -> "tuple[str | Path, ...] | None":
+    """Convert names and files of test targets to a tuple, `none` to an empty one; None for the default."""
+    if targets is None:
+        return None
+    items = (targets,) if isinstance(targets, str | Path) else tuple(targets)
+    if "none" in items and len(items) > 1:
+        raise ValueError(f"test_targets: none, or targets; got {', '.join(map(str, items))}")
+    return () if items == ("none",) else items
 
 
 DEFAULTS = EvaluateConfig()
@@ -178,43 +205,43 @@ DEFAULTS = EvaluateConfig()
 
 @dataclass(frozen=True, eq=False)
 class Settings:
-    """The arguments of `evaluate`; None where nothing was given.
+    """Arguments of `evaluate`; None stands for an argument that was not given.
 
     Raises:
-        ValueError: A number of steps below 1, an unknown measure, more workers than the memory has room for.
-        TypeError: One of a wrong kind.
+        ValueError: Fewer than 1 frame, an unknown average, too many workers for the memory, or contradictory settings.
+        TypeError: A value of a wrong type.
     """
 
     rigs: Annotated[
         ConvertedField["AnyRig | Sequence[AnyRig] | None", "tuple[AnyRig, ...]"],
-        "A rig, the name of a built-in one, or the path of a YAML file; or several, which are measured in the same "
-        "frames against the same reference, and of which the others are compared with the first. With `frames`: which "
-        "of its rigs, all if not given; or what its only one is, so that the maps show its sensors.",
-    ] = ConvertedField(_rigs, None)
+        "Rig, name of a built-in rig, or path of a YAML file. Several rigs are evaluated in the same frames against "
+        "the same reference and compared with the first. With `frames`: names of its rigs (default: all), or the rig "
+        "that recorded them, so that the maps show its sensors.",
+    ] = ConvertedField(_convert_rigs, None)
     scenario: "AnyScenario | Sequence[AnyScenario] | Mapping[str, float] | None" = None
     _: KW_ONLY
     frames: Annotated[
-        "FrameSource | str | Path | None", "A recording, or any source of frames, instead of a scenario."
+        "FrameSource | str | Path | None", "Recording, or another source of frames, instead of a scenario."
     ] = None
     num_frames: int | None = None
     seed: int = DEFAULTS.seed
     vehicle: str | Path | None = None
     sensor_model: Literal["ideal", "real"] | None = None
     weather: ConvertedField["Weather | str | Path | Sequence[Weather | str | Path]", "tuple[Weather, ...]"] = (
-        ConvertedField(_weather, DEFAULTS.weather)
+        ConvertedField(_convert_weather, DEFAULTS.weather)
     )
     regions: ConvertedField["RegionsOfInterest | str | Path | None", "RegionsOfInterest | None"] = ConvertedField(
-        _asked, None
+        _convert_regions, None
     )
     test_targets: ConvertedField["str | Path | Iterable[str | Path] | None", "tuple[str | Path, ...] | None"] = (
-        ConvertedField(_probes, None)
+        ConvertedField(_convert_test_targets, None)
     )
     cell_m: float | None = None
     thresholds_m: ConvertedField[float | Iterable[float], tuple[float, ...]] = ConvertedField(
-        _thresholds, DEFAULTS.thresholds_m
+        _convert_thresholds, DEFAULTS.thresholds_m
     )
     aggregations: ConvertedField["str | Sequence[Aggregation | str]", "tuple[Aggregation, ...]"] = ConvertedField(
-        _aggregations, DEFAULTS.aggregations
+        _convert_aggregations, DEFAULTS.aggregations
     )
     reference: str | None = None
     num_rays: int | None = None
@@ -222,93 +249,98 @@ class Settings:
     band_frame: Literal["ground", "vehicle"] | None = None
     frame_interval_s: float | None = None
     target_error: ConvertedField["TargetError | str | Sequence[str] | None", "TargetError | None"] = ConvertedField(
-        _target, None
+        _convert_target_error, None
     )
     only_detection: bool = DEFAULTS.only_detection
     redundancy: bool = DEFAULTS.redundancy
-    metrics: ConvertedField[str | Iterable[str], tuple[str, ...]] = ConvertedField(_metrics, DEFAULTS.metrics)
+    metrics: ConvertedField[str | Iterable[str], tuple[str, ...]] = ConvertedField(_convert_metrics, DEFAULTS.metrics)
     device: ConvertedField["str | torch.device", str] = ConvertedField(str, DEFAULTS.device)
     num_workers: int | None = None
     no_cache: bool = DEFAULTS.no_cache
     skip_bad_frames: bool = DEFAULTS.skip_bad_frames
     observers: Annotated[
         "Mapping[str, AnyObserver]",
-        "What else looks at the same frames, by name; what they compute is in `Result.observed`.",
+        "Name -> observer of the same frames; `Result.observed` contains their results.",
     ] = field(default_factory=dict)
     checkpoint: Annotated[
         "Checkpoint | str | Path | None",
-        "File (`.npz`) that the run is saved to every minute and at its end. If it is there, the run goes on from it, "
-        "to the same bits, and with more steps if that is asked for; or `Checkpoint(path, resume=False)`. Observers "
-        "need `state_dict` and `load_state_dict` then.",
+        "File (`.npz`) to which the run is saved every minute and at its end. An existing file is resumed, with the "
+        "same result to the last bit, also with a larger `num_frames`; `Checkpoint(path, resume=False)` replaces it. "
+        "Observers then need `state_dict` and `load_state_dict`.",
     ] = None
     ranks: Annotated[
         "Ranks | None",
-        "Processes that share the run, from `join_ranks()`; all of them call this, and get the same result.",
+        "Processes that share the run, from `join_ranks()`; all of them call `evaluate` and get the same result.",
     ] = None
-    progress: Annotated[bool, "Whether to show a bar."] = False
+    progress: Annotated[bool, "Show a progress bar."] = False
     config_record: Annotated[
-        "Mapping[str, object]", "The file of settings that the run was given, for `summary.json`; see `load_config`."
+        "Mapping[str, object]", "Origin of the settings for `summary.json`, from `load_config`."
     ] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.num_frames is not None and self.num_frames < 1:
-            raise ValueError(f"steps: at least 1 is needed; got {self.num_frames}")
+            raise ValueError(f"num_frames: at least 1 is needed; got {self.num_frames}")
         check_memory_fits(f"{self.num_workers or 0:,} workers", BYTES_PER_WORKER * (self.num_workers or 0), "use fewer")
-        if self.average not in (None, "area", "cells"):
-            raise ValueError(f"average {self.average}: `area` or `cells` is needed")
-        if self.band_frame not in (None, "ground", "vehicle"):
-            raise ValueError(f"band_frame {self.band_frame}: `ground` or `vehicle` is needed")
-        if self.sensor_model not in (None, "ideal", "real"):
-            raise ValueError(f"sensor_model {self.sensor_model}: `ideal` or `real` is needed")
+        for name, choices in (
+            ("average", ("area", "cells")),
+            ("band_frame", ("ground", "vehicle")),
+            ("sensor_model", ("ideal", "real")),
+        ):
+            value = getattr(self, name)
+            if value is not None and value not in choices:
+                raise ValueError(f"{name} {value}: `{choices[0]}` or `{choices[1]}` is needed")
         if self.reference == "paper" and self.band_frame == "ground":
-            raise ValueError("band_frame ground: the paper's reference has bands over z of the vehicle; leave it out")
-        radii = self.target_error is not None and self.target_error.radius_m is not None
-        needs = radii or self.aggregations or self.redundancy or self.metrics or self.observers
-        if self.only_detection and (needs or not self.thresholds_m):
+            raise ValueError("band_frame ground: the paper reference has height bands of the vehicle frame; omit it")
+        needs_radii = self.target_error is not None and self.target_error.radius_m is not None
+        needs_clouds = self.aggregations or self.redundancy or self.metrics or self.observers
+        if self.only_detection and (needs_radii or needs_clouds or not self.thresholds_m):
             raise ValueError(
-                "only_detection: there are no radii, no aggregations, redundancy, metrics or observers then, and there "
-                "has to be a threshold; leave one of them out"
+                "only_detection: excludes radii, aggregations, redundancy, metrics and observers, and needs a "
+                "threshold; omit one of them"
             )
 
     @cached_property
     def mixture(self) -> "Mapping[str, tuple[AnyScenario, float]] | None":
-        """Name of each scenario -> what was given, and its share; None of a single one."""
-        return _mixture(self.scenario)
+        """Name of each scenario -> the scenario and its share; None if there is only one."""
+        return _convert_mixture(self.scenario)
 
     @property
     def single_scenario(self) -> "AnyScenario":
-        """The scenario, for what is done in one world.
+        """The scenario, for runs that take only one.
 
         Raises:
             ValueError: There are several.
         """
         if self.mixture is not None:
-            raise ValueError(f"scenario: one at a time here; got {', '.join(self.mixture)} (`evaluate` takes several)")
+            raise ValueError(
+                f"scenario: a single one is needed here; got {', '.join(self.mixture)} (`evaluate` takes several)"
+            )
         return cast("AnyScenario", DEFAULT_SCENARIO if self.scenario is None else self.scenario)
 
     @property
     def needs_boxes(self) -> bool:
-        """Whether a metric is about objects, so that frames are to have them."""
+        """True if a metric needs the bounding boxes of the frames."""
         if not self.metrics:
             return False
         published = load_contrib().PUBLISHED
         return any("boxes" in published[name].needs for name in self.metrics)
 
     def check_recording(self) -> None:
-        """Find out whether anything was set that a recording decides itself.
+        """Check that no setting was given that a recording determines.
 
         Raises:
-            ValueError: The vehicle, the sensor model, the reference sensor, its rays or the time between steps was set.
+            ValueError: Vehicle, sensor model, weather, reference sensor, rays, frame interval, test targets or
+                `only_detection` were given.
         """
         if self.sensor_model is not None or self.weather:
-            raise ValueError("sensor_model and weather are for simulations; a recording has the points that returned")
+            raise ValueError("sensor_model and weather are for simulations; a recording contains real returns")
         if self.only_detection:
-            raise ValueError("only_detection: for simulations; a recording has all its points")
+            raise ValueError("only_detection is for simulations; a recording contains all its points")
         if self.vehicle is not None and not isinstance(self.frames, str | Path):
-            raise ValueError("vehicle: for simulations and paths of recordings; frames have their own (recording.body)")
+            raise ValueError("vehicle is for simulations and paths of recordings; set the ego_box of the recording")
         if self.test_targets:
-            raise ValueError("test_targets: not for recordings, which have no scene to put a body into")
+            raise ValueError("test_targets are for simulations; a recording has no scene to place them in")
         if any(setting is not None for setting in (self.reference, self.num_rays, self.frame_interval_s)):
             raise ValueError(
-                "reference, rays and frame_interval_s are for simulations; a recording has its reference points"
+                "reference, num_rays and frame_interval_s are for simulations; a recording has its reference points"
             )

@@ -18,7 +18,7 @@ from torchcover.coverage import Region
 from torchcover.evaluation.config import DESCRIPTIONS
 from torchcover.evaluation.observers import AnyObserver
 from torchcover.evaluation.progress import show_wait
-from torchcover.evaluation.settings import DEFAULT_STEPS, MAX_STEPS, Settings
+from torchcover.evaluation.settings import DEFAULT_NUM_FRAMES, MAX_NUM_FRAMES, Settings
 from torchcover.frames import FrameSource, RigSubset
 from torchcover.recordings import RecordedFrames, open_recording
 from torchcover.simulation import (
@@ -198,7 +198,7 @@ def build_simulation_task(
         num_rays = params.only_detection_rays
     num_frames = settings.num_frames
     if num_frames is None:
-        num_frames = DEFAULT_STEPS if settings.target_error is None else MAX_STEPS
+        num_frames = DEFAULT_NUM_FRAMES if settings.target_error is None else MAX_NUM_FRAMES
     frames = SimulatedFrames(
         scenario,
         rigs=rigs,
@@ -287,7 +287,7 @@ def _limit_frames(frames: SimulatedFrames, settings: Settings) -> int | None:
     has_target = settings.num_frames is None and settings.target_error is not None
     if not has_target or num_distinct_frames in (None, 1):
         return None
-    return max(DEFAULT_STEPS, num_distinct_frames)
+    return max(DEFAULT_NUM_FRAMES, num_distinct_frames)
 
 
 def _build_recording_task(frames: FrameSource, settings: Settings) -> Task[FrameSource]:
