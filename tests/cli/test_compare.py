@@ -200,7 +200,7 @@ def test_what_is_not_in_a_recording_is_told_with_what_is(torchcover, recording, 
     assert torchcover("evaluate", *arguments)[0] == 0
     assert list(json.loads((tmp_path / "out" / "summary.json").read_text())["rigs"]) == ["far", "kitti", "near"]
     code, _, error = torchcover("evaluate", "kitti", "--set", "recording.format=folder")
-    assert (code, "recording.format: for a recording" in error) == (2, True)
+    assert (code, "recording.format: only for a recording" in error) == (2, True)
 
 
 @pytest.mark.parametrize(
