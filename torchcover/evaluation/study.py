@@ -222,31 +222,13 @@ def _build_trial_record(trial: Trial) -> dict[str, Any]:
     """Build the record of a trial for `summary.json`."""
     numbers = []
     for number in trial.numbers:
+        values = {"region": number.region, "band": number.band, "quantity": number.quantity.key, "value": number.value}
         difference = number.difference._asdict() if number.difference else {}
-        numbers.append(
-            to_json_record(
-                {
-                    "region": number.region,
-                    "band": number.band,
-                    "quantity": number.quantity.key,
-                    "value": number.value,
-                    "error_coefficient": number.error.error_coefficient,
-                    "bias": number.error.bias,
-                    "difference": to_json_record(
-                        {key: difference.get(key, math.nan) for key in ("value", "error", "p_value")}
-                    ),
-                }
-            )
-        )
-    return {
-        "options": trial.options,
-        "num_frames": trial.num_frames,
-        "min_frames": trial.min_frames,
-        "duration_s": trial.duration_s,
-        "cpu_s": trial.cpu_s,
-        "band_frame": trial.band_frame,
-        "numbers": numbers,
-    }
+        difference_values = {key: difference.get(key, math.nan) for key in ("value", "error", "p_value")}
+        errors = {**number.error._asdict(), "difference": to_json_record(difference_values)}
+        numbers.append(to_json_record({**values, **errors}))
+    names = ("options", "num_frames", "min_frames", "duration_s", "cpu_s", "band_frame")
+    return {**{name: getattr(trial, name) for name in names}, "numbers": numbers}
 
 
 def measure_error_against_time(plan: StudyPlan, *, show_progress: bool = False) -> Study:
@@ -315,9 +297,8 @@ def _run_trial(
             baseline_coefficients = baseline_error.square() * baseline.counts["num_frames"]
             ratios = (estimate.error / _mask_zero_errors(paired.error)).square()
             coefficients = torch.where(baseline_coefficients.isnan(), coefficients, baseline_coefficients * ratios)
-        for quantity, value, coefficient in zip(
-            estimate.quantities, estimate.value.tolist(), coefficients.tolist(), strict=True
-        ):
+        values = zip(estimate.quantities, estimate.value.tolist(), coefficients.tolist(), strict=True)
+        for quantity, value, coefficient in values:
             difference, is_biased, bias = None, False, 0.0
             if baseline is not None:
                 difference = differences.get(quantity.key, Difference(quantity, math.nan))
@@ -326,10 +307,10 @@ def _run_trial(
                     bias = abs(difference.value)
             error = ErrorModel(coefficient, bias)
             numbers.append(StudiedNumber(region.name, band, has_target, quantity, value, error, difference, is_biased))
-    blocks_frames = estimate_blocks_needed(num_frames, effective_blocks) if effective_blocks > 0 else num_frames
-    min_frames = max(MIN_FRAMES, blocks_frames)
-    duration_s = result.run.duration_s
-    return Trial(options, num_frames, min_frames, duration_s, cpu_s, coverage.band_frame, numbers), coverage
+    min_frames = estimate_blocks_needed(num_frames, effective_blocks) if effective_blocks > 0 else num_frames
+    times_s = result.run.duration_s, cpu_s
+    trial = Trial(options, num_frames, max(MIN_FRAMES, min_frames), *times_s, coverage.band_frame, numbers)
+    return trial, coverage
 
 
 def _mask_zero_errors(errors: Tensor) -> Tensor:
