@@ -1,11 +1,12 @@
-"""Compare the numbers of two checkouts: `python -m benchmarks.side_by_side OLD [NEW]`.
+"""Compare the numbers of two checkouts: `python -m benchmarks.side_by_side OLD [NEW] [@FILE]`.
 
-Runs short commands of each checkout and compares every number of `summary.json`, every array of the `.npz` files, the
-bytes of recordings and scenarios that are written, and every tensor of the first frames of each kind of source.
-Numbers have to be equal to the last bit; `--tolerance KEY=RELATIVE` allows a relative difference for keys that contain
-KEY. `--renamed OLD=NEW` names the new name of a key or an array; a `*` in NEW stands for all arrays that match,
-stacked. `--called 'NEW=>OLD'` replaces a text in the commands of OLD. `--expected TEXT` names an intended difference:
-complaints that contain the text are counted and listed apart. Times, versions and hashes of files are not compared.
+Runs short commands of each checkout and compares every value of `summary.json`, every array of the `.npz` files, the
+bytes of written recordings and scenarios, and every tensor of the first frames of each kind of source. Numbers must be
+equal to the last bit. Durations, versions and hashes of files are not compared.
+
+Renames between the checkouts are given by options, one per line in FILE: `--called=NEW=>OLD` replaces a text in the
+commands of OLD, `--renamed=OLD=NEW` renames parts of keys and words of values. `*` in both OLD and NEW stands for the
+same text; `*` in NEW alone stacks all arrays that match.
 """
 
 import argparse
@@ -13,6 +14,7 @@ import hashlib
 import json
 import math
 import os
+import re
 import subprocess
 import sys
 import tempfile
@@ -22,7 +24,7 @@ from pathlib import Path
 import numpy as np
 
 ROOT = Path(__file__).parents[1]
-# `CHECKOUT` is the folder of the checkout that runs, `RECORDING` is made here, `DRIVE` by each checkout.
+# CHECKOUT is the folder of the checkout that runs; RECORDING is written here, DRIVE by each checkout.
 RUNS = {
     "courtyard": "evaluate front_roof_128 --scenario courtyard --num-frames 9",
     "paper_pattern": "evaluate front_grille_128 --num-frames 2 --reference paper --num-rays 65536",
@@ -54,14 +56,15 @@ RUNS = {
     "rig": "rig --frames DRIVE",
 }
 SOURCES = {
-    "simulated_frames": "data.SimulatedFrames('urban', rigs={'kitti': 'kitti'}, steps=4)",
-    "frames_of_rigs": "data.SimulatedFrames('courtyard', rigs={'a': 'kitti', 'b': 'waymo'}, steps=4, vehicle='suv')",
+    "simulated_frames": "data.SimulatedFrames('urban', rigs={'kitti': 'kitti'}, num_frames=4)",
+    "rigs": "data.SimulatedFrames('courtyard', rigs={'a': 'kitti', 'b': 'waymo'}, num_frames=4, vehicle='suv')",
     "recorded_frames": "data.RecordedFrames('RECORDING')",
     "accumulated_frames": "data.RecordedFrames('DRIVE', reference=data.AccumulatedReference(1.0))",
 }
-# Exit codes of runs that end with an answer: requirements that are not met or not checked have codes of their own.
-ANSWERS = (0, 1, 3)
-NOT_COMPARED = ("seconds", "torchcover", "left_out", "complete", "frames", "files", "options", "journal")
+# Exit codes of runs that end with a result: requirements that are not met or not decided have codes of their own.
+RESULT_CODES = (0, 1, 3)
+# Keys of summary.json that depend on time, versions or paths.
+IGNORED_KEYS = ("duration_s", "torchcover", "omissions", "complete", "frames", "files", "options", "journal")
 PROGRAM = "from torchcover.cli.app import main; main()"
 FRAMES_PROGRAM = """
 import dataclasses, hashlib, json, sys
@@ -90,51 +93,59 @@ print(json.dumps(dict(pair for index in range(4) for pair in visit(frames[index]
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter, fromfile_prefix_chars="@"
+    )
     parser.add_argument("old", type=Path)
     parser.add_argument("new", type=Path, nargs="?", default=ROOT)
     parser.add_argument("--renamed", action="append", default=[], metavar="OLD=NEW")
     parser.add_argument("--called", action="append", default=[], metavar="NEW=>OLD")
-    parser.add_argument("--tolerance", action="append", default=[], metavar="KEY=RELATIVE")
-    parser.add_argument("--expected", action="append", default=[], metavar="TEXT")
+    parser.add_argument(
+        "--tolerance", action="append", default=[], metavar="KEY=RELATIVE", help="for keys that contain KEY"
+    )
+    parser.add_argument(
+        "--expected", action="append", default=[], metavar="TEXT", help="count complaints with this text separately"
+    )
+    parser.add_argument("--ignore-texts", action="store_true", help="do not compare texts in summary.json")
     parser.add_argument("--runs", nargs="+", choices=[*RUNS, *SOURCES], default=[*RUNS, *SOURCES])
     options = parser.parse_args()
     renamed = dict(pair.split("=") for pair in options.renamed)
     called = dict(pair.split("=>") for pair in options.called)
-    tolerances = {key: float(value) for key, value in (pair.split("=") for pair in options.tolerance)}
-    unexpected = 0
+    tolerances = {}
+    for pair in options.tolerance:
+        key, _, relative = pair.partition("=")
+        tolerances[key] = float(relative)
+    unexpected_count = 0
     with tempfile.TemporaryDirectory() as folder:
         write_recording(Path(folder, "recording"))
         checkouts = {"old": options.old.resolve(), "new": options.new.resolve()}
         for side, checkout in checkouts.items():  # each in its own format
             drive = "record kitti --scenario urban --num-frames 40 --frame-interval-s 0.1"
+            drive = substitute(drive, called) if side == "old" else drive
             run(checkout, [*drive.split(), "--out", f"{folder}/{side}/drive"], folder)
         for name in options.runs:
             results = []
             for side, checkout in checkouts.items():
-                places = {"RECORDING": f"{folder}/recording", "DRIVE": f"{folder}/{side}/drive"}
-                places["CHECKOUT"] = str(checkout)
-                if name in SOURCES:
-                    results.append(hash_frames(checkout, substitute(SOURCES[name], places), folder))
-                else:
-                    text = substitute(RUNS[name], called) if side == "old" else RUNS[name]
-                    words = substitute(text, places).split()
-                    results.append(run_and_read(name, checkout, words, Path(folder, side, name), folder))
+                replacements = dict(called) if side == "old" else {}
+                replacements |= {"RECORDING": f"{folder}/recording", "DRIVE": f"{folder}/{side}/drive"}
+                replacements["CHECKOUT"] = str(checkout)
+                results.append(read_values(name, checkout, replacements, Path(folder, side, name), folder))
+            if options.ignore_texts:
+                results = [remove_texts(values) for values in results]
             complaints = list(compare(*results, renamed, tolerances))
-            intended = [complaint for complaint in complaints if any(text in complaint for text in options.expected)]
-            others = [complaint for complaint in complaints if complaint not in intended]
-            unexpected += len(others)
-            print(
-                f"{name}: {count(results[0]):,} numbers, {len(others)} differ, {len(intended)} as intended", flush=True
-            )
-            for complaint in [*others[:20], *intended[:5]]:
+            expected = [complaint for complaint in complaints if any(text in complaint for text in options.expected)]
+            unexpected = [complaint for complaint in complaints if complaint not in expected]
+            unexpected_count += len(unexpected)
+            count = count_values(results[0])
+            print(f"{name}: {count:,} values, {len(unexpected)} differ, {len(expected)} as expected", flush=True)
+            for complaint in [*unexpected[:20], *expected[:5]]:
                 print(f"  {complaint}", flush=True)
-    sys.exit(unexpected > 0)
+    sys.exit(unexpected_count > 0)
 
 
-def substitute(text, places):
-    for key, place in places.items():
-        text = text.replace(key, place)
+def substitute(text, replacements):
+    for key, replacement in replacements.items():
+        text = text.replace(key, replacement)
     return text
 
 
@@ -151,24 +162,30 @@ def run_python(checkout, program, arguments, folder):
 
 
 def run(checkout, arguments, folder):
-    """Run one command of one checkout and return what it prints."""
+    """Run one command of one checkout and return its output."""
     done = run_python(checkout, PROGRAM, arguments, folder)
-    if done.returncode not in ANSWERS or "Traceback" in done.stderr:
+    if done.returncode not in RESULT_CODES or "Traceback" in done.stderr:
         sys.exit(f"{checkout}: {' '.join(arguments)} ended with {done.returncode}\n{done.stdout}{done.stderr}")
     return done.stdout
 
 
-def run_and_read(name, checkout, words, out, folder):
-    """Run one command; the values of everything that it writes, or prints if it writes nothing, by key."""
+def read_values(name, checkout, replacements, out, folder):
+    """Run one command, or read frames of one source, and return the values by key."""
+    if name in SOURCES:
+        return hash_frames(checkout, substitute(SOURCES[name], replacements), folder)
+    arguments = substitute(RUNS[name], replacements).split()
     if name == "rig":
-        return {"printed": run(checkout, words, folder).replace(str(out.parent), "")}
-    run(checkout, [*words, "--out", str(out)], folder)
+        return {"printed": run(checkout, arguments, folder).replace(str(out.parent), "")}
+    run(checkout, [*arguments, "--out", str(out)], folder)
     if name.startswith(("record_", "world")) or name == "record":
-        paths = sorted(path for path in out.rglob("*") if path.is_file())
-        contents = {str(path.relative_to(out)): path.read_bytes() for path in paths}
-        side = str(out.parent).encode()
-        return {name: hashlib.sha256(content.replace(side, b"")).hexdigest() for name, content in contents.items()}
-    values = {key: value for key, value in flatten(read_summary(out)) if is_number_of_rig(key)}
+        hashes, side = {}, str(out.parent).encode()
+        for path in sorted(path for path in out.rglob("*") if path.is_file()):
+            hashes[str(path.relative_to(out))] = hashlib.sha256(path.read_bytes().replace(side, b"")).hexdigest()
+        return hashes
+    values = {}
+    for key, value in flatten(read_summary(out)):
+        if not set(IGNORED_KEYS) & {key.split("/")[0], key.split("/")[-1]}:
+            values[key] = value
     for path in sorted(out.rglob("*.npz")):
         with np.load(path) as arrays:
             for array in set(arrays.files) - {"header"}:
@@ -176,14 +193,8 @@ def run_and_read(name, checkout, words, out, folder):
     return values
 
 
-def is_number_of_rig(key):
-    """Whether a path is about what was measured, not about the run."""
-    parts = key.split("/")
-    return parts[0] not in NOT_COMPARED and parts[-1] != "seconds"
-
-
 def hash_frames(checkout, source, folder):
-    """A hash of each tensor of the first four frames of a source."""
+    """Compute a hash of each tensor of the first four frames of a source."""
     done = run_python(checkout, FRAMES_PROGRAM.replace("SOURCE", source), [], folder)
     if done.returncode:
         sys.exit(f"{checkout}: {source} ended with {done.returncode}\n{done.stderr}")
@@ -203,20 +214,22 @@ def write_recording(folder):
 
 
 def read_summary(out):
-    """Content of summary.json with its rows by what they are about; without the rig's name if there is one rig."""
+    """Read summary.json with its rows by rig, region and band; without the name of the rig if there is one rig."""
     content = json.loads((out / "summary.json").read_text(encoding="utf-8"))
     rows = content.pop("rows", None)
     if not isinstance(rows, list) or not all("region" in row for row in rows):
-        return {**content, "rows": {str(position): row for position, row in enumerate(rows or [])}}
-    several = len({row.get("rig") for row in rows}) > 1
-    named = {f"{row['rig'] if several else ''} {row['region']} {row['height']}": row for row in rows}
+        return {**content, "rows": {str(index): row for index, row in enumerate(rows or [])}}
+    has_rigs = len({row.get("rig") for row in rows}) > 1
+    named = {}
     for row in rows:
-        row.pop("rig", None)
+        rig = row.pop("rig", "") if has_rigs else row.pop("rig", "") * 0
+        band = row.get("band", row.get("height"))  # its name before the renames of 0.1.0
+        named[f"{rig} {row['region']} {band}"] = row
     return {**content, "rows": named}
 
 
 def flatten(content, prefix=""):
-    """Yield (path, value) of everything that is neither a mapping nor a list."""
+    """Yield (path, value) of all values that are neither a mapping nor a list."""
     items = content.items() if isinstance(content, dict) else enumerate(content)
     for key, value in items:
         if isinstance(value, dict | list):
@@ -225,50 +238,79 @@ def flatten(content, prefix=""):
             yield f"{prefix}{key}", value
 
 
-def count(values):
+def remove_texts(values):
+    """Remove texts, but not hashes of tensors and files."""
+    kept_hash = re.compile(r"(\S+ \(.*\) )?[0-9a-f]{64}")
+    numbers = {}
+    for key, value in values.items():
+        if not isinstance(value, str) or kept_hash.fullmatch(value):
+            numbers[key] = value
+    return numbers
+
+
+def count_values(values):
     return sum(value.size if isinstance(value, np.ndarray) else 1 for value in values.values())
 
 
 def compare(old, new, renamed, tolerances):
-    """Yield a sentence for each value of `old` that `new` lacks or has otherwise."""
+    """Yield a sentence for each value of `old` that is missing or different in `new`.
+
+    Args:
+        old: Key -> value.
+        new: Key -> value.
+        renamed: Old part of a key, or old text -> new one.
+        tolerances: Part of a key -> relative tolerance.
+    """
     for key, value in old.items():
-        name = "/".join(renamed.get(part, part) for part in key.split("/"))
-        other = find_value(name, new)
-        allowed = max((relative for text, relative in tolerances.items() if text in key), default=0.0)
-        if other is None and value is not None:
+        name = "/".join(rename(part, renamed) for part in key.split("/"))
+        new_value = find_value(name, new)
+        relative = max((relative for text, relative in tolerances.items() if text in key), default=0.0)
+        expected = rename(value, renamed) if isinstance(value, str) else value
+        if new_value is None and value is not None:
             yield f"{key}: missing"
-        elif not are_equal(value, other, allowed):
-            yield f"{key}: {describe_difference(value, other)}"
+        elif not are_equal(expected, new_value, relative):
+            yield f"{key}: {describe_difference(value, new_value)}"
+
+
+def rename(text, renamed):
+    """Rename a part of a key or a text by the first matching rule; `*` on both sides stands for the same text."""
+    if text in renamed:
+        return renamed[text]
+    for pattern, replacement in renamed.items():
+        if "*" in pattern and fnmatchcase(text, pattern):
+            prefix, suffix = pattern.split("*")
+            return replacement.replace("*", text[len(prefix) : len(text) - len(suffix)])
+    return text
 
 
 def find_value(name, values):
-    """The value of a name; for a name with `*`, all values that match, stacked in their order."""
+    """Find the value of a name; for a name with `*`, all values that match, stacked in their order."""
     if "*" not in name:
         return values.get(name)
-    matching = [values[other] for other in values if fnmatchcase(other, name)]
+    matching = [values[key] for key in values if fnmatchcase(key, name)]
     return np.stack(matching) if matching else None
 
 
-def are_equal(value, other, relative):
-    if isinstance(value, np.ndarray):
-        if not isinstance(other, np.ndarray) or value.shape != other.shape:
+def are_equal(old, new, relative):
+    if isinstance(old, np.ndarray):
+        if not isinstance(new, np.ndarray) or old.shape != new.shape:
             return False
-        numeric = value.dtype.kind in "fc"
-        if relative and numeric:
-            return np.allclose(value, other, rtol=relative, atol=0, equal_nan=True)
-        return np.array_equal(value, other, equal_nan=numeric)
-    if relative and isinstance(value, float) and isinstance(other, float):
-        return math.isclose(value, other, rel_tol=relative)
-    return value == other or (value != value and other != other)
+        is_numeric = old.dtype.kind in "fc"
+        if relative and is_numeric:
+            return np.allclose(old, new, rtol=relative, atol=0, equal_nan=True)
+        return np.array_equal(old, new, equal_nan=is_numeric)
+    if relative and isinstance(old, float) and isinstance(new, float):
+        return math.isclose(old, new, rel_tol=relative)
+    return old == new or (old != old and new != new)
 
 
-def describe_difference(value, other):
-    if not isinstance(value, np.ndarray):
-        return f"{value} and {other}"
-    if not isinstance(other, np.ndarray) or value.shape != other.shape:
-        return f"array of {value.shape} and {getattr(other, 'shape', other)}"
-    unequal = (value != other) & ~((value != value) & (other != other))
-    return f"{np.count_nonzero(unequal):,} of {value.size:,} elements differ"
+def describe_difference(old, new):
+    if not isinstance(old, np.ndarray):
+        return f"{old} and {new}"
+    if not isinstance(new, np.ndarray) or old.shape != new.shape:
+        return f"array of {old.shape} and {getattr(new, 'shape', new)}"
+    is_different = (old != new) & ~((old != old) & (new != new))
+    return f"{np.count_nonzero(is_different):,} of {old.size:,} elements differ"
 
 
 if __name__ == "__main__":
