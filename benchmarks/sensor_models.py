@@ -19,8 +19,9 @@ from torchcover.data import SimulatedFrames, open_recording
 from torchcover.geometry import invert, transform_points
 from torchcover.recordings.vehicle_cloud import transform_to_vehicle
 from torchcover.simulation import Lidar, Material, PaperReference, Rig, Scenario, Simulator
-from torchcover.simulation.recorded_returns import HALF_LANES_M, count_ground_rays, fit_returns, fit_road_profile
+from torchcover.simulation.recorded_returns import fit_returns
 from torchcover.simulation.returns import compute_log_excess, compute_return_probability
+from torchcover.simulation.road_returns import RoadParams, count_ground_rays, fit_road_profile
 
 BINS_M = (10.0, 20.0, 30.0, 40.0, 50.0, 70.0, 100.0)
 VEHICLE_BINS_M = (5.0, 10.0, 20.0, 40.0, 60.0, 100.0)
@@ -67,7 +68,7 @@ def predicted(rays, road):
     first = np.floor((rays.azimuth_deg + 180.0) / STRIPE_DEG) % 2 == 0
     probability = np.empty(len(first))
     for half in (first, ~first):
-        fit = fit_returns(rays.some(~half), road)
+        fit = fit_returns(rays.select(~half), road)
         probability[half] = probabilities(rays.some(half), road, fit.range_at_10_percent_m, fit.log_range_std)
     return probability
 
@@ -261,7 +262,8 @@ def main():
             place_m, on_road = lidar.mount.to_matrix()[:3, 3], []
             for points_m in sweeps:
                 above_m = points_m[:, 2] - fit_road_profile(points_m).compute_heights_m(points_m)
-                on_road.append(points_m[(np.abs(above_m) < 0.15) & (np.abs(points_m[:, 1]) < 3 * HALF_LANES_M)])
+                is_close = np.abs(points_m[:, 1]) < 3 * RoadParams().half_lanes_m
+                on_road.append(points_m[(np.abs(above_m) < 0.15) & is_close])
             real = [nearest_road(one, place_m) for one in on_road]
             model = nearest_road(simulated[lidar.name].points, place_m)
             cones += [(label, f"{np.median([one[at] for one in real]):.1f} / {model[at]:.1f}", at) for at in DIRECTIONS]

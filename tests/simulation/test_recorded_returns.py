@@ -5,14 +5,9 @@ import pytest
 
 from torchcover.recordings import open_recording
 from torchcover.simulation import Rig, calibrate
-from torchcover.simulation.recorded_returns import (
-    HALF_LANES_M,
-    NEAREST_M,
-    count_ground_rays,
-    fit_returns,
-    fit_road_profile,
-)
+from torchcover.simulation.recorded_returns import fit_returns
 from torchcover.simulation.returns import Material, compute_log_excess, compute_return_probability
+from torchcover.simulation.road_returns import RoadParams, count_ground_rays, fit_road_profile
 
 RANGE_M, SPREAD, NOISE_M, HEIGHT_M = 60.0, 0.25, 0.02, 1.9
 RIG = Rig.model_validate(
@@ -147,7 +142,7 @@ def test_the_road_is_found_where_it_tilts_and_bends():
 
 def test_what_lies_beside_the_lanes_is_no_road():
     x, y = np.meshgrid(np.linspace(-60, 60, 121), np.linspace(-20, 20, 81))
-    lanes = np.abs(y) < HALF_LANES_M
+    lanes = np.abs(y) < RoadParams().half_lanes_m
     points_m = np.stack([x, y, 0.02 * x + 0.3 * ~lanes], axis=-1)
     whole, alone = fit_road_profile(points_m.reshape(-1, 3)), fit_road_profile(points_m[lanes])
     np.testing.assert_allclose(
@@ -158,7 +153,7 @@ def test_what_lies_beside_the_lanes_is_no_road():
 def test_rays_to_what_is_near_are_in_nobodys_count(sweeps):
     """The steep ones: they return, whatever the LiDAR."""
     assert np.tan(np.deg2rad(RIG.sensors[0].compute_elevations_deg())).min() < -HEIGHT_M / 5
-    assert count_ground_rays(sweeps, RIG.sensors[0]).range_m.min() > NEAREST_M
+    assert count_ground_rays(sweeps, RIG.sensors[0]).range_m.min() > RoadParams().min_range_m
 
 
 def test_near_road_cannot_tell_how_far_a_lidar_sees(sweeps, tmp_path):
@@ -176,7 +171,7 @@ def test_near_road_cannot_tell_how_far_a_lidar_sees(sweeps, tmp_path):
     ("sweeps_made", "poses", "told"),
     [
         (lambda made: [points_m[:0] for points_m in made], 5.0, "0 rays to an open road"),
-        (lambda made: made, 0.1, "the vehicle stands, 3 sweeps within 0.20 m"),
+        (lambda made: made, 0.1, "the vehicle does not move, 3 sweeps within 0.20 m"),
         (lambda made: [*made[:2], made[0]], False, "roof: sweeps 0 and 2 are the same cloud"),
     ],
     ids=["empty", "standing", "one sweep again"],

@@ -1,203 +1,55 @@
-"""Which rays of a real LiDAR returned from the road, and which should have: how a rig is calibrated by a recording."""
+"""Calibration of the range of LiDARs by the rays that returned from a road in a recording."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from torchcover.geometry import invert, transform_points
-from torchcover.geometry.arrays import Bools, Float32, Float64, Int64
+from torchcover.geometry.arrays import Float32, Float64
 from torchcover.recordings.recording import Recording
 from torchcover.recordings.vehicle_cloud import transform_to_vehicle
 from torchcover.simulation.lidar import Lidar
 from torchcover.simulation.returns import MAX_RETURN_PROBABILITY, Material, compute_log_excess
 from torchcover.simulation.rig import Rig
-
-# Of a road that is straight ahead; beside it there are kerbs and grass. Its height is fitted to the inner part.
-HALF_ROAD_M, HALF_LANES_M = 10.0, 7.0
-# Rays to nearer ground always return, or the vehicle hides them.
-NEAREST_M, FARTHEST_M = 10.0, 125.0
-SECTOR_DEG = 0.5
-# Higher than this above the road, or lower than what no road hides, is in nobody's way.
-OVERHEAD_M = 2.5
-# How far a return from the ground may lie off it, and how much of that is an error of the ground.
-OFF_GROUND_M, OFF_GROUND_SHARE = 0.12, 0.005
-# Shares of the range to the ground: a ray is free that meets nothing before it, and returned if it ended about there.
-CLEAR, ABOUT = 0.97, (0.85, 1.2)
-# A sector in which fewer of the nearest rays return is blocked by the vehicle or by the housing of another sensor.
-OPEN_SHARE = 0.6
-# What is known before anything was seen: the spread of ln range.
-USUAL_SPREAD, SPREAD_IS_SURE_TO = 0.3, 0.7
-# Twice the range is refused where ln of the likelihood falls by so much: two standard errors.
-LESS_LIKELY = 2.0
-CURVATURE_OVER = 0.05
-FEWEST_RAYS = 200
-# A drive of less sees one road.
-LEAST_WAY_M = 2.0
-NOISE_WITHIN_M = 12.0
+from torchcover.simulation.road_returns import GroundRays, RoadParams, assign_rows, count_ground_rays, fit_road_profile
 
 
-class GroundRays(NamedTuple):
-    """Rays that point at the road, nothing being in their way, by (C,) cells: one row in one sector of one sweep.
+@dataclass(frozen=True)
+class CalibrationParams:
+    """Parameters of the calibration of a LiDAR by a recording.
 
-    How far the ground is there and how the rays meet it, how many rays there are, and how many of them returned from
-    there: too many where a row is taken for its neighbour. `azimuth_deg` is the middle of the sector in the sensor's
-    frame.
+    Args:
+        prior_std: Most likely standard deviation of ln range without a recording.
+        prior_log_error: Standard deviation of its logarithm.
+        min_log_likelihood_drop: The range is observable if twice the range reduces the log-likelihood by this much:
+            two standard errors.
+        derivative_step: Step of the numerical second derivative of the log-likelihood.
+        min_rays: Smallest number of rays to a road, and of differences for the noise.
+        min_displacement_m: Smallest motion of the vehicle in a recording of several sweeps.
+        max_noise_range_m: Range up to which the noise of ranges is measured.
+        road: Parameters of the search for rays.
     """
 
-    range_m: Float64
-    cos_incidence: Float64
-    ray_counts: Float64
-    return_counts: Float64
-    azimuth_deg: Float64
-    sweep_indices: Int64
-
-    def select(self, mask: Bools) -> "GroundRays":
-        """Those of some cells."""
-        return GroundRays._make(column[mask] for column in self)
-
-
-class RoadProfile(NamedTuple):
-    """The road as z of the vehicle frame: `level_m` + two slopes, and a curvature ahead and one behind."""
-
-    coefficients: Float64
-
-    def compute_heights_m(self, points_m: Float64) -> Float64:
-        """(N,) z of the road below N points."""
-        return np.asarray(_terms(points_m) @ self.coefficients)
-
-
-def _terms(points_m: Float64) -> Float64:
-    x, y = points_m[:, 0], points_m[:, 1]
-    squared = (x / 40.0) ** 2
-    return np.column_stack([np.ones(len(x)), x, y, squared * (x > 0), squared * (x < 0)])
-
-
-def fit_road_profile(points_m: Float64) -> RoadProfile:
-    """Fit the road under a sweep, (N, 3) points in the vehicle frame, from near to far."""
-    range_m = np.hypot(points_m[:, 0], points_m[:, 1])
-    chosen = (np.abs(points_m[:, 1]) < HALF_LANES_M) & (range_m < 90.0) & (range_m > 3.5)
-    points_m, range_m = points_m[chosen], range_m[chosen]
-    low = (range_m < 15.0) & (np.abs(points_m[:, 2]) < 0.6)
-    terms, coefficients = _terms(points_m), np.zeros(5)
-    if low.any():
-        coefficients[0] = np.median(points_m[low, 2])
-    # A curvature has to be shown: without far points it is none.
-    shrink = np.diag([0.0, 0.0, 0.0, 2000.0, 2000.0])
-    for farthest_m in (10, 12, 15, 20, 25, 30, 40, 50, 60, 80, 80):
-        off_m = np.abs(points_m[:, 2] - terms @ coefficients)
-        near = (off_m < OFF_GROUND_M + 0.004 * range_m) & (range_m < farthest_m)
-        if np.count_nonzero(near) < 50:
-            continue
-        weighted = terms[near].T * range_m[near] ** 2  # a square metre counts alike, wherever it is
-        coefficients = np.linalg.solve(weighted @ terms[near] + shrink, weighted @ points_m[near, 2])
-    return RoadProfile(coefficients)
-
-
-def count_ground_rays(sweeps: Sequence[NDArray[np.floating]], lidar: Lidar) -> GroundRays:
-    """The rays of a LiDAR that point at the road, and how many of them returned.
-
-    Which rays there were is known from its scan pattern: the row of a return is the nearest one, and each row has
-    `columns` rays to a turn.
-    """
-    found = [_of_sweep(np.asarray(points_m, dtype=np.float64), lidar, number) for number, points_m in enumerate(sweeps)]
-    return GroundRays._make(np.concatenate(columns) for columns in zip(*found, strict=True))
-
-
-def _of_sweep(points_m: Float64, lidar: Lidar, number: int) -> GroundRays:
-    vehicle_T_sensor, rows_deg = lidar.mount.to_matrix(), np.sort(lidar.compute_elevations_deg())
-    road, sectors = fit_road_profile(points_m), round(360.0 / SECTOR_DEG)
-    row, azimuth_deg, range_m = _in_rows(points_m, lidar)
-    sector = np.floor((azimuth_deg + 180.0) / SECTOR_DEG).astype(np.int64) % sectors
-    above_m = points_m[:, 2] - road.compute_heights_m(points_m)
-    middle_deg: Float64 = (np.arange(sectors, dtype=np.float64) + 0.5) * SECTOR_DEG - 180.0
-    expected_m, place_m = _expected(vehicle_T_sensor, rows_deg, middle_deg, road)
-    height_m = vehicle_T_sensor[2, 3] - road.compute_heights_m(vehicle_T_sensor[None, :3, 3])[0]
-    stands = (above_m > OFF_GROUND_M + OFF_GROUND_SHARE * range_m) & (above_m < OVERHEAD_M) & (range_m > 2.0)
-    order = np.flatnonzero(stands)[np.argsort(sector[stands], kind="stable")]
-    of_sector = np.split(order, np.searchsorted(sector[order], np.arange(1, sectors)))
-    blocked = np.empty(expected_m.shape, dtype=np.bool_)
-    for k in range(sectors):
-        there = np.concatenate([of_sector[beside % sectors] for beside in (k - 1, k, k + 1)])
-        blocked[:, k] = _blocked(expected_m[:, k], height_m, range_m[there], above_m[there])
-    cell = row * sectors + sector
-    share = range_m / expected_m.reshape(-1)[cell]
-
-    def counted(which: Bools) -> Float64:
-        return np.bincount(cell[which], minlength=expected_m.size).reshape(expected_m.shape).astype(np.float64)
-
-    returned, beyond = counted((share > ABOUT[0]) & (share < ABOUT[1])), counted(share >= ABOUT[1])
-    rays = np.maximum(lidar.columns * SECTOR_DEG / lidar.horizontal_fov_deg - beyond, 0.0)
-    free = ~blocked & (np.abs(place_m[..., 1]) < HALF_ROAD_M) & (rays > 0)
-    free &= (expected_m > NEAREST_M) & (expected_m < FARTHEST_M)
-    near = free & (expected_m < 2 * NEAREST_M)
-    opened = (returned * near).sum(axis=0) >= OPEN_SHARE * (rays * near).sum(axis=0)
-    free &= opened & near.any(axis=0)
-    azimuths_deg = np.broadcast_to(middle_deg, expected_m.shape)
-    return GroundRays(
-        expected_m[free],
-        height_m / expected_m[free],
-        rays[free],
-        returned[free],
-        azimuths_deg[free],
-        np.full(np.count_nonzero(free), number, dtype=np.int64),
-    )
-
-
-def _in_rows(points_m: Float64, lidar: Lidar) -> tuple[NDArray[np.intp], Float64, Float64]:
-    """(N,) row of a LiDAR that each point is nearest to, its azimuth in degrees and its range."""
-    in_sensor_m = transform_points(invert(lidar.mount.to_matrix()), points_m)
-    x, y, z = in_sensor_m.T
-    rows_deg, elevation_deg = np.sort(lidar.compute_elevations_deg()), np.rad2deg(np.arctan2(z, np.hypot(x, y)))
-    row = np.searchsorted((rows_deg[1:] + rows_deg[:-1]) / 2, elevation_deg)
-    return row, np.rad2deg(np.arctan2(y, x)), np.linalg.norm(in_sensor_m, axis=1)
-
-
-def _blocked(expected_m: Float64, height_m: float, range_m: Float64, above_m: Float64) -> Bools:
-    """(rows,) whether what stands in a sector, (K,) points of it, is in the way of rays to the road.
-
-    A ray passes over what is lower than the ray is there. Two points are needed, for one may be rain or dust.
-    """
-    ray_m = height_m * (1.0 - range_m[None] / expected_m[:, None])
-    in_the_way = (range_m[None] * CLEAR < expected_m[:, None]) & (above_m[None] > ray_m - OFF_GROUND_M)
-    return np.asarray(np.count_nonzero(in_the_way, axis=1) > 1)
-
-
-def _expected(
-    vehicle_T_sensor: Float64, rows_deg: Float64, azimuths_deg: Float64, road: RoadProfile
-) -> tuple[Float64, Float64]:
-    """(rows, sectors) range to the road along each ray, infinite where it meets none, and (rows, sectors, 3) where."""
-    elevation, azimuth = np.deg2rad(rows_deg)[:, None], np.deg2rad(azimuths_deg)[None]
-    flat = np.cos(elevation)
-    towards = np.stack(np.broadcast_arrays(flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)), axis=-1)
-    shape, towards = towards.shape, towards.reshape(-1, 3) @ vehicle_T_sensor[:3, :3].T
-    origin_m = vehicle_T_sensor[:3, 3]
-
-    def above_m(range_m: Float64) -> Float64:
-        points_m = origin_m + towards * range_m[:, None]
-        return np.asarray(points_m[:, 2] - road.compute_heights_m(points_m))
-
-    # The road bends little: the first crossing is looked for in steps, then halved down to a millimetre.
-    near_m, far_m = np.full(len(towards), 1.0), np.full(len(towards), np.inf)
-    for range_m in np.geomspace(2.0, 2 * FARTHEST_M, 60):
-        below = np.isinf(far_m) & (above_m(np.full(len(towards), range_m)) <= 0)
-        far_m[below] = range_m
-        near_m[np.isinf(far_m)] = range_m
-    met = np.isfinite(far_m)
-    for _ in range(20):
-        middle_m = np.where(met, (near_m + np.where(met, far_m, 0.0)) / 2, 1.0)
-        is_below = above_m(middle_m) <= 0
-        far_m = np.where(met & is_below, middle_m, far_m)
-        near_m = np.where(met & ~is_below, middle_m, near_m)
-    places_m = origin_m + towards * np.where(met, far_m, 0.0)[:, None]
-    return far_m.reshape(shape[:2]), places_m.reshape(*shape[:2], 3)
+    prior_std: float = 0.3
+    prior_log_error: float = 0.7
+    min_log_likelihood_drop: float = 2.0
+    derivative_step: float = 0.05
+    min_rays: int = 200
+    min_displacement_m: float = 2.0
+    max_noise_range_m: float = 12.0
+    road: RoadParams = RoadParams()
 
 
 class ReturnFit(NamedTuple):
-    """Range at 10 % and spread of ln range of a LiDAR, the likeliest from rays to a road, and errors of ln of both.
+    """Maximum-likelihood estimate of the range of a LiDAR.
 
-    `is_range_observable` says whether the recording tells: twice the range would have left other returns.
+    Args:
+        range_at_10_percent_m: Range at 10 % reflectivity.
+        log_range_std: Standard deviation of ln range.
+        log_range_error: Standard error of ln `range_at_10_percent_m`.
+        log_std_error: Standard error of ln `log_range_std`.
+        is_range_observable: Whether the recording determines the range: twice the range would cause other returns.
     """
 
     range_at_10_percent_m: float
@@ -207,46 +59,66 @@ class ReturnFit(NamedTuple):
     is_range_observable: bool
 
 
-def fit_returns(rays: GroundRays, road_material: Material) -> ReturnFit:
-    """The likeliest range at 10 % and spread. The rays of a cell meet one spot, and count as one."""
+def fit_returns(
+    rays: GroundRays, road_material: Material, params: CalibrationParams = CalibrationParams()
+) -> ReturnFit:
+    """Fit the range and its spread to the returns from a road; all rays of a cell hit one spot and count as one.
+
+    Args:
+        rays: Rays towards the road.
+        road_material: Material of the road.
+        params: Prior of the spread.
+
+    Returns:
+        The estimate.
+    """
     from scipy.optimize import minimize, minimize_scalar
     from scipy.special import log_ndtr
 
-    at_one_metre = compute_log_excess(
+    excess_at_1_m = compute_log_excess(
         rays.range_m, rays.cos_incidence, road_material.numeric_reflectivity, road_material.incidence_exponent, 1.0
     )
-    returned = rays.return_counts / rays.ray_counts
+    return_share = rays.return_counts / rays.ray_counts
 
-    def surprise(logs: Float64) -> float:
-        """Of logarithms of both."""
-        excess = (at_one_metre + 2 * logs[0]) / np.hypot(2 * np.exp(logs[1]), road_material.log_reflectivity_std)
-        log_seen = np.log(MAX_RETURN_PROBABILITY) + log_ndtr(excess)
-        prior = ((logs[1] - np.log(USUAL_SPREAD)) / SPREAD_IS_SURE_TO) ** 2 / 2
-        return float(prior - (returned * log_seen + (1 - returned) * np.log1p(-np.exp(log_seen))).sum())
+    def compute_loss(parameters: Float64) -> float:
+        """Compute the negative log-likelihood of ln range and ln spread."""
+        log_range, log_std = parameters
+        excess = (excess_at_1_m + 2 * log_range) / np.hypot(2 * np.exp(log_std), road_material.log_reflectivity_std)
+        log_return = np.log(MAX_RETURN_PROBABILITY) + log_ndtr(excess)
+        prior = ((log_std - np.log(params.prior_std)) / params.prior_log_error) ** 2 / 2
+        log_likelihood = return_share * log_return + (1 - return_share) * np.log1p(-np.exp(log_return))
+        return float(prior - log_likelihood.sum())
 
-    # Of rays that all return, any long enough range is as likely: the search begins at a short one.
-    best = minimize(surprise, np.log([rays.range_m.max(), USUAL_SPREAD]), method="Nelder-Mead")
-    twice = minimize_scalar(lambda log_spread: surprise(np.array([best.x[0] + np.log(2.0), log_spread])), (-3.0, -1.0))
-    width = np.eye(2) * CURVATURE_OVER
-    around = [
-        [surprise(best.x + i * one + j * two) for i in (-1, 1) for j in (-1, 1)] for one in width for two in width
-    ]
-    curvature = np.reshape([(a - b - c + d) for a, b, c, d in around], (2, 2)) / (4 * CURVATURE_OVER**2)
-    errors = np.sqrt(np.maximum(np.diag(np.linalg.pinv(curvature, hermitian=True)), 0.0))
-    range_m, spread = np.exp(best.x).tolist()
-    range_error, spread_error = errors.tolist()
-    return ReturnFit(range_m, spread, range_error, spread_error, bool(twice.fun - best.fun > LESS_LIKELY))
+    # If all rays return, any range that is long enough is as likely: the search begins at a short range.
+    best = minimize(compute_loss, np.log([rays.range_m.max(), params.prior_std]), method="Nelder-Mead")
+
+    def compute_loss_of_twice_the_range(log_std: float) -> float:
+        return compute_loss(np.array([best.x[0] + np.log(2.0), log_std]))
+
+    twice = minimize_scalar(compute_loss_of_twice_the_range, (-3.0, -1.0))
+    step = params.derivative_step
+    hessian = np.empty((2, 2))
+    for row, first in enumerate(np.eye(2) * step):
+        for column, second in enumerate(np.eye(2) * step):
+            low_low, low_high = compute_loss(best.x - first - second), compute_loss(best.x - first + second)
+            high_low, high_high = compute_loss(best.x + first - second), compute_loss(best.x + first + second)
+            hessian[row, column] = (low_low - low_high - high_low + high_high) / (4 * step**2)
+    errors = np.sqrt(np.maximum(np.diag(np.linalg.pinv(hessian, hermitian=True)), 0.0))
+    range_m, log_range_std = np.exp(best.x).tolist()
+    log_range_error, log_std_error = errors.tolist()
+    is_observable = bool(twice.fun - best.fun > params.min_log_likelihood_drop)
+    return ReturnFit(range_m, log_range_std, log_range_error, log_std_error, is_observable)
 
 
 class LidarCalibration(NamedTuple):
-    """What a recording says of one LiDAR.
+    """Calibration of one LiDAR by a recording.
 
     Args:
-        name: Its name in the rig.
-        num_rays: How many rays pointed at the road.
-        max_range_m: So far away it was seen, at most.
-        fit: What fits best.
-        range_noise_m: Standard deviation of ranges about the road; NaN where none was seen closely.
+        name: Name in the rig.
+        num_rays: Number of rays towards the road.
+        max_range_m: Range of the farthest of them.
+        fit: Estimate of the range.
+        range_noise_m: Standard deviation of ranges to the road; NaN without near road.
     """
 
     name: str
@@ -257,128 +129,190 @@ class LidarCalibration(NamedTuple):
 
     @property
     def text(self) -> str:
-        """It in a line."""
-        fit, seen = self.fit, f"{self.num_rays:,.0f} rays to a road up to {self.max_range_m:.0f} m away"
+        """Result in one line."""
+        fit, rays = self.fit, f"{self.num_rays:,.0f} rays to a road up to {self.max_range_m:.0f} m away"
         noise = f"; noise {1e3 * self.range_noise_m:.1f} mm" if np.isfinite(self.range_noise_m) else ""
         if not fit.is_range_observable:
             return (
-                f"{self.name}: {seen} cannot tell how far it sees, for the road hardly fades in them; it takes far "
-                f"road in the open{noise}"
+                f"{self.name}: {rays} cannot tell the range, because nearly all of them return; a distant open road is "
+                f"needed{noise}"
             )
         low_m, high_m = fit.range_at_10_percent_m * np.exp([-fit.log_range_error, fit.log_range_error])
         return (
             f"{self.name}: {fit.range_at_10_percent_m:.0f} m at 10 % ({low_m:.0f} to {high_m:.0f}), spread "
-            f"{fit.log_range_std:.2f} (within a factor of {np.exp(fit.log_std_error):.1f}), from {seen}{noise}"
+            f"{fit.log_range_std:.2f} (within a factor of {np.exp(fit.log_std_error):.1f}), from {rays}{noise}"
         )
 
 
-def calibrate(recording: Recording, rig: Rig) -> tuple[Rig, list[LidarCalibration]]:
-    """Fit the LiDARs of a rig to a recording: the range at 10 % and the spread to how the road fades, and the noise.
+def calibrate(
+    recording: Recording, rig: Rig, params: CalibrationParams = CalibrationParams()
+) -> tuple[Rig, list[LidarCalibration]]:
+    """Calibrate the LiDARs of a rig: range at 10 % reflectivity, its spread, and noise.
 
-    The road is taken for dry asphalt, `datasets/materials/road.yaml`.
+    The road is assumed to be dry asphalt, `datasets/materials/road.yaml`.
 
     Args:
-        recording: What they recorded, on a straight road as far as can be.
-        rig: Where they are mounted and how they scan; sensors of a recording with one LiDAR may be called otherwise.
+        recording: Recording of the LiDARs, on a straight road if possible.
+        rig: Rig with mounts and scan patterns; names are ignored if rig and recording have one LiDAR each.
+        params: Parameters of the calibration.
 
     Returns:
-        The rig with what was found, and what that is for each LiDAR; where the road never fades, its keys stay.
+        The calibrated rig, and the calibration of each LiDAR; keys of ranges that are not observable are unchanged.
 
     Raises:
-        ValueError: No LiDAR of the rig is in the recording, no ray points at a road, the recording stands still, or a
-            sweep is in it twice.
+        ValueError: The recording has no LiDAR of the rig or no ray towards a road, the vehicle does not move, or a
+            sweep occurs twice.
         OSError: A file is missing.
     """
-    names = _paired(recording, rig)
-    _check_drive(recording)
-    road, found, sensors = Material.load("road"), [], []
+    recorded_names = match_sensor_names(recording, rig)
+    check_motion(recording, params)
+    road_material, calibrations, sensors = Material.load("road"), [], []
     for sensor in rig.sensors:
-        if not isinstance(sensor, Lidar) or sensor.name not in names:
+        if not isinstance(sensor, Lidar) or sensor.name not in recorded_names:
             sensors.append(sensor)
             continue
-        sweeps = [
-            transform_to_vehicle(recording.read_scan(names[sensor.name], index), recording.ego_box).points_m
-            for index in recording.key_frames
-        ]
-        _check_different(sweeps, f"{recording.path}: {sensor.name}")
-        told = _calibration(sensor, sweeps, road, str(recording.path))
+        sweeps = []
+        for index in recording.key_frames:
+            scan = recording.read_scan(recorded_names[sensor.name], index)
+            sweeps.append(transform_to_vehicle(scan, recording.ego_box).points_m)
+        check_sweeps_differ(sweeps, f"{recording.path}: {sensor.name}")
+        calibration = calibrate_lidar(sensor, sweeps, road_material, str(recording.path), params)
         keys = sensor.model_dump(exclude_unset=True)
-        if told.fit.is_range_observable:
-            keys |= {
-                "range_at_10_percent_m": round(told.fit.range_at_10_percent_m, 1),
-                "log_range_std": round(told.fit.log_range_std, 3),
-            }
-        if np.isfinite(told.range_noise_m):
-            keys["range_noise_m"] = round(told.range_noise_m, 4)
+        if calibration.fit.is_range_observable:
+            keys["range_at_10_percent_m"] = round(calibration.fit.range_at_10_percent_m, 1)
+            keys["log_range_std"] = round(calibration.fit.log_range_std, 3)
+        if np.isfinite(calibration.range_noise_m):
+            keys["range_noise_m"] = round(calibration.range_noise_m, 4)
         sensors.append(Lidar.model_validate(keys))
-        found.append(told)
-    return rig.model_copy(update={"sensors": tuple(sensors)}), found
+        calibrations.append(calibration)
+    return rig.model_copy(update={"sensors": tuple(sensors)}), calibrations
 
 
-def _paired(recording: Recording, rig: Rig) -> dict[str, str]:
-    """Name of a LiDAR of the rig -> what the recording calls it."""
+def match_sensor_names(recording: Recording, rig: Rig) -> dict[str, str]:
+    """Match the LiDARs of a rig and of a recording.
+
+    Args:
+        recording: The recording.
+        rig: The rig.
+
+    Returns:
+        Name in the recording by name in the rig.
+
+    Raises:
+        ValueError: They have no LiDAR in common.
+    """
     lidars = [sensor.name for sensor in rig.sensors if isinstance(sensor, Lidar)]
-    same = {name: name for name in lidars if name in recording.sensors}
-    if not same and len(lidars) == len(recording.sensors) == 1:
+    common_names = {name: name for name in lidars if name in recording.sensors}
+    if not common_names and len(lidars) == len(recording.sensors) == 1:
         return {lidars[0]: recording.sensors[0]}
-    if not same:
+    if not common_names:
         raise ValueError(
             f"{recording.path}: no LiDAR of the rig {rig.name!r} is in it; the rig has {', '.join(lidars) or 'none'}, "
             f"the recording {', '.join(recording.sensors)}"
         )
-    return same
+    return common_names
 
 
-def _check_drive(recording: Recording) -> None:
-    """Refuse several sweeps from one place: they see the same road, and would seem to know more than one does."""
-    frames = list(recording.key_frames)
-    if not frames:
+def check_motion(recording: Recording, params: CalibrationParams) -> None:
+    """Check that the vehicle moves: sweeps from one position show the same road, which would understate the errors.
+
+    Args:
+        recording: The recording.
+        params: Smallest displacement.
+
+    Raises:
+        ValueError: The recording has no sweep, or the vehicle does not move.
+    """
+    if not recording.key_frames:
         raise ValueError(f"{recording.path}: no sweep in it")
-    poses = [pose for index in frames if (pose := recording.get_world_T_vehicle(index)) is not None]
-    if len(poses) > 1:
-        way_m = float(np.ptp([pose[:3, 3] for pose in poses], axis=0).max())
-        if way_m < LEAST_WAY_M:
+    poses = [recording.get_world_T_vehicle(index) for index in recording.key_frames]
+    positions_m = [pose[:3, 3] for pose in poses if pose is not None]
+    if len(positions_m) > 1:
+        displacement_m = float(np.ptp(positions_m, axis=0).max())
+        if displacement_m < params.min_displacement_m:
             raise ValueError(
-                f"{recording.path}: the vehicle stands, {len(poses)} sweeps within {way_m:.2f} m, which see the same "
-                f"road: give one sweep, or a drive of {LEAST_WAY_M:g} m at least"
+                f"{recording.path}: the vehicle does not move, {len(positions_m)} sweeps within {displacement_m:.2f} m "
+                f"show the same road: use one sweep, or a drive of at least {params.min_displacement_m:g} m"
             )
 
 
-def _check_different(sweeps: Sequence[Float32], source: str) -> None:
-    """Refuse a sweep that is there again, as it may be where no poses tell that the vehicle stands."""
-    first: dict[bytes, int] = {}
-    for number, sweep in enumerate(sweeps):
-        same = first.setdefault(sweep.tobytes(), number)
-        if same != number and len(sweep):
+def check_sweeps_differ(sweeps: Sequence[Float32], source: str) -> None:
+    """Check that no sweep occurs twice, as is possible in recordings without poses.
+
+    Args:
+        sweeps: (N, 3) points of each sweep.
+        source: Recording and sensor, for messages.
+
+    Raises:
+        ValueError: Two sweeps are equal.
+    """
+    index_by_content: dict[bytes, int] = {}
+    for index, sweep in enumerate(sweeps):
+        first_index = index_by_content.setdefault(sweep.tobytes(), index)
+        if first_index != index and len(sweep):
             raise ValueError(
-                f"{source}: sweeps {same} and {number} are the same cloud, so that both know what one does; give each "
-                "sweep once"
+                f"{source}: sweeps {first_index} and {index} are the same cloud; use each sweep once, as copies "
+                "understate the errors"
             )
 
 
-def _calibration(lidar: Lidar, sweeps: Sequence[Float32], road: Material, source: str) -> LidarCalibration:
-    rays = count_ground_rays(sweeps, lidar)
-    if rays.ray_counts.sum() < FEWEST_RAYS:
+def calibrate_lidar(
+    lidar: Lidar, sweeps: Sequence[Float32], road_material: Material, source: str, params: CalibrationParams
+) -> LidarCalibration:
+    """Calibrate one LiDAR.
+
+    Args:
+        lidar: LiDAR with its mount and scan pattern.
+        sweeps: (N, 3) points of each sweep in the vehicle frame.
+        road_material: Material of the road.
+        source: Recording, for messages.
+        params: Parameters of the calibration.
+
+    Returns:
+        The calibration.
+
+    Raises:
+        ValueError: Too few rays point at a road.
+    """
+    rays = count_ground_rays(sweeps, lidar, params.road)
+    num_rays = float(rays.ray_counts.sum())
+    if num_rays < params.min_rays:
         raise ValueError(
-            f"{source}: {lidar.name} has {rays.ray_counts.sum():.0f} rays to an open road {NEAREST_M:g} to {FARTHEST_M:g} m "
-            f"away; {FEWEST_RAYS} are needed: a drive on a straight, level road, and a rig whose mounts are right"
+            f"{source}: {lidar.name} has {num_rays:.0f} rays to an open road {params.road.min_range_m:g} to "
+            f"{params.road.max_range_m:g} m away; {params.min_rays} are needed: a drive on a straight, level road, and "
+            "a rig with correct mounts"
         )
-    fit = fit_returns(rays, road)
-    noise_m = _noise_m(sweeps, lidar)
-    return LidarCalibration(lidar.name, float(rays.ray_counts.sum()), float(rays.range_m.max()), fit, noise_m)
+    fit = fit_returns(rays, road_material, params)
+    range_noise_m = estimate_range_noise_m(sweeps, lidar, params)
+    return LidarCalibration(lidar.name, num_rays, float(rays.range_m.max()), fit, range_noise_m)
 
 
-def _noise_m(sweeps: Sequence[Float32], lidar: Lidar) -> float:
-    """Noise of ranges to near road: second differences of three neighbours in a row are sqrt(6) of it."""
-    off_m, step_deg = [np.empty(0)], lidar.horizontal_fov_deg / lidar.columns
+def estimate_range_noise_m(sweeps: Sequence[Float32], lidar: Lidar, params: CalibrationParams) -> float:
+    """Estimate the noise of ranges to near road from second differences of three neighbors in a row.
+
+    Args:
+        sweeps: (N, 3) points of each sweep in the vehicle frame.
+        lidar: LiDAR with its mount and scan pattern.
+        params: Largest range, and smallest number of differences.
+
+    Returns:
+        Standard deviation in meters; NaN with too few differences.
+    """
+    differences_m, column_deg = [np.empty(0)], lidar.horizontal_fov_deg / lidar.columns
     for sweep in sweeps:
         points_m = sweep.astype(np.float64)
-        on_road = np.abs(points_m[:, 2] - fit_road_profile(points_m).compute_heights_m(points_m)) < OFF_GROUND_M
-        row, azimuth_deg, range_m = _in_rows(points_m[on_road & (np.abs(points_m[:, 1]) < HALF_LANES_M)], lidar)
+        height_m = points_m[:, 2] - fit_road_profile(points_m, params.road).compute_heights_m(points_m)
+        is_road = np.abs(height_m) < params.road.max_ground_offset_m
+        is_road &= np.abs(points_m[:, 1]) < params.road.half_lanes_m
+        row, azimuth_deg, range_m = assign_rows(points_m[is_road], lidar)
         order = np.lexsort((azimuth_deg, row))
         row, azimuth_deg, range_m = row[order], azimuth_deg[order], range_m[order]
-        together = (row[2:] == row[:-2]) & (azimuth_deg[2:] - azimuth_deg[:-2] < 2.5 * step_deg)
-        together &= range_m[1:-1] < NOISE_WITHIN_M
-        off_m.append((range_m[:-2] - 2 * range_m[1:-1] + range_m[2:])[together])
-    off = np.concatenate(off_m)
-    return float(np.median(np.abs(off)) / 0.6745 / np.sqrt(6.0)) if len(off) >= FEWEST_RAYS else float("nan")
+        are_neighbors = (row[2:] == row[:-2]) & (azimuth_deg[2:] - azimuth_deg[:-2] < 2.5 * column_deg)
+        are_neighbors &= range_m[1:-1] < params.max_noise_range_m
+        second_differences_m = range_m[:-2] - 2 * range_m[1:-1] + range_m[2:]
+        differences_m.append(second_differences_m[are_neighbors])
+    all_differences_m = np.concatenate(differences_m)
+    if len(all_differences_m) < params.min_rays:
+        return float("nan")
+    # A second difference has sqrt(6) times the noise; 0.6745 is the median of the absolute normal distribution.
+    return float(np.median(np.abs(all_differences_m)) / 0.6745 / np.sqrt(6.0))
