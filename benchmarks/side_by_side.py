@@ -5,8 +5,8 @@ bytes of written recordings and scenarios, and every tensor of the first frames 
 equal to the last bit. Durations, versions and hashes of files are not compared.
 
 Renames between the checkouts are given by options, one per line in FILE: `--called=NEW=>OLD` replaces a text in the
-commands of OLD, `--renamed=OLD=NEW` renames parts of keys and words of values. `*` in both OLD and NEW stands for the
-same text; `*` in NEW alone stacks all arrays that match.
+commands of OLD, `--renamed=OLD=NEW` renames parts of keys and texts. A rule with `/` renames the end of a key, with `#`
+for an index. `*` in both OLD and NEW stands for the same text; `*` in NEW alone stacks all arrays that match.
 """
 
 import argparse
@@ -64,7 +64,7 @@ SOURCES = {
 # Exit codes of runs that end with a result: requirements that are not met or not decided have codes of their own.
 RESULT_CODES = (0, 1, 3)
 # Keys of summary.json that depend on time, versions or paths.
-IGNORED_KEYS = ("duration_s", "torchcover", "omissions", "complete", "frames", "files", "options", "journal")
+IGNORED_KEYS = ("duration_s", "torchcover", "omissions", "complete", "frames", "files", "options", "journal", "space_sha256")
 PROGRAM = "from torchcover.cli.app import main; main()"
 FRAMES_PROGRAM = """
 import dataclasses, hashlib, json, sys
@@ -85,7 +85,7 @@ def visit(value, name):
         for position, item in enumerate(value):
             yield from visit(item, f"{name}/{position}")
     else:
-        yield name, repr(value)
+        yield name, value if isinstance(value, (bool, int, float)) else repr(value)
 
 frames = SOURCE
 print(json.dumps(dict(pair for index in range(4) for pair in visit(frames[index], f"frame {index}"))))
@@ -182,10 +182,9 @@ def read_values(name, checkout, replacements, out, folder):
         for path in sorted(path for path in out.rglob("*") if path.is_file()):
             hashes[str(path.relative_to(out))] = hashlib.sha256(path.read_bytes().replace(side, b"")).hexdigest()
         return hashes
-    values = {}
-    for key, value in flatten(read_summary(out)):
-        if not set(IGNORED_KEYS) & {key.split("/")[0], key.split("/")[-1]}:
-            values[key] = value
+    values = dict(flatten(read_summary(out)))
+    if (out / "search.json").is_file():
+        values |= flatten(json.loads((out / "search.json").read_text(encoding="utf-8")), "search.json/")
     for path in sorted(out.rglob("*.npz")):
         with np.load(path) as arrays:
             for array in set(arrays.files) - {"header"}:
@@ -240,10 +239,11 @@ def flatten(content, prefix=""):
 
 def remove_texts(values):
     """Remove texts, but not hashes of tensors and files."""
-    kept_hash = re.compile(r"(\S+ \(.*\) )?[0-9a-f]{64}")
+    hash_pattern = re.compile(r"(\S+ \(.*\) )?[0-9a-f]{64}")
     numbers = {}
     for key, value in values.items():
-        if not isinstance(value, str) or kept_hash.fullmatch(value):
+        is_text = isinstance(value, str) and not hash_pattern.fullmatch(value)
+        if not is_text and not (isinstance(value, np.ndarray) and value.dtype.kind == "U"):
             numbers[key] = value
     return numbers
 
@@ -262,7 +262,10 @@ def compare(old, new, renamed, tolerances):
         tolerances: Part of a key -> relative tolerance.
     """
     for key, value in old.items():
-        name = "/".join(rename(part, renamed) for part in key.split("/"))
+        parts = rename_key(key, renamed)
+        if not set(IGNORED_KEYS).isdisjoint((parts[0], parts[-1])):
+            continue
+        name = "/".join(parts)
         new_value = find_value(name, new)
         relative = max((relative for text, relative in tolerances.items() if text in key), default=0.0)
         expected = rename(value, renamed) if isinstance(value, str) else value
@@ -270,6 +273,21 @@ def compare(old, new, renamed, tolerances):
             yield f"{key}: missing"
         elif not are_equal(expected, new_value, relative):
             yield f"{key}: {describe_difference(value, new_value)}"
+
+
+def rename_key(key, renamed):
+    """Rename a key: its end by a rule with `/`, where `#` stands for an index, all other parts one by one.
+
+    Returns:
+        Parts of the new key.
+    """
+    for end, replacement in renamed.items():
+        pattern = re.escape(end).replace(r"\#", r"(?P<index>\d+)")
+        if "/" in end and (match := re.search(f"(^|/)(?P<end>{pattern})$", key)):
+            beginning = key[: match.start("end")].split("/")[:-1]
+            new_end = replacement.replace("#", match["index"]) if "#" in end else replacement
+            return [*(rename(part, renamed) for part in beginning), *new_end.split("/")]
+    return [rename(part, renamed) for part in key.split("/")]
 
 
 def rename(text, renamed):
