@@ -10,11 +10,12 @@ import pytest
 
 from torchcover.encounters import EncounterSet
 from torchcover.evaluation import Requirements, report
-from torchcover.evaluation.target_visibility import NEAR_M, build_target_plan, summarize_target_maps
+from torchcover.evaluation.target_page import TargetPageParams, build_target_plan, summarize_target_maps
 from torchcover.report import render_page
 from torchcover.simulation import Rig
 
 NASTY = "<b>&amp;roof</b>"
+MAX_DISTANCE_M = TargetPageParams().max_distance_m
 
 
 def lidar(name, x_m, z_m=0.8):
@@ -41,9 +42,9 @@ def found():
 
 def test_the_first_sentence_is_the_share_of_places_near_the_vehicle(found):
     words = found.verdict[0]
-    assert words.startswith("A child of 1.10 m is seen (5 points or more) at ")
+    assert words.startswith("A child of 1.10 m is detected (5 points or more) at ")
     for rig, seen in found.targets.items():
-        near = seen.free_mask & (seen.distance_m <= NEAR_M)
+        near = seen.free_mask & (seen.distance_m <= MAX_DISTANCE_M)
         share = (near & (seen.min_points >= seen.detection_points)).sum() / near.sum()
         assert f"at {100 * share:.0f} % " in words.partition(rig)[0]
     assert words.index(NASTY) < words.index("one")  # who sees most comes first
@@ -51,15 +52,15 @@ def test_the_first_sentence_is_the_share_of_places_near_the_vehicle(found):
 
 def test_a_sensor_that_fails_takes_what_it_alone_sees(found):
     seen = found.targets[NASTY]
-    for k, (sensor, lost_m2) in enumerate(seen.compute_failure_effects_m2(NEAR_M).items()):
+    for k, (sensor, lost_m2) in enumerate(seen.compute_failure_effects_m2(MAX_DISTANCE_M).items()):
         others = np.delete(seen.sensor_points, k, axis=0).sum(axis=0)
-        lost = seen.free_mask & (seen.distance_m <= NEAR_M) & (seen.points >= seen.detection_points) & (others < seen.detection_points)
+        lost = seen.free_mask & (seen.distance_m <= MAX_DISTANCE_M) & (seen.points >= seen.detection_points) & (others < seen.detection_points)
         assert seen.sensor_names[k] == sensor
         assert lost_m2 == pytest.approx(lost.sum() * 0.04)
-    worst = max(seen.compute_failure_effects_m2(NEAR_M).values())
-    (words,) = [one for one in found.verdict if one.startswith(f"{NASTY} most needs")]
+    worst = max(seen.compute_failure_effects_m2(MAX_DISTANCE_M).values())
+    (words,) = [one for one in found.verdict if one.startswith(f"{NASTY} loses most without ")]
     assert f"{worst:.1f} m² more" in words
-    assert "one has one sensor: without it, it sees nothing." in found.verdict
+    assert "one has one sensor, so it detects nothing if this sensor fails." in found.verdict
 
 
 def test_a_difference_of_sensor_models_is_said(found):
@@ -74,7 +75,7 @@ def test_sensors_that_cells_cannot_tell_apart_are_named_together():
         {**lidar(side, 0.0), "mount": {"y_m": y_m, "z_m": 1.0}} for side, y_m in (("left", 1.1), ("right", -1.1))
     ]})  # fmt: skip
     words = report(rig, "courtyard", num_frames=8, num_workers=0).verdict[-1]
-    assert "left and right: without one, up to" in words
+    assert "loses most without left or right: up to" in words
 
 
 def test_a_plan_tells_by_how_many_sensors_each_place_is_seen(found):
@@ -83,8 +84,8 @@ def test_a_plan_tells_by_how_many_sensors_each_place_is_seen(found):
         assert ((plan.sensor_counts == -1) == ~seen.free_mask).all()
         assert ((plan.sensor_counts > 0) == seen.detected_mask).all()
         assert ((plan.sensor_counts > 1) == (seen.detected_mask & (seen.min_sensors >= 2))).all()
-        near = seen.free_mask & (seen.distance_m <= NEAR_M)
-        assert f"{(near & (plan.sensor_counts == 0)).sum():,} of {near.sum():,} places" in plan.title
+        near = seen.free_mask & (seen.distance_m <= MAX_DISTANCE_M)
+        assert f"{(near & (plan.sensor_counts == 0)).sum():,} of {near.sum():,} positions" in plan.title
 
 
 def test_what_was_asked_too_is_told(found):
@@ -95,14 +96,14 @@ def test_what_was_asked_too_is_told(found):
 def test_the_page_answers_before_anything_else_and_names_are_text(found, tmp_path):
     text = render_page(found.page)
     assert NASTY not in text
-    assert text.index("A child of 1.10 m is seen") < text.index("<svg") < text.index('id="maps"')
+    assert text.index("A child of 1.10 m is detected") < text.index("<svg") < text.index('id="maps"')
     assert text.count('class="plan"') == 2
     assert len(text) < 500_000
     written = {path.relative_to(tmp_path).as_posix() for path in found.save(tmp_path)}
     assert {"report.html", "report.md", "summary.json", "junit.xml", "encounters.csv", "targets/one.npz"} <= written
     record = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
     assert record["verdict"] == list(found.verdict)
-    assert (tmp_path / "report.md").read_text(encoding="utf-8").startswith("**A child of 1.10 m is seen")
+    assert (tmp_path / "report.md").read_text(encoding="utf-8").startswith("**A child of 1.10 m is detected")
 
 
 def test_areas_of_the_plan_are_those_of_its_cells(found):
@@ -131,9 +132,9 @@ def test_where_no_place_is_free_nothing_is_claimed(found):
 
     seen = found.targets["one"]
     nowhere = replace(seen, state=np.full_like(seen.state, 2))
-    assert math.isnan(nowhere.compute_detected_share(NEAR_M))
-    assert summarize_target_maps({"one": nowhere}) == ("No place within 2 m is free: what is seen there is unknown.",)
-    assert "Not seen at 0 of 0 places" in build_target_plan(nowhere).title
+    assert math.isnan(nowhere.compute_detected_share(MAX_DISTANCE_M))
+    assert summarize_target_maps({"one": nowhere}) == ("No position within 2 m is free, so detection there is unknown.",)
+    assert "Not detected at 0 of 0 positions" in build_target_plan(nowhere).title
 
 
 @pytest.mark.parametrize(("given", "words"), [
@@ -152,5 +153,5 @@ def test_rigs_high_above_see_nothing_beside_the_vehicle_and_say_so():
     assert (
         report(high, "courtyard", num_frames=8, num_workers=0)
         .verdict[0]
-        .endswith("seen (5 points or more) at 0 % of the places within 2 m by high.")
+        .endswith("detected (5 points or more) at 0 % of the positions within 2 m by high.")
     )

@@ -76,5 +76,5 @@ def test_the_page_of_a_target_draws_where_it_is_first_seen(tmp_path):
     assert tmp_path / "report.html" in files
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     words = " ".join(Text(page).words)
-    assert "front_roof_128: would it see dog_57cm?" in words
-    assert len(re.findall("border of what is seen, with 5 points", page)) == 4
+    assert "Detection of dog_57cm by front_roof_128" in words
+    assert len(re.findall("border of detection with 5 points", page)) == 4

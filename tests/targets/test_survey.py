@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchcover.evaluation.target_visibility import summarize_target_maps
+from torchcover.evaluation.target_page import summarize_target_maps
 from torchcover.geometry import BoundingBox, build_transform
 from torchcover.simulation import PaperReference, Scenario, Simulator
 from torchcover.simulation.bodies import merge_meshes
@@ -270,4 +270,4 @@ def test_a_target_keeps_the_height_of_its_file_and_what_reaches_below_the_ground
     assert seen.points[0, 1] == pytest.approx(expected, abs=1.0)
     assert seen.target_bottom_m == target.bottom_m == pytest.approx(max(low_m, 0.0))
     assert f"{max(low_m, 0):.2f} to {max(low_m, 0) + thick_m:.2f} m above the ground" in seen.target_description
-    assert (f", {low_m:.2f} m above the ground, is seen" in summarize_target_maps({"r": seen})[0]) == (low_m > 0)
+    assert (f", {low_m:.2f} m above the ground, is detected" in summarize_target_maps({"r": seen})[0]) == (low_m > 0)

@@ -7,7 +7,7 @@ from typing import Any
 
 from torchcover.cli.printing import print_files, print_verdict
 from torchcover.evaluation import map_target_visibility, save_target_map
-from torchcover.evaluation.target_visibility import build_positions_table, build_sides_table, summarize_target_maps
+from torchcover.evaluation.target_page import build_positions_table, build_sides_table, summarize_target_maps
 from torchcover.files import lock_folder
 from torchcover.report import Terminal, print_page_tables
 from torchcover.simulation import Rig

@@ -17,14 +17,13 @@ from torchcover.evaluation.requirements import Requirements
 from torchcover.evaluation.requirements_check import CheckResult, check
 from torchcover.evaluation.result import Result
 from torchcover.evaluation.settings import DEFAULT_NUM_FRAMES, FILES, Settings, parse_file_kinds
-from torchcover.evaluation.target_visibility import (
-    build_flat_ground,
+from torchcover.evaluation.target_page import (
     build_sides_table,
     build_target_page,
     build_target_record,
-    map_target_visibility,
     summarize_target_maps,
 )
+from torchcover.evaluation.target_visibility import build_flat_ground, map_target_visibility
 from torchcover.evaluation.task import AnyRig, AnyScenario, build_simulation_task, load_rig, make_rig_names
 from torchcover.files import AtomicOutput
 from torchcover.notebooks import build_result_html
@@ -218,7 +217,7 @@ def report(
     Example:
         >>> result = report("front_roof_128", "courtyard", num_frames=8)
         >>> print(result.verdict[0])
-        A child of 1.10 m is seen (5 points or more) at 35 % of the places within 2 m by front_roof_128.
+        A child of 1.10 m is detected (5 points or more) at 35 % of the places within 2 m by front_roof_128.
     """
     start_s = time.monotonic()
     inputs = [rigs] if isinstance(rigs, str | Path | Rig) else list(rigs)
