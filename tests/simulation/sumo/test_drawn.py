@@ -298,7 +298,7 @@ def test_a_program_writes_no_files_talks_without_end_and_may_run_out_of_memory(s
 def test_a_simulation_that_is_over_before_the_run_begins_is_refused(tmp_path):
     net, routes = RandomStreets().build_network(tmp_path, np.random.default_rng(0)), tmp_path / "r.xml"
     routes.write_text("<routes/>")
-    with pytest.raises(ValueError, match=r"the simulation is over before t = 60 s, where the run begins: .*begin_s"):
+    with pytest.raises(ValueError, match=r"the simulation ends before t = 60 s, where the run begins: .*begin_s"):
         SumoTraffic(net=net, routes=(routes,), duration_s=2.0).build_scene(0)
 
 
@@ -323,7 +323,7 @@ def test_an_empty_town_is_a_world_a_hundred_times_as_much_is_refused_and_who_is_
             drawn(**{key: 1400.0})
     monkeypatch.setattr(traffic, "drop_colliding_users", lambda bodies: bodies[:1])
     bare = {"built_share": 0.0, "parked_share": 0.0, "roadside_density": 0.0}
-    with pytest.warns(UserWarning, match=r"the simulation has \d of \d road users where another one is"):
+    with pytest.warns(UserWarning, match=r"^\d of \d road users of the simulation are left out"):
         world = drawn(**dict.fromkeys(LITTLE, 0.0)).model_copy(update=bare).build_scene(0)
     assert not world.objects
     assert world.num_omitted_road_users > 0  # who could have been the ego

@@ -4,16 +4,12 @@ import numpy as np
 import pytest
 import shapely
 
+from torchcover.simulation.sumo.collisions import drop_colliding_users
 from torchcover.simulation.sumo.floating import SumoTrack
 from torchcover.simulation.sumo.ground import Sidewalks, build_ground
-from torchcover.simulation.sumo.motion import (
-    CATCH_UP_MPS,
-    RoadUser,
-    compute_motions,
-    compute_rectangle_corners_m,
-    drop_colliding_users,
-)
+from torchcover.simulation.sumo.motion import PARAMS, RoadUser, compute_motions
 from torchcover.simulation.sumo.network import read_network
+from torchcover.simulation.sumo.paths import compute_rectangle_corners_m
 from torchcover.simulation.sumo.vicinity import Vicinity
 from torchcover.simulation.traffic.fleet import HITCHES, compute_tractrix_yaw_rad
 
@@ -90,7 +86,7 @@ def test_people_walk_what_they_jumped(jump_m, back):
     places_m[75:, 1] += 0.6 * jump_m
     places_m[75:, 0] += 0.8 * jump_m * back
     (motion,) = compute_motions([user(places_m, on_foot=True, kind="adult", size_m=(0.3, 0.5))], 30.0, ORIGIN)
-    assert speeds(motion).max() < 1.2 + CATCH_UP_MPS + 1e-6
+    assert speeds(motion).max() < 1.2 + PARAMS.jump_extra_mps + 1e-6
     assert motion.is_plausible
     np.testing.assert_allclose(motion.poses[[0, -1], :2], places_m[[0, -1]], atol=1e-6)
 

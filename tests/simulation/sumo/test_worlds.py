@@ -70,7 +70,7 @@ def test_types_have_bodies_by_class_and_length(tmp_path):
 def test_whoever_is_where_another_one_is_is_left_out_with_a_count(tmp_path):
     pair = drive("one", start=90.0), drive("other", start=92.0)
     steps = together(drive(), drive("ghost", start=52.0), *pair, drive("free", start=120.0))
-    with pytest.warns(UserWarning, match=r"has 2 of 4 road users where another one is.* \('ghost', 'other'\)"):
+    with pytest.warns(UserWarning, match=r"^2 of 4 road users .* overlap others or curbs.* \('ghost', 'other'\)"):
         world = made(tmp_path, steps=steps, ego_id="ego").build_scene(0)
     assert [actor.name.split()[1] for actor in world.actors] == ["one", "free"]
     assert world.num_omitted_road_users == 2
@@ -99,7 +99,7 @@ def test_who_is_too_wide_for_the_lane_between_two_kerbs_is_left_out(tmp_path):
     kerbs = [(WALK, 2.0, [(0.0, y, 0.0), (400.0, y, 0.0)]) for y in (-2.1, 2.1)]
     lane = edge("east", kerbs[0], (DRIVE, 2.2, [(0.0, 0.0, 0.0), (400.0, 0.0, 0.0)]), kerbs[1])
     steps = together(drive(), drive("bus", start=90.0, type="bus"), drive("cyclist", start=120.0, type="bicycle"))
-    with pytest.warns(UserWarning, match=r"has 1 of 2 road users .* \('bus'\)"):
+    with pytest.warns(UserWarning, match=r"^1 of 2 road users .* \('bus'\)"):
         world = made(tmp_path, lane, steps=steps, ego_id="ego").build_scene(0)
     assert [actor.category for actor in world.actors] == ["cyclist"]
 
@@ -219,7 +219,7 @@ def test_cars_are_parked_in_bays_only(tmp_path):
         ({"begin_s": 3.0}, "no car that could be the ego"),
         (
             {"ego_id": "ego", "begin_s": 2.0, "duration_s": 2.0, "steps": together(drive(start=335.0, speed=30.0))},
-            r"the ego is farther than 10 m from all streets of the network at t = 2\.6 s: it leaves them, or the data",
+            r"the ego vehicle is farther than 10 m from all streets of the network at t = 2\.6 s: it leaves them, or the data",
         ),
         ({"ego_id": "ego", "steps": together(drive(y=9000.0))}, "farther than 10 m from all streets .* t = 0 s"),
     ],
@@ -234,10 +234,10 @@ def test_without_an_ego_there_is_no_world(options, message, tmp_path):
     [
         ({"type": "sumo"}, "give a net and its routes, a net and its fcd, or random"),
         ({"type": "sumo", "net": "a.net.xml"}, "give a net and its routes"),
-        ({"type": "sumo", "random": {}, "ego_id": "a"}, "random draws all traffic; leave out ego_id"),
+        ({"type": "sumo", "random": {}, "ego_id": "a"}, "random samples all traffic; leave out ego_id"),
         (
             {"type": "sumo", "net": "a.net.xml", "random": {"max_lanes_per_direction": 1}},
-            "random: max_lanes_per_direction are for streets that are drawn",
+            "random: max_lanes_per_direction only apply to sampled streets",
         ),
         ({"type": "sumo", "random": {"layout": "star"}}, "'rand', 'grid' or 'spider'"),
         ({"type": "somo"}, "type: traffic is one of 'urban', 'highway', 'parking', 'sumo', 'tracks'; got 'somo'"),

@@ -1,6 +1,7 @@
-"""Traffic of type `sumo`: road networks and road users of SUMO, the user's own or drawn."""
+"""Traffic of type `sumo`: road networks and road users of SUMO, given or sampled."""
 
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Literal, Self
@@ -13,6 +14,7 @@ from torchcover.files import BadFileError
 from torchcover.geometry.arrays import Bools, Float64
 from torchcover.recordings.unsupported_formats import find_remedy
 from torchcover.simulation.documents import RelativePath
+from torchcover.simulation.sumo.collisions import drop_colliding_users
 from torchcover.simulation.sumo.crowd import read_vehicle_types, select_road_users
 from torchcover.simulation.sumo.floating import (
     FloatingCarData,
@@ -21,7 +23,7 @@ from torchcover.simulation.sumo.floating import (
     read_floating_car_data,
 )
 from torchcover.simulation.sumo.ground import BodyPlacer, Sidewalks, build_bridges, build_ground, place_parked_vehicles
-from torchcover.simulation.sumo.motion import compute_motions, drop_colliding_users
+from torchcover.simulation.sumo.motion import Motion, RoadUser, compute_motions
 from torchcover.simulation.sumo.network import SAME_POSITION_M, read_network
 from torchcover.simulation.sumo.simulating import convert_opendrive, find_sumo_home, simulate
 from torchcover.simulation.sumo.streets import EGO_TYPE, RandomStreets, write_routes
@@ -31,51 +33,54 @@ from torchcover.simulation.traffic.frontage import RoadsideDensity, StreetSide, 
 from torchcover.simulation.traffic.kind import ProceduralTraffic, SceneParts
 from torchcover.simulation.traffic.scenery import Scenery, merge_by_kind
 
-# Nothing stands nearer to a lane than this; furniture and houses keep off by more, so that no crown hangs over it.
-CLEAR_M, KERB_M, BEHIND_M = 0.4, 1.0, 2.2
-# Gaps that the drawing of a network left are street, too; and beside bridges nothing stands.
-GAP_M, BRIDGE_M = 1.0, 12.0
-# Traffic that is drawn sets off everywhere at once, and needs some time to get into motion and to queue at lights.
+# Sampled traffic starts everywhere at once and needs this time to move and to queue at traffic lights.
 WARM_UP_S = 30.0
-USUAL_BEGIN_S = 60.0
-# Of traffic that is drawn such a share may be where bodies cannot be: more, and it is thinner than was asked for.
-USUALLY_LEFT_OUT = 0.15
-# In plan, nothing is in anybody's way that is so near to the middle of a lane on a bridge: it may be below.
-BELOW_M = 3.0
 
 
 def find_visible_sides(
     vicinity: Vicinity, built_share: float, generator: np.random.Generator
 ) -> tuple[list[StreetSide], list[shapely.Geometry]]:
-    """What can be seen of the sides of streets, and where nothing may stand."""
-    street = shapely.union_all(shapely.buffer(vicinity.street_polygons, GAP_M, join_style="mitre")).buffer(-GAP_M)
-    bridges = vicinity.build_bridge_area(BRIDGE_M)
+    """Find the visible sides of streets, and the areas without roadside objects.
+
+    Args:
+        vicinity: Part of a network.
+        built_share: Share of the sides with houses.
+        generator: Random generator.
+    """
+    curb_offset_m, facade_offset_m = 1.0, 2.2  # so that no crown of a tree is over a lane
+    clearance_m = 0.4  # distance of all objects from lanes
+    gap_m = 1.0  # gaps that networks leave between lanes
+    bridge_margin_m = 12.0  # no objects stand next to bridges
+    streets = shapely.buffer(vicinity.street_polygons, gap_m, join_style="mitre")
+    street_area = shapely.union_all(streets).buffer(-gap_m)
+    bridges = vicinity.build_bridge_area(bridge_margin_m)
     shapely.prepare(bridges)
 
-    def sees(places_m: Float64) -> Bools:
-        return np.asarray(vicinity.is_visible(places_m) & ~shapely.contains_xy(bridges, *places_m.T))
+    def is_visible(positions_m: Float64) -> Bools:
+        return np.asarray(vicinity.is_visible(positions_m) & ~shapely.contains_xy(bridges, *positions_m.T))
 
-    taken = shapely.buffer(vicinity.street_polygons, CLEAR_M).tolist()
-    return find_street_sides(street, (KERB_M, BEHIND_M), sees, built_share, generator), taken
+    offsets_m = (curb_offset_m, facade_offset_m)
+    sides = find_street_sides(street_area, offsets_m, is_visible, built_share, generator)
+    return sides, shapely.buffer(vicinity.street_polygons, clearance_m).tolist()
 
 
 class SumoTraffic(ProceduralTraffic):
-    """Traffic of SUMO, on a network of the user's own or on one that is drawn anew for each run.
+    """Traffic of SUMO on a given network, or on a network that is sampled for each run.
 
     Args:
-        net: A road network: `.net.xml`, or `.xodr` (OpenDRIVE).
-        omit_missing_links: Whether links of an `.xodr` to roads and junctions that are not there are left out.
-        routes: Files of routes for it, which SUMO drives; relative to the document.
-        fcd: Floating car data, which SUMO wrote before, instead of driving now.
-        random: Streets and traffic that are drawn; with a net, its traffic only.
-        ego_id: Which vehicle is the ego; if not given, one that is there all the time is drawn for each run.
-        ego_type: The type of which it is drawn; any car if not given.
-        begin_s: Time of the simulation at which the run begins, at the earliest: the ego has to be there. After a
-            minute if not given, or with the floating car data.
-        built_share: Share of the streets' sides that have houses.
+        net: Road network: `.net.xml`, or `.xodr` (OpenDRIVE); relative to the document.
+        omit_missing_links: Whether links of an `.xodr` to missing roads and junctions are removed.
+        routes: Files of routes on the network, which SUMO simulates.
+        fcd: Floating car data that SUMO wrote, instead of a simulation.
+        random: Sampled streets and traffic; with a network, sampled traffic only.
+        ego_id: Name of the ego vehicle; if None, a vehicle that is present all the time is sampled for each run.
+        ego_type: Name of the type from which it is sampled; any car if None.
+        begin_s: Time of the simulation at which the run begins, at the earliest, since the ego vehicle must be present.
+            If None: 60 s, or the start of the floating car data.
+        built_share: Share of the sides of streets with houses.
         roadside_density: Factor on the usual density of roadside objects other than houses, or factors for some kinds,
             such as `{hedge: 2, lamp: 0}`.
-        parked_share: Share of the parking bays (lanes that no vehicle may use) that are occupied.
+        parked_share: Share of the parking bays (lanes of type "parking") that are occupied.
     """
 
     type: Literal["sumo"] = "sumo"
@@ -93,97 +98,123 @@ class SumoTraffic(ProceduralTraffic):
 
     @model_validator(mode="after")
     def _check_sources(self) -> Self:
-        if self.random is None and (self.net is None or not (self.routes or self.fcd)):
-            raise ValueError("give a net and its routes, a net and its fcd, or random (which may have a net, too)")
-        if self.random is not None:
-            given = [key for key in ("routes", "fcd", "ego_id", "ego_type", "begin_s") if getattr(self, key)]
-            if given:
-                raise ValueError(f"random draws all traffic; leave out {', '.join(given)}, or random")
-            of_streets = sorted(
-                {"layout", "max_lanes_per_direction", "speed_limit_mps", "max_bend_ratio", "hill_height_std_m"}
-                & self.random.model_fields_set
-            )
-            if self.net is not None and of_streets:
-                raise ValueError(f"random: {', '.join(of_streets)} are for streets that are drawn; there is a net")
+        if self.random is None:
+            if self.net is None or not (self.routes or self.fcd):
+                raise ValueError("give a net and its routes, a net and its fcd, or random (which may have a net, too)")
+            return self
+        conflicting = [key for key in ("routes", "fcd", "ego_id", "ego_type", "begin_s") if getattr(self, key)]
+        if conflicting:
+            raise ValueError(f"random samples all traffic; leave out {', '.join(conflicting)}, or random")
+        street_keys = {"layout", "max_lanes_per_direction", "speed_limit_mps", "max_bend_ratio", "hill_height_std_m"}
+        unused = sorted(street_keys & self.random.model_fields_set)
+        if self.net is not None and unused:
+            raise ValueError(f"random: {', '.join(unused)} only apply to sampled streets; remove them, or net")
         return self
 
     def check(self) -> None:
-        """Refuse where SUMO is needed, but not installed."""
+        """Check that SUMO is installed if it is needed.
+
+        Raises:
+            ImportError: SUMO is missing.
+        """
         if self.fcd is None or (self.net is not None and self.net.suffix == ".xodr"):
-            find_sumo_home()  # or an ImportError
+            find_sumo_home()
 
     def _build(self, fleet: Fleet, times_s: Float64, generator: np.random.Generator) -> SceneParts:
+        duration_s = float(times_s[-1])
+        vicinity, ego, users, origin_m = self._select_road_users(fleet, duration_s, generator)
+        ground = build_ground(vicinity)
+        sidewalks = Sidewalks(vicinity, ground)
+        sides, clear_areas = find_visible_sides(vicinity, self.built_share, generator)
+        roadside = place_scenery(
+            sides, clear_areas, clear_areas, (), ground.compute_heights_m, self.roadside_density, generator
+        )
+        raised = merge_by_kind(sidewalks.build_meshes(), build_bridges(vicinity))
+        static_meshes = (ground.build_mesh(), *raised, *merge_by_kind(*roadside))
+        parked = place_parked_vehicles(vicinity, ground, fleet, self.parked_share, generator)
+        # Near the centerline of a lane on a bridge, an obstacle may be below the bridge.
+        bridge_area = vicinity.build_bridge_area(3.0)
+        obstacles = shapely.difference(np.concatenate([sidewalks.polygons, parked]), bridge_area)
+        motions = compute_motions([ego, *users], duration_s, origin_m, obstacles, sidewalks.walkable_area)
+        shown = drop_colliding_users(motions)
+        fleet.omitted_count = len(motions) - len(shown)
+        self._warn_of_omissions(motions, shown, len(users))
+        placer = BodyPlacer(ground, sidewalks)
+        ego_actor = placer.build_ego(shown[0], times_s, fleet.meshes[EGO], generator)
+        scenery = Scenery(static_meshes, tuple(range(1 + len(raised))))
+        return scenery, ego_actor, placer.build_actors(shown[1:], fleet, duration_s)
+
+    def _select_road_users(
+        self, fleet: Fleet, duration_s: float, generator: np.random.Generator
+    ) -> tuple[Vicinity, RoadUser, list[RoadUser], Float64]:
+        """Select the part of the network, the ego vehicle, road users near it, and the origin (2,) of the scene."""
         with TemporaryDirectory() as folder:
-            network_file = self._network_file(Path(folder), generator)
+            network_file = self._find_network_file(Path(folder), generator)
             network = read_network(network_file)
             routes = self.routes
             if self.random is not None:
                 routes = (Path(folder) / "drawn.rou.xml",)
-                write_routes(*routes, network, self.random, fleet, WARM_UP_S + float(times_s[-1]), generator)
-            known = {name: found for path in routes for name, found in read_vehicle_types(path).items()}
-            recorded = self._recorded(network_file, routes, float(times_s[-1]), generator)
+                write_routes(*routes, network, self.random, fleet, WARM_UP_S + duration_s, generator)
+            vehicle_types = {}
+            for path in routes:
+                vehicle_types.update(read_vehicle_types(path))
+            data = self._load_floating_car_data(network_file, routes, duration_s, generator)
         ego_type = EGO_TYPE if self.random is not None else self.ego_type
-        duration_s = float(times_s[-1])
-        ego, others = select_road_users(recorded, known, fleet, self.ego_id, ego_type, duration_s, generator)
-        near_m = np.floor(ego.track.front_positions_m[0, :2])
-        (alone,) = compute_motions([ego], duration_s, near_m)
-        begin_m = np.floor(alone.poses[0, :2] + SAME_POSITION_M)
-        origin_m, way_m = near_m + begin_m, alone.poses[:, :2] - begin_m
-        vicinity = Vicinity(network, way_m, origin_m)
-        gone = np.flatnonzero(~vicinity.is_on_street(way_m))
-        if len(gone):
+        ego, users = select_road_users(data, vehicle_types, fleet, self.ego_id, ego_type, duration_s, generator)
+        # The origin has integer coordinates near the first position of the ego vehicle.
+        track_origin_m = np.floor(ego.track.front_positions_m[0, :2])
+        (ego_motion,) = compute_motions([ego], duration_s, track_origin_m)
+        start_m = np.floor(ego_motion.poses[0, :2] + SAME_POSITION_M)
+        origin_m, path_m = track_origin_m + start_m, ego_motion.poses[:, :2] - start_m
+        vicinity = Vicinity(network, path_m, origin_m)
+        off_street = np.flatnonzero(~vicinity.is_on_street(path_m))
+        if len(off_street):
+            time_s = data.begin_s + ego_motion.times_s[off_street[0]]
             raise ValueError(
-                f"the ego is farther than {vicinity.params.max_off_street_m:g} m from all streets of the network at t = "
-                f"{recorded.begin_s + alone.times_s[gone[0]]:g} s: it leaves them, or the data are those of another "
-                "network"
+                f"the ego vehicle is farther than {vicinity.params.max_off_street_m:g} m from all streets of the "
+                f"network at t = {time_s:g} s: it leaves them, or the data belong to another network"
             )
-        ground = build_ground(vicinity)
-        pavement = Sidewalks(vicinity, ground)
-        sides, taken = find_visible_sides(vicinity, self.built_share, generator)
-        stood = place_scenery(sides, taken, taken, (), ground.compute_heights_m, self.roadside_density, generator)
-        raised = merge_by_kind(pavement.build_meshes(), build_bridges(vicinity))
-        static = (ground.build_mesh(), *raised, *merge_by_kind(*stood))
-        parked = place_parked_vehicles(vicinity, ground, fleet, self.parked_share, generator)
-        obstacles = shapely.difference(np.concatenate([pavement.polygons, parked]), vicinity.build_bridge_area(BELOW_M))
-        moved = compute_motions([ego, *others], duration_s, origin_m, obstacles, pavement.walkable_area)
-        shown = drop_colliding_users(moved)
-        fleet.omitted_count = len(moved) - len(shown)
-        if fleet.omitted_count > (0.0 if self.random is None else USUALLY_LEFT_OUT) * len(others):
-            there = {motion.road_user.track.name for motion in shown}
-            missing = sorted({motion.road_user.track.name for motion in moved} - there)
-            warnings.warn(
-                f"the simulation has {fleet.omitted_count} of {len(others)} road users where another one is, over a kerb or "
-                f"faster than people are ({', '.join(map(repr, missing[:3]))}); they are left out",
-                stacklevel=2,
-            )
-        placing = BodyPlacer(ground, pavement)
-        driver = placing.build_ego(shown[0], times_s, fleet.meshes[EGO], generator)
-        scenery = Scenery(static, tuple(range(1 + len(raised))))
-        return scenery, driver, placing.build_actors(shown[1:], fleet, duration_s)
+        return vicinity, ego, users, origin_m
 
-    def _network_file(self, folder: Path, generator: np.random.Generator) -> Path:
-        """The network in SUMO's own format."""
+    def _warn_of_omissions(self, motions: Sequence[Motion], shown: Sequence[Motion], num_users: int) -> None:
+        """Warn of omitted road users; of sampled traffic, some may be missing."""
+        max_omitted_share = 0.0 if self.random is None else 0.15
+        num_omitted = len(motions) - len(shown)
+        if num_omitted > max_omitted_share * num_users:
+            shown_names = {motion.road_user.track.name for motion in shown}
+            missing = sorted({motion.road_user.track.name for motion in motions} - shown_names)
+            warnings.warn(
+                f"{num_omitted} of {num_users} road users of the simulation are left out: they overlap others or curbs, "
+                f"or are faster than people can be ({', '.join(repr(name) for name in missing[:3])})",
+                stacklevel=3,
+            )
+
+    def _find_network_file(self, folder: Path, generator: np.random.Generator) -> Path:
+        """Find the network in SUMO's format; sampled and converted networks are written into a folder."""
         if self.net is None:
             assert self.random is not None  # checked in _check_sources
             return self.random.build_network(folder, generator)
-        if self.net.suffix not in (".xml", ".xodr") and (remedy := find_remedy(self.net)):
+        if self.net.suffix == ".xodr":
+            return convert_opendrive(self.net, folder, omit_missing_links=self.omit_missing_links)
+        if self.net.suffix != ".xml" and (remedy := find_remedy(self.net)):
             raise BadFileError(f"{self.net}: a network is a .net.xml or .xodr file; {remedy}")
-        if self.net.suffix != ".xodr":
-            return self.net
-        return convert_opendrive(self.net, folder, omit_missing_links=self.omit_missing_links)
+        return self.net
 
-    def _recorded(
+    def _load_floating_car_data(
         self, network_file: Path, routes: tuple[Path, ...], duration_s: float, generator: np.random.Generator
     ) -> FloatingCarData:
+        """Read floating car data, or simulate."""
         if self.fcd is not None:
             return read_floating_car_data(self.fcd, TimeWindow(self.begin_s or -np.inf, duration_s, self.ego_id))
-        begin_s = WARM_UP_S if self.random is not None else USUAL_BEGIN_S if self.begin_s is None else self.begin_s
-        seed, drawn = int(generator.integers(1 << 31)), self.random is not None
-        pieces = simulate(network_file, routes, begin_s, seed, around_vehicle=self.ego_id, is_sampled=drawn)
-        recorded = parse_floating_car_data(pieces, TimeWindow(begin_s, duration_s, self.ego_id))
-        if not np.isfinite(recorded.last_time_s):
+        is_sampled = self.random is not None
+        begin_s = 60.0 if self.begin_s is None else self.begin_s
+        begin_s = WARM_UP_S if is_sampled else begin_s
+        seed = int(generator.integers(1 << 31))
+        chunks = simulate(network_file, routes, begin_s, seed, around_vehicle=self.ego_id, is_sampled=is_sampled)
+        data = parse_floating_car_data(chunks, TimeWindow(begin_s, duration_s, self.ego_id))
+        if not np.isfinite(data.last_time_s):
             raise ValueError(
-                f"the simulation is over before t = {begin_s:g} s, where the run begins: everybody has arrived, "
-                "or nobody sets off; change begin_s, or the routes"
+                f"the simulation ends before t = {begin_s:g} s, where the run begins: all vehicles have arrived, or none "
+                "departs; change begin_s, or the routes"
             )
-        return recorded
+        return data
