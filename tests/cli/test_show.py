@@ -70,7 +70,7 @@ def test_a_scenario_is_drawn_in_the_frame_of_the_ego(torchcover, worlds, drawn):
     [
         ("4.5 1.8 1.5", "4.50 m long (x, forward), 1.80 m wide (y), 1.50 m high (z, up)", ""),
         ("1.8 4.5 1.5", "1.80 m long", "wider than long; a vehicle's x axis points forward"),
-        ("83.7 30 25", "83.70 m long", "far too large for a vehicle on a road; a file in millimetres"),
+        ("83.7 30 25", "83.70 m long", "far too large for a vehicle on a road; a file in millimeters"),
     ],
 )
 def test_a_mesh_and_the_vehicle_of_it_say_their_size_and_what_is_doubtful(torchcover, tmp_path, size, told, doubt):

@@ -101,14 +101,14 @@ def looks(matrix, direction=(1.0, 0.0, 0.0)):
 
 
 @pytest.mark.parametrize("name", RIGS)
-def test_a_rig_says_where_its_numbers_come_from_and_names_its_sensors(name):
+def test_descriptions_state_the_source_and_sensors_have_names(name):
     rig = Rig.load(name)
     assert rig.name == name
     assert any(word in rig.description for word in ("/", "assumption"))
 
 
 @pytest.mark.parametrize("name", RIGS)
-def test_no_sensor_lies_inside_its_vehicle_or_below_the_ground(name):
+def test_sensors_lie_outside_the_vehicle_and_above_ground(name):
     rig = Rig.load(name)
     sensors = rig.sensors
     positions = np.array([sensor.mount.to_matrix()[:3, 3] for sensor in sensors])
@@ -126,19 +126,19 @@ def test_no_sensor_lies_inside_its_vehicle_or_below_the_ground(name):
 
 
 @pytest.mark.parametrize(("rig", "sensor", "frame", "published"), REAR_AXLE)
-def test_positions_are_those_of_the_source(rig, sensor, frame, published):
+def test_positions_match_the_source(rig, sensor, frame, published):
     before_axle, axle_height = frame
     np.testing.assert_allclose(mounted(rig, sensor)[:3, 3] + [before_axle, 0.0, -axle_height], published, atol=6e-4)
 
 
 @pytest.mark.parametrize("rig", CARLA)
-def test_positions_are_those_of_carla_with_left_and_right_exchanged(rig):
+def test_carla_positions_have_left_and_right_exchanged(rig):
     positions = np.array([sensor.mount.to_matrix()[:3, 3] for sensor in Rig.load(rig).sensors])
     np.testing.assert_allclose((positions * [1, -1, 1]).T, CARLA[rig], atol=1e-9)
 
 
 @pytest.mark.parametrize("rig", CARLA)
-def test_the_right_axis_drops_by_the_sine_of_carlas_roll(rig):
+def test_carla_roll_lowers_the_right_axis(rig):
     rolls = ROLLS.get(rig, (0,) * len(CARLA[rig][0]))
     for sensor, roll in zip(Rig.load(rig).sensors, rolls, strict=True):
         right = sensor.mount.to_matrix()[:3, :3] @ [0, -1, 0]
@@ -146,7 +146,7 @@ def test_the_right_axis_drops_by_the_sine_of_carlas_roll(rig):
 
 
 @pytest.mark.parametrize("name", IN_DEGREES)
-def test_the_other_reading_of_a_roll_has_the_same_number_of_degrees_and_nothing_else_changed(name):
+def test_roll_readings_differ_only_in_the_unit(name):
     radians, degrees = Rig.load(name), Rig.load(f"{name}_degrees")
     for sensor, other, roll in zip(radians.sensors, degrees.sensors, ROLLS[name], strict=True):
         assert other.mount.roll_deg == roll
@@ -156,7 +156,7 @@ def test_the_other_reading_of_a_roll_has_the_same_number_of_degrees_and_nothing_
     assert "Doubt about the unit" in degrees.description
 
 
-def test_the_placements_of_place3ds_tables_have_the_lidar_of_its_tables():
+def test_place3d_placements_use_the_lidar_of_place3d():
     placements = [name for name in RIGS if name.startswith("place3d2024_")]
     assert len(placements) == 9 + len(IN_DEGREES)
     for name in placements:
@@ -186,7 +186,7 @@ def test_the_pitched_placement_looks_down():
         ("edgar", "innovusion_rear", 180.0, -10.570),
     ],
 )
-def test_sensors_look_where_the_source_says(rig, sensor, azimuth, elevation):
+def test_sensor_directions_match_the_source(rig, sensor, azimuth, elevation):
     found = looks(mounted(rig, sensor))
     assert (found[0] - azimuth + 180) % 360 - 180 == pytest.approx(0.0, abs=1e-3)
     assert found[1] == pytest.approx(elevation, abs=1e-3)
@@ -215,7 +215,7 @@ def test_sensors_look_where_the_source_says(rig, sensor, azimuth, elevation):
         ("argoverse2_cameras", "ring_rear_right", -152.8),
     ],
 )
-def test_cameras_look_where_the_source_says_and_stand_upright(rig, sensor, azimuth):
+def test_camera_directions_match_the_source_and_are_upright(rig, sensor, azimuth):
     matrix = mounted(rig, sensor)
     found = looks(matrix)
     assert found[0] == pytest.approx(azimuth, abs=0.1)
@@ -231,7 +231,7 @@ def test_kittis_cameras_have_their_baselines():
 
 
 @pytest.mark.parametrize("rig", [name for name in RIGS if name.endswith("_cameras")])
-def test_published_cameras_have_a_ray_for_every_pixel_and_come_beside_a_rig_of_lidars(rig):
+def test_published_cameras_have_a_ray_per_pixel(rig):
     for sensor in Rig.load(rig).sensors:
         assert np.isfinite(sensor.compute_directions()).all()
     if rig != "three_cameras":
@@ -239,7 +239,7 @@ def test_published_cameras_have_a_ray_for_every_pixel_and_come_beside_a_rig_of_l
         assert {sensor.type for sensor in lidars.sensors} == {"lidar"}
 
 
-def test_edgars_ousters_are_turned_as_in_its_urdf():
+def test_edgar_lidars_have_the_rotation_of_the_urdf():
     for sensor, (roll, pitch, yaw) in {
         "ouster_left": (-0.3461248, 0.0165291, -0.0162606),
         "ouster_right": (0.3551248, 0.0165291, 0.0061281),
@@ -257,7 +257,7 @@ def test_argoverses_lower_lidar_hangs_upside_down():
     assert looks(matrix)[0] == pytest.approx(-11.6)
 
 
-def test_roof_rigs_differ_in_their_rows_alone():
+def test_roof_rigs_differ_only_in_their_rows():
     roofs = {rows: Rig.load(f"front_roof_{rows}").sensors[0] for rows in (32, 64, 128)}
     for rows, sensor in roofs.items():
         assert len(sensor.compute_elevations_deg()) == rows

@@ -35,7 +35,7 @@ def camera(kind="pinhole", /, **changes):
 
 
 @pytest.mark.parametrize("lens", LENSES)
-def test_a_depth_image_that_is_cast_unprojects_to_the_hits(lens):
+def test_unprojected_depth_images_equal_the_hits(lens):
     sensor = camera(lens)
     instant = SceneGeometry(Scenario.load("courtyard").build_scene()).get_snapshot(0)
     vehicle_T_mount = sensor.mount.to_matrix()
@@ -55,13 +55,13 @@ def test_a_depth_image_that_is_cast_unprojects_to_the_hits(lens):
     assert apart.values.max() < 1e-4
 
 
-def test_the_field_of_view_is_that_of_the_outermost_pixels():
+def test_outermost_pixels_define_the_field_of_view():
     # 100 degrees to the edges of the outermost pixels; their centres lie half a pixel inside.
     expected = 2 * np.rad2deg(np.arctan(np.tan(np.deg2rad(50)) * 159 / 160))
     assert camera(mount={}).horizontal_fov_deg == pytest.approx(expected, abs=0.02)
 
 
-def test_pixels_without_a_ray_give_no_point_and_are_no_rays():
+def test_pixels_without_a_ray_are_not_counted():
     # A fold within the image: beyond it there is nothing.
     folded = camera("brown_conrady", coefficients=[-0.35, 0.0, 0.0, 0.0])
     missing = int(np.isnan(folded.compute_directions()[0]).sum())
@@ -104,7 +104,7 @@ def test_an_impossible_camera_is_refused(changes, message):
         camera(**changes)
 
 
-def test_depth_errs_as_that_of_a_pair_of_cameras_and_no_range_is_below_zero():
+def test_depth_error_follows_the_stereo_model():
     pair = {"baseline_m": 0.3, "subpixel_px": 0.25}
     sensor = camera(stereo=pair, range_noise_share=0.03, range_noise_m=0.04, width=500, fov_deg=90.0)  # f is 250 px
     range_m = np.array([1.0, 10.0, 59.0])
@@ -122,7 +122,7 @@ def test_depth_errs_as_that_of_a_pair_of_cameras_and_no_range_is_below_zero():
     assert not camera(range_noise_share=0.1).is_exact
 
 
-def test_points_on_an_object_are_counted_as_pixels_of_the_full_image():
+def test_point_counts_are_pixels_of_the_full_image():
     car = {"category": "car", "shape": {"type": "box", "size_m": [4, 2, 1.5]}, "name": "car", "pose": {"x_m": 9.0}}
     made = scenario(FLOOR, actors=[car])
     rigs = {

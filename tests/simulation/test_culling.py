@@ -60,7 +60,7 @@ def assert_same_bits(scan, expected):
 
 @pytest.mark.parametrize("step", [0, 170, 399])
 @pytest.mark.parametrize("sensor", ["roof", "bumper", "paper"])
-def test_a_scan_is_that_of_every_ray_cast_at_every_body(scene, step, sensor):
+def test_culling_does_not_change_a_scan(scene, step, sensor):
     instant, generator = scene.get_snapshot(step, max_distance_m=150.0), np.random.default_rng(step)
     if sensor == "paper":
         reference = PaperReference(rows=60, columns=90)
@@ -72,7 +72,7 @@ def test_a_scan_is_that_of_every_ray_cast_at_every_body(scene, step, sensor):
     assert seen.num_body_casts < 0.5 * seen.num_rays * len(instant.moving_bodies)
 
 
-def test_bodies_of_one_kind_are_cast_at_together_from_a_place_on_one_of_them_too():
+def test_grouped_casting_starts_correctly_on_a_body():
     """Two coincide: what a ray hits then is the last of them, as it is when they are cast at in turn."""
     car, away = Box(type="box", size_m=(4, 2, 1.5)).build_mesh(), np.array([0.0, 3.0])
     places = [(0, 0, 0), (8, 1, 0), (8, 1, 0), (9, -4, 0), (-7, 2, 0)]
@@ -105,14 +105,14 @@ def boxes_around(generator, count):
     return np.array([(corners * s) @ p[:3, :3].T + p[:3, 3] for s, p in zip(sizes, poses, strict=True)]), sizes, poses
 
 
-def test_a_tile_of_which_no_ray_is_cast_meets_no_box_around_the_sensor():
+def test_empty_tiles_have_no_candidate_blocks():
     none = SPHERE[0].select(np.zeros(SPHERE[0].directions.shape[1], dtype=bool))
     around = compute_outlines(EGO.corners_m[None], ROOF[:3, 3] / 2)
     assert find_boxes_in_cone(around, none.axis, none.half_angle_rad, 0.0).tolist() == [0]
     assert find_blocks_towards_boxes(around, none, np.eye(3), np.empty(0, dtype=np.float32)).shape == (1, 0)
 
 
-def test_no_ray_that_meets_a_box_is_left_out():
+def test_no_ray_that_hits_a_box_is_culled():
     """Directions to points inside boxes, the corners included, pass every test for those boxes."""
     generator = np.random.default_rng(0)
     corners_m, sizes, poses = boxes_around(generator, 300)
@@ -142,7 +142,7 @@ def test_no_ray_that_meets_a_box_is_left_out():
     assert 3 < close < 150
 
 
-def test_a_ray_does_not_depend_on_its_company():
+def test_rotating_a_ray_is_independent_of_other_rays():
     turn, rays = convert_euler_to_rotation(31, 7, 3), np.concatenate([tile.directions for tile in SPHERE], axis=1)
     together = rotate(turn, rays)
     for first in range(0, 2000, 40):

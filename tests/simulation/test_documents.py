@@ -69,19 +69,19 @@ def test_degrees_that_look_like_radians_are_reported(keys, told):
     assert [told in str(one.message) for one in caught] == [True] * (told is not None)
 
 
-def test_mounts_of_recordings_that_look_like_radians_are_reported():
+def test_recording_mounts_in_radians_are_reported():
     with pytest.warns(UserWarning, match="yaw_deg: 1.5708 looks like 90 degrees"):
         Mount(x_m=1.0, y_m=0.0, z_m=0.0, yaw_deg=1.5708).to_matrix()
 
 
-def test_a_scenario_is_read_and_mesh_paths_are_relative_to_it(tmp_path):
+def test_mesh_paths_are_relative_to_the_scenario_file(tmp_path):
     content = SCENARIO + "  - {name: m, shape: {type: mesh, path: parts/m.stl}}\n"
     scenario = Scenario.load(str(write(tmp_path, content)))
     assert scenario.bodies[1].shape.path == tmp_path / "parts" / "m.stl"
 
 
 @pytest.mark.parametrize("kind", ["rigs", "scenarios", "vehicles"])
-def test_every_built_in_document_is_valid_and_carries_its_file_name(kind):
+def test_built_in_documents_are_valid_and_named_consistently(kind):
     model = {"rigs": Rig, "scenarios": Scenario, "vehicles": Vehicle}[kind]
     names = list_builtin_names(kind)
     assert names
@@ -152,7 +152,7 @@ DOUBLED = {
 
 
 @pytest.mark.parametrize("kind", DOUBLED)
-def test_a_key_that_is_there_twice_is_an_error_in_every_document(tmp_path, kind):
+def test_repeated_keys_are_refused_in_every_document(tmp_path, kind):
     read, content, key = DOUBLED[kind]
     path = write(tmp_path, content)
     with pytest.raises(ValueError, match=f"the key '{key}' is there twice, in line .* and in line ") as caught:
@@ -160,26 +160,26 @@ def test_a_key_that_is_there_twice_is_an_error_in_every_document(tmp_path, kind)
     assert str(caught.value).startswith(f"{path}: ")
 
 
-def test_a_sensor_made_without_a_mount_is_one_at_the_origin_when_it_was_written(tmp_path):
+def test_a_sensor_without_mount_is_saved_at_origin(tmp_path):
     given = {"channels": 4, "vertical_fov_deg": (-10, 10), "horizontal_fov_deg": 360, "columns": 8, "max_range_m": 50}
     Rig(name="r", sensors=(Lidar(name="a", **given),)).save(tmp_path / "rig.yaml")
     assert Rig.load(tmp_path / "rig.yaml").sensors[0].mount == Pose()
 
 
-def test_whole_numbers_lists_and_numpys_numbers_may_stand_for_what_is_kept():
+def test_integers_lists_and_numpy_numbers_are_converted():
     given = {"vertical_fov_deg": [-10, np.float32(10)], "horizontal_fov_deg": np.int64(360), "max_range_m": 50}
     lidar = Lidar(name="a", channels=np.int64(4), columns=8, **given)
     assert lidar.vertical_fov_deg == (-10.0, 10.0)
     assert (lidar.channels, type(lidar.channels), type(lidar.max_range_m)) == (4, int, float)
 
 
-def test_a_bad_sensor_does_not_make_the_list_of_sensors_too_short(tmp_path):
+def test_an_invalid_sensor_does_not_shorten_the_list(tmp_path):
     with pytest.raises(ValueError, match=r"sensors\.0\.colums: unknown key") as caught:
         Rig.load(write(tmp_path, RIG.replace("columns: 8", "colums: 8")))
     assert "at least 1" not in str(caught.value)
 
 
-def test_a_message_is_short_however_many_mistakes_there_are_and_however_large_they_are(tmp_path):
+def test_messages_about_many_mistakes_stay_short(tmp_path):
     nested = "[" * 50 + "1, 2" + "]" * 50
     keys = "".join(f"key_{k}: {nested}\n" for k in range(40))
     with pytest.raises(ValueError, match="and 35 more mistakes") as caught:
@@ -190,7 +190,7 @@ def test_a_message_is_short_however_many_mistakes_there_are_and_however_large_th
 def test_a_vehicle_that_names_itself_is_refused(tmp_path):
     path = tmp_path / "v.yaml"
     path.write_text(f"name: v\nparts: [{{name: p, shape: {{type: vehicle, vehicle: {path}}}}}]\n")
-    with pytest.raises(ValueError, match=r"v\.yaml: part 'p' is the vehicle '.*v\.yaml'; a vehicle is put"):
+    with pytest.raises(ValueError, match=r"v\.yaml: part 'p' is the vehicle '.*v\.yaml', which may contain this"):
         Vehicle.load(path)
 
 
@@ -214,7 +214,7 @@ def test_a_rig_needs_a_sensor(tmp_path):
         ("a: [1", "not a YAML file"),
     ],
 )
-def test_what_is_not_a_document_is_refused(tmp_path, content, message):
+def test_files_other_than_documents_are_refused(tmp_path, content, message):
     with pytest.raises(ValueError, match=rf"doc\.yaml: .*{message}"):
         Rig.load(write(tmp_path, content))
 
@@ -225,7 +225,7 @@ def test_an_unknown_shape_lists_the_known_ones(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["no_such_rig", "../rigs/front_roof_128", ""])
-def test_an_unknown_name_gets_the_nearest_and_no_list(name):
+def test_unknown_names_suggest_the_nearest_name(name):
     with pytest.raises(FileNotFoundError, match=r"neither a \.yaml file nor one of the built-in rigs; is '") as caught:
         Rig.load(name)
     assert len(str(caught.value)) < 250
@@ -246,14 +246,14 @@ def test_an_unknown_name_gets_the_nearest_and_no_list(name):
         (read_objects, "cut_in.xosc", "OpenSCENARIO is not read.*; recorded tracks are"),
     ],
 )
-def test_a_file_of_another_format_is_refused_with_the_conversion_that_helps(tmp_path, load, name, told):
+def test_files_of_other_formats_name_the_conversion(tmp_path, load, name, told):
     (tmp_path / name).write_text("<OpenSCENARIO/>")
     with pytest.raises(ValueError, match=f"{name}: .*{told}"):
         load(tmp_path / name)
 
 
 @pytest.mark.parametrize("name", ["map.osm", "cut_in.xosc"])
-def test_a_network_of_another_format_is_refused_with_the_conversion_that_helps(tmp_path, name):
+def test_networks_of_other_formats_name_the_conversion(tmp_path, name):
     scenario = f"{{name: s, traffic: {{type: sumo, net: {name}, fcd: fcd.xml}}}}"
     with pytest.raises(ValueError, match=r"a network is a \.net\.xml or \.xodr file; Open"):
         Scenario.load(write(tmp_path, scenario)).build_scene()
@@ -275,6 +275,6 @@ def test_a_quaternion_and_angles_describe_the_same_pose():
         ("name: s\ntraffic: {type: rural}\n", "traffic: .*'urban', 'highway', 'parking'"),
     ],
 )
-def test_a_scenario_is_given_or_procedural(tmp_path, content, message):
+def test_scenarios_have_either_bodies_or_traffic(tmp_path, content, message):
     with pytest.raises(ValueError, match=message):
         Scenario.load(write(tmp_path, content))

@@ -37,7 +37,7 @@ def length_m(scenario, *rigs, vehicle=None):
 
 
 @pytest.mark.parametrize("world", [given, procedural])
-def test_the_first_that_is_given_carries_the_rig(world):
+def test_the_first_specified_vehicle_is_the_ego(world):
     assert length_m(world(), rig()) == pytest.approx(4.90)
     assert length_m(world(), rig("sedan")) == pytest.approx(4.77)
     assert length_m(world(shape=BOX), rig("sedan")) == pytest.approx(6.0)
@@ -46,13 +46,13 @@ def test_the_first_that_is_given_carries_the_rig(world):
 
 
 @pytest.mark.parametrize("name", ["courtyard", "urban", "highway", "parking"])
-def test_built_in_scenarios_leave_it_to_the_rig(name):
+def test_built_in_scenarios_use_the_vehicle_of_rigs(name):
     zoe = set_ego(Scenario.load(name), {"nuscenes": Rig.load("nuscenes")})
     assert (zoe.ego_name, zoe.compute_ego_box().size_m[0]) == ("renault_zoe", pytest.approx(4.084))
     assert set_ego(Scenario.load(name), {"a": rig()}).ego_name == Scenario.load(name).ego_name == "suv"
 
 
-def test_rigs_that_name_different_vehicles_need_one_that_is_for_all():
+def test_rigs_of_different_vehicles_need_a_common_one():
     two = (rig("sedan"), rig("van"))
     with pytest.raises(ValueError, match=r"different vehicles \(0 sedan, 1 van\), .* one ego: choose it by --vehicle"):
         length_m(given(), *two)
@@ -62,7 +62,7 @@ def test_rigs_that_name_different_vehicles_need_one_that_is_for_all():
     assert length_m(given(), rig("sedan"), rig("sedan"), rig()) == pytest.approx(4.77)
 
 
-def test_a_vehicles_file_lies_beside_the_document_that_names_it(tmp_path, monkeypatch):
+def test_vehicle_paths_are_relative_to_their_document(tmp_path, monkeypatch):
     (tmp_path / "own").mkdir()
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "own" / "cart.yaml").write_text(CART)
@@ -85,12 +85,12 @@ def test_a_vehicles_file_lies_beside_the_document_that_names_it(tmp_path, monkey
     assert set_ego(given(), {"r": rig()}, "../own/cart.yaml").ego_name == "cart.yaml"
 
 
-def test_an_unknown_vehicle_is_told_with_whose_it_is_and_the_known_ones():
+def test_unknown_vehicles_are_reported_with_their_rig():
     with pytest.raises(FileNotFoundError, match=r"rig 'top': vehicle: 'tank' is neither .* built-in vehicles; is "):
         set_ego(given(), {"top": rig("tank")})
 
 
-def test_frames_say_which_vehicle_it_was_and_are_others_on_another():
+def test_frames_depend_on_the_vehicle_and_name_it():
     scenario = given()
     frames = [SimulatedFrames(scenario, rig(), num_frames=1, reference_sensor=SMALL, vehicle=v) for v in (None, "van")]
     assert [each.description["vehicle"] for each in frames] == ["suv", "van"]

@@ -21,7 +21,7 @@ def world(ego, actors, parked=()):
     return Scene((CAR,), Actor("ego", "car", CAR, ego), tuple(actors), 0.5, 10.0, tuple(parked))
 
 
-def test_a_label_is_where_the_body_is_in_the_frame_of_the_ego():
+def test_labels_are_poses_in_the_vehicle_frame():
     """The ego drives north, 10 m/s; the truck drives east, 5 m/s, 20 m ahead of it after a second."""
     ego = driving(10.0, 90.0, UTM_M)
     truck = Actor("truck 1", "truck", CAR, driving(5.0, 0.0, UTM_M + np.array([-5.0, 30.0, 0.0])))
@@ -33,7 +33,7 @@ def test_a_label_is_where_the_body_is_in_the_frame_of_the_ego():
     np.testing.assert_allclose(label.velocity_mps, [0.0, -5.0], atol=1e-6)
 
 
-def test_the_range_is_measured_over_ground_and_who_is_not_there_has_no_label():
+def test_range_is_horizontal_and_absent_objects_are_unlabeled():
     ego = Trajectory.create_static([0.0, 0.0, 0.0])
     near = Actor("near", "car", CAR, Trajectory.create_static([30.0, 40.0, 9.0]))
     far = Actor("far", "car", CAR, Trajectory.create_static([30.0, 40.1, 0.0]))
@@ -50,7 +50,7 @@ def test_parked_objects_have_labels_too():
     np.testing.assert_array_equal(label.velocity_mps, 0.0)
 
 
-def test_velocity_is_that_of_the_segment_their_mean_at_a_corner_and_zero_at_rest():
+def test_velocity_at_a_pose_averages_both_segments():
     track = Trajectory.from_arrays([1.0, 2.0, 4.0], [[0, 0, 0], [10, 0, 0], [10, 8, 0]], np.zeros((3, 3)))
     for time_s, expected in {
         0.5: [0, 0, 0], 1.0: [10, 0, 0], 1.5: [10, 0, 0], 2.0: [5, 2, 0], 3.0: [0, 4, 0], 4.0: [0, 4, 0], 4.5: [0, 0, 0]

@@ -41,12 +41,12 @@ def read(folder, keys):
     return Rig.load(path).sensors[0]
 
 
-def test_these_are_all():
+def test_all_built_in_models_are_tested():
     assert list_builtin_names("lidars") == sorted(PUBLISHED)
 
 
 @pytest.mark.parametrize("name", PUBLISHED)
-def test_a_model_has_its_published_figures_and_says_where_they_come_from(name):
+def test_models_match_data_sheets_and_state_the_source(name):
     model = LidarModel.load(name)
     rows, lowest, highest, columns, range_m = PUBLISHED[name]
     elevations = model.compute_elevations_deg()
@@ -64,7 +64,7 @@ def test_rows_are_sorted_and_different(name):
     assert (steps < 0).all() or (steps > 0).all()
 
 
-def test_hesai_rows_turn_left_where_its_table_says_right():
+def test_hesai_azimuth_offsets_have_the_opposite_sign():
     # Channel 8 of a Pandar64: elevation 1.676, offset 3.125 degrees clockwise.
     model = LidarModel.load("hesai_pandar64")
     row = int(np.argmin(np.abs(model.compute_elevations_deg() - 1.676)))
@@ -86,7 +86,7 @@ def test_a_sensor_has_the_pattern_of_its_model():
     assert (lidar.name, lidar.mount.z_m, lidar.min_range_m, lidar.max_range_m) == ("s", 2.0, 0.3, 120.0)
 
 
-def test_what_a_sensor_says_itself_wins():
+def test_keys_of_a_sensor_override_its_model():
     lidar = sensor(model="velodyne_vlp16", columns=900, max_range_m=30, range_noise_m=0.03, dropout=0.1)
     assert (lidar.columns, lidar.max_range_m, lidar.range_noise_m, lidar.dropout) == (900, 30.0, 0.03, 0.1)
     assert len(lidar.compute_elevations_deg()) == 16
@@ -101,30 +101,30 @@ def test_what_a_sensor_says_itself_wins():
         ("innovusion_falcon", {"channels": 3}, [-12.5, 0, 12.5]),
     ],
 )
-def test_rows_of_a_sensor_replace_those_of_its_model_and_their_offsets(model, keys, rows_deg):
+def test_rows_of_a_sensor_replace_model_offsets(model, keys, rows_deg):
     lidar = sensor(model=model, **keys)
     assert (lidar.compute_elevations_deg().tolist(), lidar.azimuth_offsets_deg) == (rows_deg, None)
 
 
-def test_offsets_can_be_left_out():
+def test_azimuth_offsets_are_optional():
     lidar = sensor(model="hesai_pandar64", azimuth_offsets_deg=None)
     assert lidar.azimuth_offsets_deg is None
     assert len(lidar.compute_elevations_deg()) == 64
 
 
-def test_a_sensor_written_out_is_the_same_sensor_again():
+def test_expanding_the_model_keeps_the_sensor_equal():
     for model in ("ouster_os1_64", "innovusion_falcon"):
         lidar = sensor(model=model, columns=7)
         assert Lidar.model_validate(lidar.model_dump()) == lidar
 
 
-def test_the_keys_that_arrive_stay_as_they_were():
+def test_parsing_does_not_change_the_input():
     keys = {"name": "s", "model": "velodyne_vlp16"}
     Lidar.model_validate(keys)
     assert keys == {"name": "s", "model": "velodyne_vlp16"}
 
 
-def test_a_model_can_be_a_file_beside_the_rig(tmp_path):
+def test_models_may_be_files_relative_to_rigs(tmp_path):
     (tmp_path / "own.yaml").write_text(
         "{name: own, elevations_deg: [0, -5], horizontal_fov_deg: 90, columns: 4, max_range_m: 9}"
     )

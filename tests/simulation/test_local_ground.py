@@ -67,7 +67,7 @@ def heights(ground, *points):
 PLANE = sheet(lambda x, y: 0 * x)
 
 
-def test_roofs_are_no_ground_and_pavements_are():
+def test_sidewalks_are_ground_and_roofs_are_not():
     house, pavement, car = solid((9, 9, 6), 20), solid((9, 3, 0.15), -20), solid((4, 2, 1.4), 0, 10)
     ground = ground_of([PLANE, house, pavement, car])
     found = heights(ground, [20, 0, 7], [-20, 0, 1.15], [0, 10, 1.4], [5, 5, 2], [5, 5, -1], [5, 5, -0.02])
@@ -75,7 +75,7 @@ def test_roofs_are_no_ground_and_pavements_are():
     assert math.isnan(heights(ground, [500, 0, 2])[0])
 
 
-def test_a_ramp_a_bridge_and_the_road_below_it():
+def test_ramps_connect_a_bridge_with_the_road():
     up = wedge((10, 30), (-3, 3), (0, 5))
     deck = solid((20, 6, 0.8), 40, 0, 4.2)
     down = wedge((10, 30), (-3, 3), (0, 5)).transform(build_transform(convert_euler_to_rotation(180, 0, 0), [80, 0, 0]))
@@ -87,7 +87,7 @@ def test_a_ramp_a_bridge_and_the_road_below_it():
     np.testing.assert_allclose(heights(ground_of([PLANE, deck]), [40, 0, 6]), [6], atol=1e-5)
 
 
-def test_the_decks_of_a_car_park_and_the_stairs_between_them():
+def test_stairs_connect_levels_of_a_parking_garage():
     stairs = [solid((0.3, 2, 0.18 * (k + 1)), 5 + 0.3 * k, 12) for k in range(16)]
     deck = solid((30, 20, 0.3), 24.65, 12, 0.18 * 17 - 0.3)
     pillar = (
@@ -102,7 +102,7 @@ def test_the_decks_of_a_car_park_and_the_stairs_between_them():
 
 
 @pytest.mark.parametrize("down", [False, True])
-def test_a_terrain_whichever_way_its_faces_look(down):
+def test_terrain_is_ground_for_any_face_orientation(down):
     slope = sheet(lambda x, y: 0.1 * x - 0.05 * y, down=down)
     ground = ground_of([slope])
     rng = np.random.default_rng(1)
@@ -114,7 +114,7 @@ def test_a_terrain_whichever_way_its_faces_look(down):
     assert not ground.is_below_ground(np.array([0.0, 0.0, 0.5]))
 
 
-def test_heights_are_those_along_the_vertical_of_the_world_in_any_frame():
+def test_heights_are_along_the_world_vertical():
     ground = ground_of([PLANE, solid((9, 3, 0.15), -20)])
     rng = np.random.default_rng(2)
     world = np.column_stack([rng.uniform(-50, 50, (200, 2)), rng.uniform(-0.03, 9, 200)])
@@ -123,7 +123,7 @@ def test_heights_are_those_along_the_vertical_of_the_world_in_any_frame():
     np.testing.assert_allclose(ground.compute_heights_m(inside, pose), ground.compute_heights_m(world), atol=1e-4)
 
 
-def test_steep_faces_and_what_is_far_above_are_nobodys_ground():
+def test_steep_or_distant_faces_are_not_ground():
     assert find_level_faces(wedge((0, 1), (0, 1), (0, 0.9))).sum() == 2
     assert find_level_faces(wedge((0, 1), (0, 1), (0, 1.1))).sum() == 0
     for seed in range(50):  # 45 degrees, whatever rounding makes of that
@@ -140,12 +140,12 @@ def test_steep_faces_and_what_is_far_above_are_nobodys_ground():
 
 
 @pytest.mark.parametrize(("top_m", "height_m"), [(0.95, 2.05), (1.05, 3.0)])
-def test_who_is_on_a_surface_has_it_within_a_metre(top_m, height_m):
+def test_surfaces_within_a_meter_of_positions_are_ground(top_m, height_m):
     ground = ground_of([PLANE, solid((9, 9, 0.2), 0, 0, top_m - 0.2)])
     assert math.isclose(heights(ground, [0, 0, 3])[0], height_m, abs_tol=1e-5)
 
 
-def test_bounds_of_heights_hold_every_point_of_a_triangle():
+def test_height_bounds_contain_all_points_of_triangles():
     bumpy = sheet(lambda x, y: 2 * np.sin(x / 9) + np.cos(y / 7) + 0.02 * x, half=100, every=4)
     ground = ground_of([bumpy, solid((9, 9, 0.15), 30, 0, 3.0), solid((20, 20, 1), -40, 0, 6.0)], [(0, 0, 1)])
     rng = np.random.default_rng(3)
@@ -178,7 +178,7 @@ OBSTACLE = SurfaceReference(AREA, num_rays=600, num_poses=2, bands_m=((0.5, 2.0)
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.06, -0.06])
-def test_the_wall_on_a_slope_is_cut_at_heights_above_the_slope(at, slope):
+def test_walls_are_cut_by_height_above_slope(at, slope):
     at([2.6, 0.0, 1.0])
     wall = Mesh(np.array([[25, -8, -5], [25, 8, -5], [25, 8, 9], [25, -8, 9.0]]), np.array([[0, 1, 2], [0, 2, 3]]))
     world = resting([sheet(lambda x, y: slope * x + 0.04 * y), wall], pitch=-math.degrees(math.atan(slope)))
@@ -189,7 +189,7 @@ def test_the_wall_on_a_slope_is_cut_at_heights_above_the_slope(at, slope):
     agrees(np.array([one.weights.astype(np.float64).sum() for one in found]), 16 * 1.5)
 
 
-def test_drawing_by_height_is_unbiased_for_any_number_of_rays_and_bands_that_overlap():
+def test_sampling_by_height_is_unbiased():
     waves = sheet(lambda x, y: np.sin(x / 11), every=2)
     scene = SceneGeometry(resting([waves, solid((4, 4, 3), 20, 0, -1), solid((2, 9, 2), 30, 3, -1)]))
     areas = (((5.0, 45.0), (-10.0, 10.0)), ((15.0, 25.0), (-5.0, 5.0)))
@@ -212,7 +212,7 @@ def test_drawing_by_height_is_unbiased_for_any_number_of_rays_and_bands_that_ove
         assert (error < 0.1 * many.mean(axis=0)).all()
 
 
-def test_on_level_ground_both_frames_are_one(at):
+def test_both_band_frames_agree_on_level_ground(at):
     at([2.6, 0.0, 1.0])
     wall = box([0.2, 10, 3], x_m=20)
     made = scenario({**FLOOR, "ground": True}, wall)
@@ -221,7 +221,7 @@ def test_on_level_ground_both_frames_are_one(at):
         agrees(sums(made, sensor), 15.0)
 
 
-def test_what_is_sunk_into_the_ground_counts_from_there_on(at):
+def test_sunken_bodies_count_from_the_ground_up(at):
     """A ledge of 4 x 4 m, which is ground: the upper 5 cm of its front lie on its top, as kerbs do."""
     at([2.6, 0.0, 2.0])
     ledge = {"name": "ledge", "ground": True, "shape": {"type": "box", "size_m": [4, 4, 2]}, "poses": [{"x_m": 12}]}
@@ -235,7 +235,7 @@ def test_what_is_sunk_into_the_ground_counts_from_there_on(at):
             agrees(sums(made, area, steps=20), 16 + 4 * min(high_m, 0.5 + 0.05))
 
 
-def test_bodies_that_move_are_cut_at_heights_above_the_ground_below_them(at):
+def test_moving_bodies_are_cut_by_height_above_ground(at):
     at([2.6, 0.0, 1.0])
     hill = sheet(lambda x, y: 0.08 * x)
     times = np.array([0.0, 1.0])
@@ -255,7 +255,7 @@ def attitudes():
     return [{}, {"pitch": 2.0}, {"pitch": -2.0}, {"roll": 2.0}, {"pitch": 1.5, "roll": -1.5}]
 
 
-def test_heights_and_bands_do_not_know_the_attitude_of_the_ego():
+def test_heights_are_independent_of_ego_attitude():
     """The same places in the world, whichever way the ego leans."""
     static = [sheet(lambda x, y: 0.03 * x), solid((3, 3, 2.5), 20, 2), solid((8, 3, 0.15), -20, 0, -0.6)]
     rng = np.random.default_rng(4)
@@ -270,7 +270,7 @@ def test_heights_and_bands_do_not_know_the_attitude_of_the_ego():
         np.testing.assert_allclose(other, found[0], atol=2e-4)
 
 
-def test_who_stands_below_the_ground_is_refused_and_a_sheet_buries_nobody():
+def test_positions_below_ground_are_refused():
     flat = {True: sheet(lambda x, y: 0 * x, down=True), False: PLANE}
     for mesh in flat.values():
         instant = SceneGeometry(resting([mesh])).get_snapshot(0)
@@ -283,7 +283,7 @@ def test_who_stands_below_the_ground_is_refused_and_a_sheet_buries_nobody():
     assert instant.is_occupied(np.array([8.0, 0.0, 1.0]))
 
 
-def test_frames_carry_heights_everywhere_they_go(tmp_path):
+def test_frames_keep_heights_through_transforms_and_storage(tmp_path):
     frames = SimulatedFrames("courtyard", "front_roof_32", num_frames=2, boxes=True)
     frame = frames[0]
     assert frame.reference_heights_m.shape == frame.reference_weights.shape
@@ -304,7 +304,7 @@ def test_frames_carry_heights_everywhere_they_go(tmp_path):
     torch.testing.assert_close(again.boxes.bottom_heights_m, frame.boxes.bottom_heights_m)
 
 
-def test_boxes_know_how_high_their_bottoms_are():
+def test_boxes_have_bottom_heights_above_ground():
     frames = SimulatedFrames("urban", "front_roof_32", num_frames=1, seed=2, boxes=True)
     boxes = frames[0].boxes
     assert len(boxes) > 20
@@ -312,7 +312,7 @@ def test_boxes_know_how_high_their_bottoms_are():
     assert (boxes.center_m[:, 2] - boxes.size_m[:, 2] / 2).abs().max() > 1.0
 
 
-def test_a_scenario_says_its_ground_or_is_told_what_was_taken():
+def test_unmarked_ground_is_found_and_noted():
     wall = box([0.2, 10, 3], x_m=20)
     deck = {"name": "deck", "shape": {"type": "box", "size_m": [9, 9, 4]}, "poses": [{"x_m": -30}]}
     guessed = Simulator(scenario(FLOOR, wall, deck), {}, OBSTACLE)
@@ -325,7 +325,7 @@ def test_a_scenario_says_its_ground_or_is_told_what_was_taken():
     assert np.isnan(nothing.simulate_frame(0).reference_heights_m).all()
 
 
-def test_what_cannot_be_ground_is_refused():
+def test_bodies_without_level_faces_cannot_be_ground():
     part = {"name": "p", "ground": True, "shape": {"type": "box", "size_m": [1, 1, 1]}}
     with pytest.raises(ValueError, match="part 'p' is ground"):
         Vehicle.model_validate({"name": "v", "parts": [part]})
@@ -346,7 +346,7 @@ def test_what_cannot_be_ground_is_refused():
     SurfaceReference(AREA, bands_m=((-3.0, -1.0),), band_frame="vehicle")
 
 
-def test_the_courtyard_says_what_would_have_been_found():
+def test_ground_of_the_courtyard_matches_the_search():
     world = Scenario.load("courtyard").build_scene()
     said, found = (
         SceneGeometry(dataclasses.replace(world, ground_mesh_indices=known)).ground_masks

@@ -81,7 +81,7 @@ def areas(mesh):
         ("a.dae", as_dae),
     ],
 )
-def test_polygons_that_are_not_convex_keep_their_area(tmp_path, name, write, points):
+def test_concave_polygons_keep_their_area(tmp_path, name, write, points):
     content, copies = write(points)
     (tmp_path / name).write_bytes(content)
     mesh = MeshFile(type="mesh", path=tmp_path / name).build_mesh()
@@ -89,7 +89,7 @@ def test_polygons_that_are_not_convex_keep_their_area(tmp_path, name, write, poi
     assert len(mesh.faces) == copies * (len(points) - 2)
 
 
-def test_polygons_of_any_shape_keep_their_area_in_any_plane():
+def test_polygons_keep_their_area_in_any_plane():
     """Stars seen from their middle, and a square with a hole that is joined to its outline by a cut."""
     random = np.random.default_rng(0)
     hole = [(0, 0), (4, 0), (4, 4), (0, 4), (0, 0), (1, 1), (1, 3), (3, 3), (3, 1), (1, 1)]
@@ -129,7 +129,7 @@ def as_glb(meshes):
     return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
 
 
-def test_objects_and_materials_that_are_named_let_rays_pass(tmp_path):
+def test_rays_pass_transparent_objects_and_materials(tmp_path):
     corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]])
     parts = {"body": (corners, 0), "door": (2 * corners, 0), "windscreen": (4 * corners, 1), "rear": (8 * corners, 1)}
     (tmp_path / "car.glb").write_bytes(as_glb(parts))
@@ -149,7 +149,7 @@ def test_objects_and_materials_that_are_named_let_rays_pass(tmp_path):
 
 
 @pytest.mark.parametrize("opacity", ["d 0.3", "Tr 0.7"])
-def test_materials_of_mtl_files_have_names_and_an_opacity(tmp_path, opacity):
+def test_mtl_materials_have_names_and_opacity(tmp_path, opacity):
     (tmp_path / "a.mtl").write_text(f"newmtl paint\nKd 1 0 0\nd 1\nnewmtl glass\nKd 0 0 1\n{opacity}\n")
     vertices = "".join(f"v {x} {y} 0\n" for x, y in [(0, 0), (1, 0), (1, 1), (0, 1)])
     (tmp_path / "a.obj").write_text(f"mtllib a.mtl\n{vertices}usemtl paint\nf 1 2 3\nusemtl glass\nf 1 3 4\n")
@@ -158,7 +158,7 @@ def test_materials_of_mtl_files_have_names_and_an_opacity(tmp_path, opacity):
     assert len(mesh.model_copy(update={"transparent": ("glass",)}).build_mesh().faces) == 1
 
 
-def test_a_camera_behind_glass_is_told_how_to_look_through_it(tmp_path):
+def test_blocked_cameras_are_told_about_transparent_windows(tmp_path):
     """A closed car of glass sides: the message names the material and the key, and with the key it looks out."""
     box = Box(type="box", size_m=(4.0, 2.0, 1.5)).build_mesh()
     sides = {f"side {k}": (box.vertices_m[face], 0 if k < 2 else 1) for k, face in enumerate(box.faces)}
@@ -178,19 +178,19 @@ def test_a_camera_behind_glass_is_told_how_to_look_through_it(tmp_path):
 
 
 @pytest.mark.parametrize(("name", "told"), [("a.fbx", "export it as GLB"), ("a.urdf", "`torchcover robot` reads")])
-def test_a_format_that_is_not_read_is_refused_with_the_conversion_that_helps(tmp_path, name, told):
+def test_unsupported_formats_name_the_conversion(tmp_path, name, told):
     (tmp_path / name).write_bytes(b"Kaydara FBX Binary")
     with pytest.raises(BadFileError, match=f"is no mesh that can be read; {told}"):
         MeshFile(type="mesh", path=tmp_path / name).build_mesh()
 
 
-def test_an_index_that_no_vertex_has_is_refused(tmp_path):
+def test_faces_with_invalid_indices_are_refused(tmp_path):
     (tmp_path / "a.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3 5\n")
     with pytest.raises(BadFileError, match="cannot read it as a mesh"):
         MeshFile(type="mesh", path=tmp_path / "a.obj").build_mesh()
 
 
-def test_text_in_latin_1_is_read_as_it_is_in_utf_8(tmp_path):
+def test_latin_1_text_equals_utf_8_text(tmp_path):
     text = "# caf\u00e9\nmtllib caf\u00e9.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl caf\u00e9\nf 1 2 3\n"
     (tmp_path / "a.obj").write_bytes(text.encode("latin-1"))
     ascii_stl = "solid \u00e9\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\n"
@@ -208,7 +208,7 @@ def test_text_in_latin_1_is_read_as_it_is_in_utf_8(tmp_path):
         ("a.gltf", "EXT_meshopt_compression", BadFileError, "compressed by EXT_meshopt_compression; export it without"),
     ],
 )
-def test_a_package_that_is_missing_is_no_damage(tmp_path, name, content, error, told):
+def test_missing_packages_are_not_reported_as_damage(tmp_path, name, content, error, told):
     """trimesh would read compressed glTF as points that all are at the origin."""
     text = f'{{"asset": {{}}, "extensionsRequired": ["{content}"]}}' if name == "a.gltf" else content
     (tmp_path / name).write_text(text)

@@ -30,12 +30,12 @@ def simulator(tmp_path, mount, *, speed_mps=0.0, bodies=(), actors=()):
 
 @pytest.mark.parametrize("speed_mps", [0.0, 2.0])
 @pytest.mark.parametrize("mount", [{"z_m": -1.73}, {"x_m": 3.0, "z_m": -0.01}])
-def test_a_sensor_below_the_ground_is_refused_by_name(tmp_path, mount, speed_mps):
+def test_sensors_below_the_ground_are_refused(tmp_path, mount, speed_mps):
     with pytest.raises(ValueError, match=r"rig 'mine': sensor 'top' at .* lies below the ground, or inside a wall"):
         simulator(tmp_path, mount, speed_mps=speed_mps).simulate_frame(0)
 
 
-def test_a_sensor_far_from_the_vehicle_is_taken_for_one_in_other_units(tmp_path):
+def test_distant_mounts_suggest_wrong_units(tmp_path):
     # The box of the ego ends at 2 m ahead and 1 m up: 20 m from its upper front edge on either axis.
     assert len(simulator(tmp_path, {"x_m": 2.0, "z_m": 20.9}).simulate_frame(0).clouds["mine"]) > 0
     with pytest.raises(ValueError, match=r"'top' at .* lies 1799 m away from the ego .*in meters.* millimeters\?"):
@@ -44,7 +44,7 @@ def test_a_sensor_far_from_the_vehicle_is_taken_for_one_in_other_units(tmp_path)
         simulator(tmp_path, {"x_m": -22.1, "z_m": 0.5}).simulate_frame(0)
 
 
-def test_only_another_vehicle_than_that_of_the_rig_is_said_to_be_in_the_way():
+def test_only_foreign_vehicles_suggest_the_vehicle_option():
     kitti = Rig.load("kitti")
     low = kitti.sensors[0].model_copy(update={"mount": Pose(z_m=0.8)})
     low = kitti.model_copy(update={"sensors": (low,)})
@@ -54,7 +54,7 @@ def test_only_another_vehicle_than_that_of_the_rig_is_said_to_be_in_the_way():
             Simulator(world, {"kitti": low}, PaperReference(rows=4, columns=4)).simulate_frame(0)
 
 
-def test_a_sensor_in_a_wall_or_in_another_vehicle_is_refused(tmp_path):
+def test_sensors_inside_other_bodies_are_refused(tmp_path):
     with pytest.raises(ValueError, match=r"'top' at .* inside a wall"):
         simulator(tmp_path, {"x_m": 5.0, "z_m": 2.0}, bodies=[BAR]).simulate_frame(0)
     van = {"name": "van", "category": "car", "shape": {"type": "box", "size_m": [5, 2, 3]}, "pose": {"y_m": 4.0}}
@@ -62,7 +62,7 @@ def test_a_sensor_in_a_wall_or_in_another_vehicle_is_refused(tmp_path):
         simulator(tmp_path, {"y_m": 3.5, "z_m": 2.0}, actors=[van]).simulate_frame(0)
 
 
-def test_a_sensor_that_drives_into_a_wall_is_refused_when_it_gets_there(tmp_path):
+def test_driving_into_a_wall_is_refused_there(tmp_path):
     driving = simulator(tmp_path, {"z_m": 2.0}, speed_mps=1.0, bodies=[BAR])
     assert len(driving.simulate_frame(4).clouds["mine"]) > 0
     with pytest.raises(ValueError, match="'top' at"):
@@ -70,14 +70,14 @@ def test_a_sensor_that_drives_into_a_wall_is_refused_when_it_gets_there(tmp_path
 
 
 @pytest.mark.parametrize("speed_mps", [0.0, 2.0])
-def test_a_sensor_exactly_on_the_ground_is_warned_of(tmp_path, speed_mps):
+def test_sensors_exactly_on_the_ground_cause_warnings(tmp_path, speed_mps):
     lying = simulator(tmp_path, {"x_m": 3.0, "z_m": 0.0}, speed_mps=speed_mps)
     with pytest.warns(UserWarning, match=r"rig 'mine': sensor 'top' at \[3.0, 0.0, 0.0\] m lies exactly on the ground"):
         lying.simulate_frame(1 if speed_mps else 0)
 
 
 @pytest.mark.parametrize("speed_mps", [0.0, 2.0])
-def test_a_sensor_on_the_skin_of_the_ego_is_where_it_may_be(tmp_path, speed_mps):
+def test_sensors_may_lie_on_the_ego_surface(tmp_path, speed_mps):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert (
@@ -87,7 +87,7 @@ def test_a_sensor_on_the_skin_of_the_ego_is_where_it_may_be(tmp_path, speed_mps)
 
 
 @pytest.mark.parametrize("moving", [False, True])
-def test_the_ego_buries_nobody_and_is_no_ground(tmp_path, moving):
+def test_the_ego_is_neither_ground_nor_enclosing(tmp_path, moving):
     scene = SceneGeometry(simulator(tmp_path, {"z_m": 1.6}, speed_mps=2.0 * moving).scenario.build_scene())
     instant = scene.get_snapshot(0)
     assert not instant.is_occupied(np.array([0.0, 0.0, 0.5]))

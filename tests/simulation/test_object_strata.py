@@ -60,7 +60,7 @@ def worlds_with(actor_of):
 
 
 @pytest.mark.parametrize("made", worlds_with(lambda moves: there(10.0, moves=moves)), ids=["rests", "moves", "parked"])
-def test_all_of_an_object_that_is_seen_is_found_wherever_the_areas_are(at, made):
+def test_visible_object_surface_is_sampled_outside_areas_too(at, made):
     at([2.5, 3.0, 2.5])
     found = scans(made, SurfaceReference(BEHIND, num_rays=100, num_poses=1, points_per_object=64))
     assert all(scan.sampled_point_counts.tolist() == [64] for scan in found)
@@ -71,7 +71,7 @@ def test_all_of_an_object_that_is_seen_is_found_wherever_the_areas_are(at, made)
 
 
 @pytest.mark.parametrize("made", worlds_with(lambda moves: there(10.0, moves=moves)), ids=["rests", "moves", "parked"])
-def test_in_the_areas_and_bands_the_square_metres_are_those_without_them(at, made):
+def test_object_strata_do_not_change_the_areas(at, made):
     at([2.5, 3.0, 2.5])
     # The area holds a quarter of the box in x, and the upper band half of it.
     areas, bands = (((4.0, 9.5), (-5.0, 5.0)),), ((-0.5, 0.5), (0.75, 2.0))
@@ -91,7 +91,7 @@ def test_in_the_areas_and_bands_the_square_metres_are_those_without_them(at, mad
         agrees(with_, exact or without.mean(), within=0.05)
 
 
-def test_each_object_gets_at_least_the_number_of_points_that_was_asked_for(at):
+def test_each_object_has_the_requested_points(at):
     at([2.5, 3.0, 2.5])
     made = world([there(10.0), there(30.0, moves=True)], parked=[there(90.0)])
     (scan,) = scans(made, SurfaceReference(BEHIND, num_rays=100, num_poses=4, points_per_object=10), steps=1)
@@ -104,7 +104,7 @@ def test_each_object_gets_at_least_the_number_of_points_that_was_asked_for(at):
     assert scan.sampled_point_counts[1:].tolist() == [0, 0]
 
 
-def test_of_two_objects_that_overlap_the_inside_is_not_seen(at):
+def test_the_inside_of_overlapping_objects_is_hidden(at):
     at([2.5, 0.0, 1.0])
     made = world([there(10.0), there(12.0, size_m=(4.0, 1.0, 3.0))])
     found = scans(made, SurfaceReference(BEHIND, num_rays=10, num_poses=1, points_per_object=128))
@@ -114,13 +114,13 @@ def test_of_two_objects_that_overlap_the_inside_is_not_seen(at):
     assert all(scan.sampled_point_counts.tolist() == [128, 128] for scan in found)
 
 
-def test_what_is_below_the_ground_is_drawn_and_not_seen(at):
+def test_surface_below_ground_is_sampled_and_invisible(at):
     at([2.5, 0.0, 0.9])
     made = world(parked=[there(10.0, z_m=-0.5)])
     agrees(m2(scans(made, SurfaceReference(BEHIND, num_rays=10, num_poses=1, points_per_object=128))), 2.0)
 
 
-def test_one_place_and_one_point_have_the_right_mean():
+def test_one_position_and_point_are_unbiased():
     found = scans(
         world([there(10.0)]), SurfaceReference(BEHIND, num_rays=1, num_poses=1, points_per_object=1), steps=150
     )
@@ -144,7 +144,7 @@ def test_without_an_object_nothing_changes():
     np.testing.assert_array_equal(with_.weights, without.weights)
 
 
-def test_nothing_is_drawn_on_who_is_not_there_or_out_of_range(at):
+def test_absent_and_distant_objects_are_not_sampled(at):
     at([-2.5, 0.0, 1.0])
     made = world([there(10.0, moves=True, until_s=1.5), there(37.0), there(40.0)])
     sensor = SurfaceReference(BEHIND, num_rays=100, num_poses=2, points_per_object=20, max_range_m=39.0)
@@ -154,7 +154,7 @@ def test_nothing_is_drawn_on_who_is_not_there_or_out_of_range(at):
     assert afterwards.sampled_point_counts.tolist() == [0, 20, 0]
 
 
-def test_an_object_that_turns_only_its_inner_side_to_a_place_hides_itself():
+def test_inner_sides_of_an_object_are_hidden():
     mesh = Box(type="box", size_m=(20.0, 20.0, 20.0)).build_mesh()
     place_m = np.array([1.0, 2.0, 3.0])
     away = UprightBoxes(np.full((1, 3), 90.0), np.full((1, 3), 99.0))
@@ -167,7 +167,7 @@ def test_an_object_that_turns_only_its_inner_side_to_a_place_hides_itself():
     assert compute_visibility(instant, place_m, drawn.points_m - np.float32(1e-3) * drawn.normals).is_visible.all()
 
 
-def test_an_object_of_any_size_is_cut_whole():
+def test_objects_of_any_size_are_sampled_completely():
     huge = Patches.from_mesh(Plane(type="plane", size_m=(1e6, 10.0)).build_mesh())
     assert len(huge.is_outward) < 10_000
     assert np.linalg.norm(huge.normals_m2.astype(np.float64), axis=0).sum() / 2 == pytest.approx(1e7, rel=1e-5)
@@ -182,7 +182,7 @@ LIDAR = {
 }  # fmt: skip
 
 
-def test_a_frame_tells_what_is_hidden_from_the_places_too_from_what_nobody_asked_about(at):
+def test_visibility_tells_hidden_objects_from_distant_ones(at):
     at([-2.5, 0.0, 1.9])
     cars = [
         {"name": name, "category": "car", "shape": {"type": "box", "size_m": [4, 2, 1.5]}, "pose": pose}
@@ -206,7 +206,7 @@ def test_a_frame_tells_what_is_hidden_from_the_places_too_from_what_nobody_asked
     assert torch.equal(frame.boxes.select(seen.hidden).sampled_points, torch.tensor([64]))
 
 
-def test_frames_with_boxes_ask_about_every_object_unless_they_are_given_a_reference():
+def test_frames_with_boxes_sample_all_objects():
     frames = [SimulatedFrames("courtyard", "front_roof_32", num_frames=1, boxes=boxes) for boxes in (False, True)]
     assert [some.reference_sensor.points_per_object for some in frames] == [0, 64]
     assert frames[0].reference_sensor.areas == frames[1].reference_sensor.areas

@@ -23,7 +23,7 @@ def same_points(a, b):
     return np.array_equal(a.clouds["r"], b.clouds["r"]) and np.array_equal(a.reference, b.reference)
 
 
-def test_counts_say_what_was_left_out_in_traffic():
+def test_counts_report_omitted_work_in_traffic():
     near, far = (simulator("urban", max_range_m=metres).simulate_frame(5).counts for metres in (30.0, 200.0))
     assert near["moving_bodies"] == far["moving_bodies"]
     assert near["moving_bodies_out_of_range"] > far["moving_bodies_out_of_range"]
@@ -36,7 +36,7 @@ def test_counts_say_what_was_left_out_in_traffic():
         assert counts["sensor_self_hits_reused"] == counts["sensor_self_hits"] > 0
 
 
-def test_counts_say_what_was_left_out_where_nothing_moves():
+def test_counts_report_reused_work_without_motion():
     counts = simulator("courtyard").simulate_frame(5).counts
     assert counts["sensor_rays_reused"] == counts["sensor_rays"] == 16 * 90
     assert counts["sensor_self_hits_reused"] == counts["sensor_self_hits"] > 0
@@ -44,7 +44,7 @@ def test_counts_say_what_was_left_out_where_nothing_moves():
 
 
 @pytest.mark.parametrize("keys", [{}, {"range_noise_m": 0.05, "dropout": 0.2}])
-def test_a_reused_scan_gives_what_a_fresh_one_does(keys):
+def test_reused_scans_equal_new_scans(keys):
     used = simulator("courtyard", keys)
     for index in (4, 2, 3):
         reused, fresh = used.simulate_frame(index), simulator("courtyard", keys).simulate_frame(index)
@@ -53,7 +53,7 @@ def test_a_reused_scan_gives_what_a_fresh_one_does(keys):
     assert np.array_equal(used.simulate_frame(2).clouds["r"], used.simulate_frame(3).clouds["r"]) == (not keys)
 
 
-def test_a_change_of_one_step_does_not_reach_the_next():
+def test_changing_a_frame_does_not_affect_the_next():
     used = simulator("courtyard")
     first = used.simulate_frame(0).clouds["r"]
     kept = first.copy()
@@ -77,7 +77,7 @@ def test_bodies_out_of_range_change_nothing(monkeypatch):
     assert same_points(limited, unlimited)
 
 
-def test_a_range_starts_at_the_sensor_not_at_the_vehicle(tmp_path):
+def test_ranges_start_at_the_sensor(tmp_path):
     """32 m ahead of the vehicle, 29 m ahead of a LiDAR with a range of 30 m."""
     (tmp_path / "t.csv").write_text("t,x,y,z,roll,pitch,yaw\n0,34,0,0,0,0,0\n9,34,9,0,0,0,0\n", encoding="utf-8")
     box = {"type": "box", "size_m": [4, 2, 2]}

@@ -114,7 +114,7 @@ def reference_sensor(request, monkeypatch):
     return made
 
 
-def test_a_sensors_directions_are_of_length_one_or_none(sensor):
+def test_sensor_directions_are_unit_vectors_or_nan(sensor):
     directions = sensor.compute_directions()
     assert directions.dtype == np.float64
     assert directions.ndim == 3
@@ -127,7 +127,7 @@ def test_a_sensors_directions_are_of_length_one_or_none(sensor):
     np.testing.assert_array_equal(sensor.compute_directions(), directions)
 
 
-def test_a_sensors_fields_of_view_hold_its_rays(sensor):
+def test_fields_of_view_contain_all_rays(sensor):
     x, y, z = sensor.compute_directions()
     low, high = compute_vertical_fov_deg(sensor)
     middle = np.rad2deg(np.arcsin(z))[:, x.shape[1] // 2]
@@ -148,7 +148,7 @@ def hit_by(returns, count):
     return np.arange(count) if returns.hit_indices is None else returns.hit_indices
 
 
-def test_a_sensor_makes_points_of_hits_that_are_far_enough_and_of_no_others(sensor):
+def test_only_hits_within_range_limits_give_points(sensor):
     exact = sensor.model_copy(update={"range_noise_m": 0.0, "dropout": 0.0})
     assert exact.is_exact
     assert not sensor.is_exact
@@ -161,7 +161,7 @@ def test_a_sensor_makes_points_of_hits_that_are_far_enough_and_of_no_others(sens
     assert len(hit_by(exact.measure(none, SensorNoise(None)), 0)) == 0
 
 
-def test_what_a_sensor_makes_of_a_beam_does_not_depend_on_other_beams(sensor):
+def test_beams_are_measured_independently(sensor):
     """Hits that are taken away change nothing about those of beams that keep theirs, in any number of places."""
     beams, random = sensor.compute_beam_indices(), np.random.default_rng(5)
     whole = hits_of(sensor, random.uniform(0.5, 9.0, len(hits_of(sensor, 1.0).ray_indices)))
@@ -187,7 +187,7 @@ def test_what_a_sensor_makes_of_a_beam_does_not_depend_on_other_beams(sensor):
     )
 
 
-def test_a_sensor_asks_for_the_same_numbers_whatever_is_hit(sensor):
+def test_random_numbers_do_not_depend_on_the_hits(sensor):
     """Else what one thread meets would decide what another draws."""
     rays = len(hits_of(sensor, 1.0).ray_indices)
     used, fresh = (SensorNoise(np.random.default_rng(2), num_rays=rays) for _ in range(2))
@@ -197,13 +197,13 @@ def test_a_sensor_asks_for_the_same_numbers_whatever_is_hit(sensor):
     np.testing.assert_array_equal(one.range_error_m, other.range_error_m)
 
 
-def test_a_sensor_survives_pickling_and_its_own_document(sensor):
+def test_sensors_survive_pickling_and_saving(sensor):
     assert pickle.loads(pickle.dumps(sensor)) == sensor
     rig = Rig(name="r", sensors=(sensor,))
     assert Rig.model_validate(rig.model_dump()) == rig
 
 
-def test_a_sensors_wrong_key_is_named_as_it_stands_in_the_file(sensor):
+def test_wrong_sensor_keys_are_named(sensor):
     keys = sensor.model_dump() | {"colour": "red"}
     with pytest.raises(ValueError, match=r"sensors\.0\.colour\n.*Extra inputs"):
         Rig.model_validate({"name": "r", "sensors": [keys]})
@@ -222,7 +222,7 @@ def test_a_sensor_is_simulated(sensor):
     assert ranges_m.max() <= exact.max_range_m
 
 
-def test_how_far_a_sensor_reaches_is_decided_by_the_scenario(sensor, monkeypatch):
+def test_the_scenario_decides_the_range_of_sensors(sensor, monkeypatch):
     rig = Rig(name="r", sensors=(sensor.model_copy(update={"range_noise_m": 0.0, "dropout": 0.0}),))
 
     def seen():
@@ -249,14 +249,14 @@ def test_how_far_a_sensor_reaches_is_decided_by_the_scenario(sensor, monkeypatch
 
 
 @pytest.mark.parametrize("content", ["lidar", 3, {"type": ["lidar"]}, {"type": "sonar"}, None])
-def test_what_is_no_sensor_is_refused_with_the_kinds_there_are(content):
+def test_unknown_sensor_types_list_the_valid_ones(content):
     kinds = " or a ".join(map(repr, SENSORS))
     with pytest.raises(ValueError, match=rf"sensors\.0\n.*type: a sensor is a {kinds}; got"):
         Rig.model_validate({"name": "r", "sensors": [content]})
 
 
 @pytest.mark.parametrize("sensor", [PaperReference(8, 8), DownReference(8)], ids=["paper", "down"])
-def test_a_reference_sensors_place_is_in_the_shell_around_the_ego(sensor):
+def test_reference_positions_lie_in_the_shell(sensor):
     grown_m = sensor.shell_m + 1e-12
     for seed in range(50):
         pose = sensor.sample_pose(EGO, np.random.default_rng(seed))
@@ -267,7 +267,7 @@ def test_a_reference_sensors_place_is_in_the_shell_around_the_ego(sensor):
         assert ((pose[:3, 3] < EGO.lower_m) | (pose[:3, 3] > EGO.upper_m)).any()
 
 
-def test_a_reference_sensor_without_a_number_of_rays_has_one_of_its_own(reference_sensor):
+def test_reference_sensors_have_a_default_ray_number(reference_sensor):
     own = type(reference_sensor).from_query_plan(ASKED, None)
     assert own == type(reference_sensor).from_query_plan(ASKED, None)
     assert own != reference_sensor
@@ -290,7 +290,7 @@ def test_a_reference_sensor_survives_pickling(reference_sensor):
     )
 
 
-def test_a_reference_sensor_draws_from_the_generator_of_the_step_and_from_nothing_else(reference_sensor):
+def test_reference_sensors_use_only_the_frame_rng(reference_sensor):
     np.random.seed(1)  # noqa: NPY002  (the random numbers that it must not draw)
     state = np.random.get_state()[1].copy()  # noqa: NPY002
     simulator = Simulator(Scenario.load("courtyard"), {}, reference_sensor, seed=3)
@@ -300,7 +300,7 @@ def test_a_reference_sensor_draws_from_the_generator_of_the_step_and_from_nothin
     np.testing.assert_array_equal(np.random.get_state()[1], state)  # noqa: NPY002
 
 
-def test_a_reference_sensors_points_are_near_enough_and_have_the_weights_that_it_promises(reference_sensor):
+def test_reference_points_are_in_range_and_weighted(reference_sensor):
     seen = Simulator(Scenario.load("courtyard"), {}, reference_sensor).simulate_frame(0)
     assert seen.reference.dtype == np.float32
     assert seen.reference.shape == (len(seen.reference), 3)

@@ -41,7 +41,7 @@ def by_cell(sensor, *bodies):
     return dict(zip(map(tuple, cells_of(sensor, points_m).tolist()), points_m, strict=True))
 
 
-def test_a_flat_wall_fills_the_cells_that_it_passes_through():
+def test_walls_fill_the_cells_they_cross():
     """Wide: of azimuth a, the wall is 20 m / cos(a) away on the horizon, and a little more above and below it."""
     sensor = radar(vertical_fov_deg=[0, 0], ray_spacing_m=0.02)
     points_m = points_of(sensor)
@@ -53,7 +53,7 @@ def test_a_flat_wall_fills_the_cells_that_it_passes_through():
     assert len(points_m) == len(expected)
 
 
-def test_a_point_is_the_hit_in_the_middle_of_its_cell():
+def test_points_are_central_hits_of_cells():
     """Against a slow twin, at random ranges in several places."""
     sensor, random = radar(min_range_m=3.0, range_cell_m=2.0), np.random.default_rng(3)
     rays = sensor.num_rays
@@ -72,7 +72,7 @@ def test_a_point_is_the_hit_in_the_middle_of_its_cell():
     assert max(map(len, cells.values())) > 5
 
 
-def test_more_rays_in_a_cell_find_the_same_surfaces():
+def test_more_rays_per_cell_find_the_same_surfaces():
     """A box before a wall: no more cells come, and the ranges of their points come to rest."""
     box = {"name": "box", "shape": {"type": "box", "size_m": [2, 2, 3]}, "poses": [{"x_m": 12.0, "y_m": 2.0}]}
     finest = by_cell(radar(ray_spacing_m=0.05), box)
@@ -88,7 +88,7 @@ def test_more_rays_in_a_cell_find_the_same_surfaces():
     assert moved_m[2] < 0.01
 
 
-def test_the_road_in_front_of_a_body_does_not_take_its_points():
+def test_road_hits_do_not_replace_body_points():
     """Where both are in one cell, the point lies on what fills more of its view."""
     floor = {"name": "floor", "shape": {"type": "plane", "size_m": [200, 200]}}
     body = {"name": "body", "shape": {"type": "box", "size_m": [0.4, 3, 1.8]}, "poses": [{"x_m": 7.55}]}
@@ -100,7 +100,7 @@ def test_the_road_in_front_of_a_body_does_not_take_its_points():
     np.testing.assert_allclose(in_its_cell[:, 0], 5.25, atol=1e-4)
 
 
-def test_points_drop_out_and_err_a_cell_at_a_time():
+def test_noise_and_dropout_apply_per_cell():
     exact = points_of(radar())
     noisy = points_of(radar(range_noise_m=0.05))
     error_m = np.linalg.norm(noisy, axis=1) - np.linalg.norm(exact, axis=1)
@@ -111,7 +111,7 @@ def test_points_drop_out_and_err_a_cell_at_a_time():
     assert set(map(tuple, left)) < set(map(tuple, exact))
 
 
-def test_rays_fill_the_opening_and_are_as_close_as_asked_for():
+def test_rays_fill_the_fov_at_the_requested_spacing():
     sensor = radar(azimuth_cell_deg=7.0)
     assert sensor.num_azimuth_cells == 9  # of 6.67 degrees: none is wider
     x, y, z = sensor.compute_directions()
@@ -142,12 +142,12 @@ def test_rays_fill_the_opening_and_are_as_close_as_asked_for():
         ({"min_range_m": 40.0}, r"min_range_m \(40.0\) must be below max_range_m \(40.0\)"),
     ],
 )
-def test_a_radar_that_cannot_be_is_refused_with_its_key(keys, message):
+def test_invalid_radars_are_refused_with_the_key(keys, message):
     with pytest.raises(ValueError, match=message):
         radar(**keys)
 
 
-def test_the_radars_of_nuscenes_share_the_range_and_look_all_around():
+def test_nuscenes_radars_cover_all_azimuths():
     sensors = Rig.load("nuscenes_radars").sensors
     assert len(sensors) == 10
     for near, far in zip(sensors[::2], sensors[1::2], strict=True):

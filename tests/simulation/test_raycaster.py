@@ -83,7 +83,7 @@ def test_agrees_with_a_slow_intersection_in_float64():
     assert 0.2 < both.mean() < 1.0
 
 
-def test_what_is_struck_knows_how_steeply():
+def test_hit_attributes_have_the_incidence_angle():
     mesh, directions = random_mesh(200), random_directions(600)
     caster = RayCaster([mesh])
     hits = caster.cast(HERE, directions, endless(directions))
@@ -96,7 +96,7 @@ def test_what_is_struck_knows_how_steeply():
     assert 0.2 < met.mean() < 1.0
 
 
-def test_no_ray_slips_out_of_a_closed_box_through_its_edges():
+def test_no_ray_leaves_a_box_through_edges():
     box = Box(type="box", size_m=(4.0, 6.0, 3.0)).build_mesh()
     corners = box.vertices_m[box.faces]
     weights = np.linspace(0, 1, 101)[:, None, None, None]
@@ -110,7 +110,7 @@ def test_no_ray_slips_out_of_a_closed_box_through_its_edges():
 
 
 @pytest.mark.parametrize("gap_m", [0.001, 0.01, 0.4])
-def test_a_mountain_far_away_does_not_blur_the_wall_in_front(gap_m):
+def test_distant_bodies_do_not_affect_near_hits(gap_m):
     ahead = np.array([[1], [0], [0]], np.float32)
     hits = RayCaster([MOUNTAIN, box_at(0.5 + gap_m)]).cast(HERE, ahead, endless(ahead))
     assert hits.body_indices == [1]
@@ -146,7 +146,7 @@ def planes_of(mesh):
         Ellipsoid(type="ellipsoid", size_m=(1.0, 2.0, 3.0)),
     ],
 )
-def test_rays_leave_all_faces_that_meet_where_they_start(shape):
+def test_rays_leave_all_faces_at_their_origin(shape):
     """From places on edges and in corners: outwards to the walls of a room, inwards to the other side of the body."""
     mesh, generator = (
         shape.build_mesh().transform(build_transform(convert_euler_to_rotation(10.0, 20.0, 30.0), [1.0, 2.0, 3.0])),
@@ -173,7 +173,7 @@ def test_rays_leave_all_faces_that_meet_where_they_start(shape):
 
 
 @pytest.mark.parametrize("limit_m", [1e-6, 0.3, 1.0, 7.0, np.inf])
-def test_a_ray_that_leaves_a_face_ends_at_its_limit(limit_m):
+def test_rays_that_leave_a_face_keep_limits(limit_m):
     turned = build_transform(convert_euler_to_rotation(37.0, 21.0, -13.0), [1.0, 2.0, 3.0])
     floor, place = (
         Plane(type="plane", size_m=(200, 200)).build_mesh().transform(turned),
@@ -190,7 +190,7 @@ def test_a_ray_that_leaves_a_face_ends_at_its_limit(limit_m):
     np.testing.assert_allclose(hits.range_m, np.minimum(expected, limit_m), rtol=1e-4)
 
 
-def test_rays_leave_a_sliver_that_they_start_on():
+def test_rays_leave_the_sliver_at_their_origin():
     generator = NUMBERS(7)
     for _ in range(50):
         along, across = generator.normal(size=(2, 3))
@@ -201,7 +201,7 @@ def test_rays_leave_a_sliver_that_they_start_on():
         assert (hits.body_indices == -1).all()
 
 
-def test_one_caster_answers_for_one_place_after_the_other():
+def test_one_caster_handles_different_origins():
     caster, outwards = RayCaster([box_at(9.0), box_at(0.0)]), np.array([[1.0], [0.0], [0.0]], dtype=np.float32)
     for _ in range(2):
         inside = caster.cast(HERE, outwards, endless(outwards))
@@ -210,7 +210,7 @@ def test_one_caster_answers_for_one_place_after_the_other():
         assert (on_the_wall.body_indices, on_the_wall.range_m) == ([0], [pytest.approx(8.0, rel=1e-6)])
 
 
-def test_a_place_on_a_face_up_to_the_rounding_of_doubles_is_on_it():
+def test_positions_on_a_face_within_rounding_touch_it():
     ground, down = (
         Plane(type="plane", size_m=(100, 100)).build_mesh(),
         np.array([[0.0], [0.0], [-1.0]], dtype=np.float32),
@@ -258,7 +258,7 @@ def test_a_scene_without_bodies_is_refused():
 
 
 @pytest.mark.skipif(not os.path.isdir("/proc/self/task"), reason="the system does not tell its threads")
-def test_scenes_are_built_without_threads_that_a_forked_process_would_miss():
+def test_building_scenes_starts_no_threads():
     threads = len(os.listdir("/proc/self/task"))
     cores = os.sched_getaffinity(0)
     RayCaster([random_mesh(20_000)])
@@ -275,7 +275,7 @@ def stacked(sizes):
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_a_place_between_bodies_that_touch_is_inside_one_however_they_are_turned(seed):
+def test_touching_bodies_leave_no_gap_between_them(seed):
     """The faces in which they touch are there twice: which of the two a ray met would be up to rounding."""
     numbers = NUMBERS(seed)
     turn = build_transform(
@@ -290,7 +290,7 @@ def test_a_place_between_bodies_that_touch_is_inside_one_however_they_are_turned
             assert order[caster.find_enclosing_bodies(place_m)].tolist() == expected
 
 
-def test_a_place_is_inside_of_what_encloses_it_and_of_no_sheet():
+def test_sheets_do_not_enclose_positions():
     """Convex bodies against their half spaces; bodies within bodies, and one of two parts that touch."""
     ball, cube = Ellipsoid(type="ellipsoid", size_m=(4, 3, 2)).build_mesh(), box_at(0.0, size=2.0)
     caster = RayCaster([ball, Plane(type="plane", size_m=(9, 9)).build_mesh(), cube])
@@ -315,7 +315,7 @@ def behind_all(mesh, place):
     return bool((((place - a) * np.cross(b - a, c - a)).sum(axis=1) < 0).all())
 
 
-def test_who_stands_on_top_of_a_body_is_not_inside_and_who_lies_below_its_bottom_is_not_either():
+def test_positions_on_body_surfaces_are_not_inside():
     for seed in range(50):
         shift = NUMBERS(seed).uniform(-500, 500, 3)
         slab = stacked([(4, 4, 0.3)])[0]

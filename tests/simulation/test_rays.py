@@ -17,14 +17,14 @@ def test_every_ray_is_in_one_tile(rows, columns):
 
 
 @pytest.mark.parametrize("rows", [2, 64, 300])
-def test_every_ray_lies_in_the_cone_of_its_tile(rows):
+def test_rays_lie_in_the_cone_of_their_tile(rows):
     for tile in split_into_tiles(PaperReference(rows=rows, columns=400).compute_directions()):
         assert np.linalg.norm(tile.axis) == pytest.approx(1.0)
         angles = np.arccos(np.clip(tile.axis @ tile.directions.astype(np.float64), -1, 1))
         assert angles.max() <= tile.half_angle_rad + 1e-6
 
 
-def test_directions_that_cancel_make_a_cone_that_is_the_whole_sphere():
+def test_opposite_directions_have_a_spherical_cone():
     both_ways = np.array([[1.0, -1.0], [0.0, 0.0], [0.0, 0.0]]).reshape(3, 1, 2)
     (tile,) = split_into_tiles(both_ways)
     assert tile.half_angle_rad == pytest.approx(np.pi)

@@ -17,7 +17,7 @@ def rectangle(x, y):
     return {"x_m": x, "y_m": y}
 
 
-def test_the_usual_table_has_the_papers_regions_and_the_near_field_of_the_vehicle():
+def test_default_regions_are_paper_regions_and_near_field():
     asked = RegionsOfInterest().build_query_plan(ROBOT_M)
     assert [region.name for region in asked.regions] == ["20m", "80m", "160m", *SIDES]
     assert (asked.grid.x_m, asked.grid.y_m, asked.grid.cell_m, asked.bands_m) == (
@@ -32,7 +32,7 @@ def test_the_usual_table_has_the_papers_regions_and_the_near_field_of_the_vehicl
 
 
 @pytest.mark.parametrize("cell", [0.1, 0.25, 0.5])
-def test_the_near_field_is_all_that_is_within_its_reach_of_the_vehicle_and_nothing_twice(cell):
+def test_near_field_parts_cover_it_exactly_once(cell):
     asked = RegionsOfInterest().build_query_plan(ROBOT_M, cell)
     covered = sum(region.mask_cells(asked.grid).long() for region in asked.regions if region.name in SIDES)
     x, y = asked.grid.x_centers_m, asked.grid.y_centers_m[:, None]
@@ -41,7 +41,7 @@ def test_the_near_field_is_all_that_is_within_its_reach_of_the_vehicle_and_nothi
     assert torch.equal(covered, (around & ~vehicle).long())
 
 
-def test_what_the_grid_does_not_hold_is_not_in_the_usual_table():
+def test_default_regions_outside_the_grid_are_omitted():
     small = RegionsOfInterest(grid={"x_m": (-5.0, 5.0), "y_m": (-5.0, 5.0), "cell_m": 0.5}).build_query_plan(ROBOT_M)
     assert [region.name for region in small.regions] == SIDES
     assert [region.name for region in RegionsOfInterest().build_query_plan(ROBOT_M, 8.0).regions] == [
@@ -54,31 +54,31 @@ def test_what_the_grid_does_not_hold_is_not_in_the_usual_table():
     assert elsewhere.areas == (((50.0, 55.0), (-5.0, 5.0)),)
 
 
-def test_a_region_beyond_the_usual_grid_makes_it_larger_by_whole_cells():
+def test_distant_regions_enlarge_the_default_grid():
     asked = RegionsOfInterest(regions={"side": rectangle((-41.1, 0.0), (30.0, 55.0))}).build_query_plan(ROBOT_M)
     assert (asked.grid.x_m, asked.grid.y_m) == ((-41.25, 160.0), (-40.0, 55.0))
     assert asked.areas == (((-41.1, 0.0), (30.0, 55.0)), (asked.grid.x_m, asked.grid.y_m))
 
 
-def test_a_region_beyond_a_grid_that_was_given_is_refused():
+def test_regions_outside_a_given_grid_are_refused():
     given = {"x_m": (-5.0, 5.0), "y_m": (-5.0, 5.0)}
     with pytest.raises(ValueError, match="region 'side' spans x = 0 to 6 m, beyond the grid's -5 to 5 m; enlarge"):
         RegionsOfInterest(regions={"side": rectangle((0.0, 6.0), (0.0, 1.0))}, grid=given).build_query_plan(ROBOT_M)
 
 
-def test_a_region_within_the_vehicle_is_warned_of():
+def test_regions_inside_the_vehicle_cause_a_warning():
     hidden = RegionsOfInterest(regions={"hold": rectangle((-0.4, 0.4), (-0.3, 0.3))})
     with pytest.warns(UserWarning, match="region 'hold' lies within the vehicle"):
         hidden.build_query_plan(ROBOT_M)
     assert hidden.build_query_plan().regions[0].name == "hold"  # of no vehicle nobody can say so
 
 
-def test_a_region_between_the_centres_of_cells_is_refused():
+def test_regions_without_cell_centers_are_refused():
     with pytest.raises(ValueError, match=r"region 'thin' holds no cell center; use smaller cells than 0.25 m"):
         RegionsOfInterest(regions={"thin": rectangle((0.0, 0.1), (0.0, 1.0))}).build_query_plan(ROBOT_M)
 
 
-def test_yaml_and_python_say_the_same(tmp_path):
+def test_yaml_and_python_regions_are_equal(tmp_path):
     (tmp_path / "ask.yaml").write_text(
         "regions:\n"
         "  behind: {x_m: [-4, -0.5], y_m: [-1, 1]}\n"
@@ -115,14 +115,14 @@ def test_yaml_and_python_say_the_same(tmp_path):
         ("regions: {a: {x: [0, 1], y: [0, 1]}}", "regions.a.x: .*regions.a.y: "),
     ],
 )
-def test_what_asks_nothing_is_refused(tmp_path, content, message):
+def test_empty_regions_are_refused(tmp_path, content, message):
     (tmp_path / "ask.yaml").write_text(content)
     with pytest.raises(ValueError, match=message) as caught:
         RegionsOfInterest.load(tmp_path / "ask.yaml")
     assert str(tmp_path / "ask.yaml") in str(caught.value)
 
 
-def test_more_cells_than_there_is_memory_for_are_refused_in_one_line():
+def test_grids_too_large_for_memory_are_refused():
     given = {"x_m": (-1000.0, 1000.0), "y_m": (-1000.0, 1000.0), "cell_m": 0.1}
     with pytest.raises(ValueError, match="800,000,000 cells, over 100,000,000: use larger cells"):
         RegionsOfInterest(grid=given).build_query_plan()
@@ -143,7 +143,7 @@ def office(size_m=(14.0, 10.0), ego=None, **others):
     return Scenario.model_validate({"name": "office", "ego": ego, "bodies": [floor], **others})
 
 
-def test_a_room_is_what_stands_around_the_ego_in_its_frame_wherever_it_drives(tmp_path):
+def test_rooms_are_walls_in_the_vehicle_frame(tmp_path):
     np.testing.assert_allclose(office().find_room_bounds_m(), [(-7, 7), (-5, 5)])
     turned = office(ego={"pose": {"x_m": -3.0, "yaw_deg": 90.0}})
     np.testing.assert_allclose(turned.find_room_bounds_m(), [(-5, 5), (-10, 4)], atol=1e-9)
@@ -152,7 +152,7 @@ def test_a_room_is_what_stands_around_the_ego_in_its_frame_wherever_it_drives(tm
     np.testing.assert_allclose(driving.find_room_bounds_m(), [(-12, 12), (-6, 5)], atol=1e-9)
 
 
-def test_what_is_no_room_is_none_and_what_is_smaller_than_the_vehicle_is_a_mistake():
+def test_rooms_enclose_the_ego_and_fit_its_size():
     assert office((100.0, 10.0)).find_room_bounds_m() is None
     assert office(ego={"pose": {"x_m": 20.0}}).find_room_bounds_m() is None
     assert Scenario.load("urban").find_room_bounds_m() is None
@@ -166,7 +166,7 @@ def test_what_is_no_room_is_none_and_what_is_smaller_than_the_vehicle_is_a_mista
     ("max_range_m", "name", "x", "forward"),
     [(100.0, "room", (-7.0, 7.0), ["5m"]), (6.0, "range", (-6.25, 6.25), ["5m"]), (3.0, "range", (-3.5, 3.5), [])],
 )
-def test_grid_and_regions_fit_the_room_and_the_range(max_range_m, name, x, forward):
+def test_grid_and_regions_fit_room_and_range(max_range_m, name, x, forward):
     rig = Rig.model_validate(
         {"name": "r", "sensors": [{"name": "s", "mount": {"x_m": 0.2, "z_m": 1.0}, "channels": 2, "columns": 4,
          "vertical_fov_deg": (-30, 0), "horizontal_fov_deg": 360, "max_range_m": max_range_m}]}

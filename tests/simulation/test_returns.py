@@ -26,7 +26,7 @@ KEYS = {
 
 @pytest.mark.parametrize("range_at_10_percent_m", [40.0, 200.0])
 @pytest.mark.parametrize("reflectivity", [0.1, 0.4])
-def test_every_other_ray_returns_from_where_the_data_sheet_says(range_at_10_percent_m, reflectivity):
+def test_half_of_rays_return_at_rated_range(range_at_10_percent_m, reflectivity):
     """Four times as bright is twice as far."""
     range_m = range_at_10_percent_m * np.sqrt(reflectivity / 0.1)
     excess = compute_log_excess(range_m, 1.0, reflectivity, 1.0, range_at_10_percent_m)
@@ -37,7 +37,7 @@ def test_every_other_ray_returns_from_where_the_data_sheet_says(range_at_10_perc
     )
 
 
-def test_lambert_on_a_road_falls_with_the_cube_of_the_range():
+def test_road_returns_fall_with_cubed_range():
     """cos = h / R: where half the rays return is at (R10^2 h)^(1/3)."""
     range_m = (60.0**2 * 1.9) ** (1 / 3)
     assert compute_log_excess(range_m, 1.9 / range_m, 0.1, 1.0, 60.0) == pytest.approx(0.0, abs=1e-14)
@@ -54,7 +54,7 @@ def test_lambert_on_a_road_falls_with_the_cube_of_the_range():
         {"extinction_per_m": 0.001},
     ],
 )
-def test_whatever_is_worse_returns_less(worse):
+def test_worse_conditions_never_increase_return_probability(worse):
     hit = {
         "range_m": 50.0,
         "cos_incidence": 0.5,
@@ -65,21 +65,21 @@ def test_whatever_is_worse_returns_less(worse):
     assert compute_log_excess(**(hit | worse)) < compute_log_excess(**hit)
 
 
-def test_what_reflects_nothing_never_returns_and_a_retroreflector_always_does():
+def test_black_never_returns_and_retroreflectors_always_do():
     excess = compute_log_excess(50.0, 0.1, np.array([0.0, np.inf]), 1.0, 1.0)
     assert compute_return_probability(excess, 0.3).tolist() == [0.0, MAX_RETURN_PROBABILITY]
 
 
-def test_a_contrast_of_five_percent_is_left_at_the_visibility():
+def test_contrast_at_visibility_range_is_five_percent():
     assert np.exp(-compute_extinction_per_m(80.0) * 80.0) == pytest.approx(0.05)
     assert compute_extinction_per_m(None) == 0.0
 
 
-def test_each_builtin_material_is_called_as_its_file():
+def test_built_in_materials_are_named_after_files():
     assert [Material.load(name).name for name in list_builtin_names("materials")] == list_builtin_names("materials")
 
 
-def test_bad_materials_are_told():
+def test_invalid_materials_are_reported():
     for reflectivity in (1.5, -0.1, True, "shiny", float("nan"), None):
         message = "Material: reflectivity: a share of light from 0 to 1, or `retroreflective`, is needed; got "
         with pytest.raises(ValueError, match=f"^{re.escape(message + repr(reflectivity))}$"):
@@ -96,7 +96,7 @@ def test_bad_materials_are_told():
         ({"range_factors": [1.0]}, "one for each of the 2 rows is needed; got 1"),
     ],
 )
-def test_bad_keys_of_a_lidar_are_told(given, told):
+def test_invalid_lidar_keys_are_reported(given, told):
     with pytest.raises(ValueError, match=told):
         Lidar(**KEYS | given)
 
@@ -129,7 +129,7 @@ def seen(weather=None, index=0, bodies=None, **keys):
     return Simulator(scenario, {"rig": rig}, PaperReference(rows=2, columns=2)).simulate_scans(index)["rig"][0]
 
 
-def test_as_many_return_from_a_plain_as_the_law_says():
+def test_returns_from_a_plane_follow_the_law():
     every, returned = seen(range_at_10_percent_m=None), seen()
     road = Material.load("road")
     is_road = every.points[:, 2] < 1e-3
@@ -160,13 +160,13 @@ def test_as_many_return_from_a_plain_as_the_law_says():
     ],
     ids=["fog", "rain", "wet", "short", "factors", "dropout"],
 )
-def test_no_ray_returns_because_something_is_worse(worse, keys):
+def test_worse_conditions_never_add_returns(worse, keys):
     """The same random numbers: not one return more, and fewer in all."""
     clear, bad = seen(), seen(worse, **keys)
     assert set(bad.ray_indices.tolist()) < set(clear.ray_indices.tolist())
 
 
-def test_rows_have_their_own_factors():
+def test_rows_have_separate_range_factors():
     """The lower half of them hardly sees anything."""
     factors = np.where(np.arange(40) < 20, 1e-3, 1.0).tolist()
     lower, every = seen(range_factors=factors).points, seen().points
@@ -174,7 +174,7 @@ def test_rows_have_their_own_factors():
     assert np.hypot(*lower[:, :2].T).min() > 20 > np.hypot(*every[:, :2].T).min()
 
 
-def test_what_reflects_returns_from_farther():
+def test_reflective_surfaces_return_from_farther_away():
     """Paint, a sign and nothing at all in place of the road."""
 
     def of(material):
@@ -187,7 +187,7 @@ def test_what_reflects_returns_from_farther():
     )
 
 
-def test_a_material_may_be_a_file_beside_the_scenario(tmp_path):
+def test_material_paths_are_relative_to_the_scenario(tmp_path):
     """It counts as what stands there: black returns nothing, and what else it is called makes no difference."""
     of = []
     for reflectivity in (0.0, "retroreflective", 0.0):
@@ -201,7 +201,7 @@ def test_a_material_may_be_a_file_beside_the_scenario(tmp_path):
     assert of[0][1] != of[1][1]
 
 
-def test_a_rig_is_written_with_the_material_of_a_housing_wherever_it_goes(tmp_path, monkeypatch):
+def test_saved_rigs_keep_materials_of_housings(tmp_path, monkeypatch):
     """And so it is with any file that a document names."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "there").mkdir()
@@ -217,7 +217,7 @@ def test_a_rig_is_written_with_the_material_of_a_housing_wherever_it_goes(tmp_pa
     assert again.collect_content() == Rig.load(tmp_path / "rig.yaml").collect_content()
 
 
-def test_a_body_is_as_dark_all_over_and_always():
+def test_reflectivity_is_constant_over_body_and_time():
     """Of black cars, hardly one ray returns; and a step later it is the same cars."""
     bodies = [
         PLAIN["bodies"][0],
@@ -241,7 +241,7 @@ def test_a_body_is_as_dark_all_over_and_always():
     assert np.abs(shares[0] - shares[1]).max() < 0.25
 
 
-def test_an_ideal_rig_is_the_one_without_a_range_at_10_percent():
+def test_ideal_rigs_have_no_range_at_10_percent():
     rig = Rig.model_validate({"name": "rig", "sensors": [ROOF]})
     ideal = rig.apply_sensor_model("ideal")
     assert (rig.sensor_model, ideal.sensor_model, ideal.apply_sensor_model(None).sensor_model) == (
@@ -263,14 +263,14 @@ def test_an_ideal_rig_is_the_one_without_a_range_at_10_percent():
         ({"bodies": [PLAIN["bodies"][0] | {"material": "raod"}]}, "is 'road' meant"),
     ],
 )
-def test_bad_weather_and_materials_of_a_scenario_are_told(given, told, tmp_path):
+def test_invalid_weather_and_materials_are_reported(given, told, tmp_path):
     path = tmp_path / "world.yaml"
     path.write_text(yaml.safe_dump(PLAIN | given))
     with pytest.raises(ValueError, match=told):
         Scenario.load(path)
 
 
-def test_cameras_see_as_far_as_people_and_radars_through_fog():
+def test_fog_limits_cameras_but_not_radars():
     foggy = Scenario.model_validate(PLAIN | {"weather": {"visibility_m": 50.0}})
     camera, radar = Rig.load("three_cameras").sensors[0], Rig.load("nuscenes_radars").sensors[0]
     assert foggy.compute_max_range_m(camera) == 50.0

@@ -48,7 +48,7 @@ def as_set(points):
     return points[np.lexsort(points.round(3).T)]
 
 
-def test_the_ego_occludes_and_its_points_are_left_out():
+def test_the_ego_occludes_and_gives_no_points():
     seen = scan(world(moving=False))
     x, y, z = seen.points.T
     assert not ((np.abs(x) < 1.999) & (np.abs(y) < 0.999) & (z < 1.001)).any()
@@ -63,14 +63,14 @@ def test_the_ego_occludes_and_its_points_are_left_out():
     assert seen.num_rays == directions.shape[1]
 
 
-def test_a_moving_ego_sees_what_a_resting_one_would_see_there():
+def test_moving_and_resting_egos_have_equal_scans():
     resting = scan(world(moving=False))
     moving = scan(world(moving=False, ego_moves=True))
     assert moving.self_hits == resting.self_hits
     np.testing.assert_allclose(as_set(moving.points), as_set(resting.points), atol=1e-4)
 
 
-def test_an_actor_is_where_its_trajectory_says_and_hides_what_lies_behind():
+def test_actors_follow_trajectories_and_occlude():
     for step in (0, 1, 2):
         x, y, z = scan(world(), step).points.T
         side = (np.abs(y - 5.5) < 1e-3) & (z > 0.05)
@@ -81,14 +81,14 @@ def test_an_actor_is_where_its_trajectory_says_and_hides_what_lies_behind():
 
 
 @pytest.mark.parametrize("ego_moves", [False, True])
-def test_the_same_world_far_out_gives_the_same_points(ego_moves):
+def test_distant_world_coordinates_give_the_same_points(ego_moves):
     here = scan(world(ego_moves=ego_moves), 2)
     there = scan(world(UTM, 37.0, ego_moves=ego_moves), 2)
     assert len(here.points) == len(there.points)
     np.testing.assert_allclose(as_set(there.points), as_set(here.points), atol=1e-3)
 
 
-def test_an_actor_in_the_ego_is_an_error_that_names_actor_and_time():
+def test_overlapping_actors_are_reported_with_the_time():
     made = world(ego_moves=True)
     crossing = Trajectory.from_arrays([0.0, 10.0], [[5, -25, 0], [5, 25, 0]], [[90, 0, 0]] * 2)
     scene = SceneGeometry(
@@ -100,7 +100,7 @@ def test_an_actor_in_the_ego_is_an_error_that_names_actor_and_time():
 
 
 @pytest.mark.parametrize("moving", [False, True])
-def test_a_place_in_the_ground_a_wall_or_a_car_is_buried(moving):
+def test_positions_inside_bodies_are_occupied(moving):
     instant = SceneGeometry(world(moving=moving)).get_snapshot(0)
     for buried in ([3, 3, -0.2], [10, 0, 1], [0, 6, 0.5]):
         assert instant.is_occupied(np.array(buried, dtype=float))

@@ -65,7 +65,7 @@ def same(one, other):
     ],
     ids=lambda traffic: traffic.type,
 )
-def test_a_world_from_disk_is_the_one_that_was_built_and_shares_its_bodies(disk, traffic):
+def test_cached_scenes_equal_built_scenes(disk, traffic):
     files, built = disk
     scenario = Scenario(name="drawn", traffic=traffic)
     worlds, ego = SceneCache(scenario, 5), scenario.build_ego_mesh()
@@ -98,7 +98,7 @@ def test_frames_are_the_same_to_the_bit(disk):
         np.testing.assert_array_equal(other.reference, seen[0].reference)
 
 
-def test_a_world_is_found_by_all_that_it_is_drawn_from_and_by_nothing_else(disk, tmp_path):
+def test_cache_keys_depend_on_all_inputs_only(disk, tmp_path):
     files, _ = disk
     body = tmp_path / "ego.yaml"
     parts = "name: ego\nparts: [{{name: all, shape: {{type: box, size_m: [4, 2, {height}]}}}}]\n"
@@ -121,7 +121,7 @@ def test_a_world_is_found_by_all_that_it_is_drawn_from_and_by_nothing_else(disk,
 
 
 @pytest.mark.parametrize("change", ["code", "library"])
-def test_other_code_or_another_library_draws_anew(disk, monkeypatch, change):
+def test_other_code_or_libraries_invalidate_the_cache(disk, monkeypatch, change):
     world_of(lot())
     if change == "code":
         monkeypatch.setattr(scene_cache, "_hash_code", lambda: "other")
@@ -143,7 +143,7 @@ def harm(content, how):
 
 
 @pytest.mark.parametrize("how", ["a number", "a word", "cut short", "empty", "not ours", "another scene"])
-def test_a_damaged_scene_is_built_again_with_a_warning(disk, how):
+def test_damaged_scenes_are_rebuilt_with_a_warning(disk, how):
     files, built = disk
     scene = world_of(lot())
     [path] = files()
@@ -186,7 +186,7 @@ NAMES = {"link": "a" * 64 + ".npz", "hard link": "b" * 64 + ".npz", "FIFO": "c" 
          "folder": "d" * 64 + ".npz", "file": "mine.npz", "longer": "e" * 65 + ".npz"}  # fmt: skip
 
 
-def test_what_is_not_of_the_cache_stays_and_does_not_stop_it(disk, monkeypatch, tmp_path):
+def test_foreign_files_stay_and_do_not_interfere(disk, monkeypatch, tmp_path):
     files, built = disk
     world_of(lot())
     [path] = files()
@@ -208,7 +208,7 @@ def test_what_is_not_of_the_cache_stays_and_does_not_stop_it(disk, monkeypatch, 
 
 
 @pytest.mark.parametrize("kind", ["link", "hard link", "FIFO", "folder"])
-def test_a_scene_is_not_read_through_what_lies_under_its_name(disk, tmp_path, kind):
+def test_links_in_place_of_scenes_are_ignored(disk, tmp_path, kind):
     files, built = disk
     scene = world_of(lot())
     [path] = files()
@@ -246,7 +246,7 @@ def test_the_oldest_scenes_are_deleted_for_new_ones(disk, monkeypatch):
     assert len(files()) == 3  # it does not fit, and nothing is deleted for it
 
 
-def test_without_a_budget_nothing_lies_there(disk, monkeypatch):
+def test_without_a_budget_nothing_is_written(disk, monkeypatch):
     world_of(lot(), no_cache=True)
     monkeypatch.setenv("TORCHCOVER_CACHE_GB", "0")
     world_of(lot())
@@ -294,7 +294,7 @@ def a_link(monkeypatch, tmp_path):
 
 
 @pytest.mark.parametrize("lacks", [no_home, a_file, read_only, full_at_once, of_others, a_link])
-def test_without_a_disk_the_run_goes_on_with_one_remark(disk, monkeypatch, tmp_path, lacks):
+def test_without_a_disk_runs_continue_with_one_warning(disk, monkeypatch, tmp_path, lacks):
     lacks(monkeypatch, tmp_path)
 
     def run():
@@ -310,7 +310,7 @@ def test_without_a_disk_the_run_goes_on_with_one_remark(disk, monkeypatch, tmp_p
     assert disk[0]() == []
 
 
-def test_two_runs_write_the_same_world(disk, monkeypatch):
+def test_concurrent_runs_write_the_same_scene(disk, monkeypatch):
     files, built = disk
     replace, meanwhile = os.replace, []
 
@@ -327,7 +327,7 @@ def test_two_runs_write_the_same_world(disk, monkeypatch):
     assert built == [0, 0]
 
 
-def test_a_world_with_doubts_is_not_kept_but_doubted_each_time(disk, monkeypatch):
+def test_scenes_with_warnings_are_not_cached(disk, monkeypatch):
     world = Scenario.build_scene
 
     def doubtful(self, *args):
@@ -341,7 +341,7 @@ def test_a_world_with_doubts_is_not_kept_but_doubted_each_time(disk, monkeypatch
     assert disk[0]() == []
 
 
-def test_traffic_from_elsewhere_is_not_kept(disk):
+def test_traffic_of_other_packages_is_not_cached(disk):
     class Elsewhere(ParkingTraffic):
         """Whose code nobody hashes."""
 

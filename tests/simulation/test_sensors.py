@@ -26,7 +26,7 @@ def angles(directions):
     return np.rad2deg(np.arcsin(z)), np.rad2deg(np.arctan2(y, x))
 
 
-def test_rows_span_the_vertical_field_of_view_and_columns_the_middles_of_equal_sectors():
+def test_rows_span_the_fov_and_columns_equal_sectors():
     elevation, azimuth = angles(lidar().compute_directions())
     np.testing.assert_allclose(elevation.reshape(5, 6)[:, 0], [-20, -12.5, -5, 2.5, 10], atol=1e-12)
     np.testing.assert_allclose(azimuth.reshape(5, 6)[2], [-37.5, -22.5, -7.5, 7.5, 22.5, 37.5], atol=1e-12)
@@ -39,7 +39,7 @@ def test_a_full_turn_has_no_ray_twice():
     np.testing.assert_allclose(np.diff(np.sort(azimuth)), 45.0, atol=1e-12)
 
 
-def test_a_table_of_rows_with_offsets_is_taken_as_it_is():
+def test_row_tables_with_offsets_are_used_unchanged():
     table = lidar(
         channels=None, vertical_fov_deg=None, elevations_deg=(5, -3, 1), azimuth_offsets_deg=(0, 2, -4), columns=1
     )
@@ -48,13 +48,13 @@ def test_a_table_of_rows_with_offsets_is_taken_as_it_is():
     np.testing.assert_allclose(azimuth, [0, 2, -4], atol=1e-12)
 
 
-def test_the_reference_sensor_covers_the_lower_hemisphere_evenly_in_angle():
+def test_paper_reference_rays_are_uniform_in_angle():
     elevation, azimuth = angles(PaperReference(rows=91, columns=36).compute_directions())
     np.testing.assert_allclose(elevation.reshape(91, 36)[:, 3], np.arange(0, -91, -1), atol=1e-6)
     np.testing.assert_allclose(np.sort(azimuth.reshape(91, 36)[0] % 360), np.arange(0, 360, 10), atol=1e-12)
 
 
-def test_the_default_is_the_papers():
+def test_default_reference_sensor_matches_the_paper():
     sensor = PaperReference()
     assert (sensor.rows, sensor.columns, sensor.shell_m, sensor.max_tilt_deg) == (1024, 1024, 0.5, 45.0)
 
@@ -65,7 +65,7 @@ def poses(count):
     return np.stack([sensor.sample_pose(EGO, generator) for _ in range(count)])
 
 
-def test_positions_are_uniform_in_the_shell_beside_and_above_the_ego():
+def test_positions_are_uniform_in_the_shell():
     position = poses(4000)[:, :3, 3]
     lower, upper = np.array(EGO.lower_m), np.array(EGO.upper_m)
     assert (position >= lower - [0.5, 0.5, 0]).all()
@@ -81,7 +81,7 @@ def test_positions_are_uniform_in_the_shell_beside_and_above_the_ego():
     assert abs(share - in_front) < 4 * np.sqrt(in_front * (1 - in_front) / 4000)
 
 
-def test_yaw_pitch_and_roll_are_uniform_in_their_ranges():
+def test_orientations_are_uniform_in_their_ranges():
     rotation = poses(4000)[:, :3, :3]
     yaw = np.rad2deg(np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0]))
     pitch = np.rad2deg(np.arcsin(-rotation[:, 2, 0]))

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from torchcover.simulation import Rig, SimulatedFrames, bodies, list_builtin_names
+from torchcover.simulation import Rig, SimulatedFrames, list_builtin_names
 from torchcover.simulation.bodies import Body, Vehicle, VehicleShape, build_actor_mesh
+from torchcover.simulation.body_size import HIGH_REMEDY, WIDE_REMEDY
 from torchcover.simulation.documents import Pose
 from torchcover.simulation.scenario import ActorDescription
 from torchcover.simulation.shapes import Box, Cylinder, Ellipsoid, Frustum, MeshFile
@@ -58,7 +59,7 @@ def edge_counts(mesh):
         (Ellipsoid(type="ellipsoid", size_m=(2, 4, 6)), 6 * BANDED_SPHERE),
     ],
 )
-def test_solids_are_closed_face_outwards_and_have_their_volume(shape, volume):
+def test_solids_are_closed_outward_and_have_their_volume(shape, volume):
     mesh = shape.build_mesh()
     edges, distinct, paired = edge_counts(mesh)
     assert edges == distinct
@@ -67,7 +68,7 @@ def test_solids_are_closed_face_outwards_and_have_their_volume(shape, volume):
     assert mesh.vertices_m[:, 2].min() == 0.0
 
 
-def test_an_ellipsoid_has_its_size_and_its_corners_lie_on_the_surface():
+def test_ellipsoid_corners_lie_on_its_surface():
     mesh = Ellipsoid(type="ellipsoid", size_m=(0.2, 0.3, 0.5)).build_mesh()
     np.testing.assert_allclose(mesh.vertices_m.min(0), [-0.1, -0.15, 0.0], atol=1e-15)
     np.testing.assert_allclose(mesh.vertices_m.max(0), [0.1, 0.15, 0.5], atol=1e-15)
@@ -84,7 +85,7 @@ def test_an_ellipsoid_has_its_size_and_its_corners_lie_on_the_surface():
         ("", "an empty file"),
     ],
 )
-def test_unusable_mesh_files_are_named(tmp_path, content, message):
+def test_invalid_mesh_files_are_named(tmp_path, content, message):
     path = tmp_path / "bad.ply"
     path.write_text(content)
     with pytest.raises(ValueError, match=rf"bad\.ply: .*{message}"):
@@ -111,7 +112,7 @@ CAR = Box(type="box", size_m=(4.9, 1.94, 1.63))
 
 
 @pytest.mark.parametrize("shape", [CAR, Cylinder(type="cylinder", radius_m=2, height_m=5)])
-def test_closed_meshes_give_no_warning_however_they_are_written(tmp_path, shape):
+def test_closed_meshes_cause_no_warning_in_any_format(tmp_path, shape):
     mesh = shape.build_mesh()
     # Warnings are errors here: what is read without one has all its faces.
     assert len(mesh_file(tmp_path, ply_of(mesh)).build_mesh().faces) == len(mesh.faces)
@@ -132,13 +133,13 @@ def in_millimetres(size_m):
 
 
 @pytest.mark.parametrize("unit", [1000.0, 100.0, 1 / 0.0254, 84 / 4.9])
-def test_an_ego_or_actor_in_another_unit_is_named_with_the_remedy(tmp_path, unit):
+def test_wrong_units_of_actors_are_reported(tmp_path, unit):
     shape = mesh_file(tmp_path, ply_of(CAR.build_mesh()), meters_per_unit=unit)
     with pytest.warns(UserWarning, match=r"ego: its body is .* far too large for .*; .*`meters_per_unit: 0\.001`"):
         ActorDescription(shape=shape).build_actor("ego", "ego")
 
 
-def test_a_body_in_millimetres_is_named_though_scenery_may_be_large(tmp_path):
+def test_bodies_in_millimeters_are_reported(tmp_path):
     shape = mesh_file(tmp_path, in_millimetres((4.9, 1.94, 1.63)))
     with pytest.warns(UserWarning, match=r"body 'parked car': its body is 4,900 x 1,940 x 1,630 m"):
         Body(name="parked car", shape=shape).build_meshes()
@@ -158,7 +159,7 @@ def test_a_body_in_millimetres_is_named_though_scenery_may_be_large(tmp_path):
         ((0.049, 0.0194, 0.0163), r"a: its body is 0.049 x 0.0194 x 0.0163 m, too small .*meters_per_unit"),
     ],
 )
-def test_a_vehicle_as_none_looks_is_named_with_the_remedy(category, size_m, message):
+def test_impossible_vehicle_proportions_are_reported(category, size_m, message):
     with pytest.warns(UserWarning, match=message):
         ActorDescription(shape=Box(type="box", size_m=size_m)).build_actor("a", category)
 
@@ -172,8 +173,8 @@ def test_a_vehicle_as_none_looks_is_named_with_the_remedy(category, size_m, mess
         ({"yaw_deg": 90}, [0, -1, 0], [0, 0, 1]),
     ],
 )
-def test_the_turns_that_are_proposed_lead_to_x_forward_and_z_up(pose, forward, up):
-    assert str(pose).replace("'", "") in bodies.WIDE + bodies.HIGH
+def test_suggested_rotations_give_x_forward_z_up(pose, forward, up):
+    assert str(pose).replace("'", "") in WIDE_REMEDY + HIGH_REMEDY
     turned = Pose(**pose).to_matrix()[:3, :3] @ np.array([forward, up]).T
     np.testing.assert_allclose(turned.T, [[1, 0, 0], [0, 0, 1]], atol=1e-12)
 
@@ -191,12 +192,12 @@ def test_the_turns_that_are_proposed_lead_to_x_forward_and_z_up(pose, forward, u
         ("barrier", (0.5, 2.5, 1.0)),
     ],
 )
-def test_what_is_real_gives_no_warning(category, size_m):
+def test_real_sizes_cause_no_warning(category, size_m):
     ActorDescription(shape=Box(type="box", size_m=size_m)).build_actor("a", category)
 
 
 @pytest.mark.parametrize("name", list_builtin_names("vehicles"))
-def test_no_built_in_vehicle_gives_a_warning(name):
+def test_built_in_vehicles_cause_no_warning(name):
     ActorDescription(shape=VehicleShape(type="vehicle", vehicle=name)).build_actor("ego", "ego")
 
 
@@ -208,7 +209,7 @@ def vehicle_of(folder, name, *parts, extends=""):
     return folder / f"{name}.yaml"
 
 
-def test_a_vehicle_has_the_parts_and_mount_regions_of_the_one_that_it_extends(tmp_path):
+def test_vehicles_inherit_parts_and_mount_regions(tmp_path):
     roof_box = PART.format("box", "[1.2, 0.9, 0.4]", "{x_m: -0.5, z_m: 1.7}")
     suv, extended = Vehicle.load("suv"), Vehicle.load(vehicle_of(tmp_path, "suv_box", roof_box, extends="suv"))
     assert extended.parts[:-1] == suv.parts
@@ -217,7 +218,7 @@ def test_a_vehicle_has_the_parts_and_mount_regions_of_the_one_that_it_extends(tm
     assert np.ptp(extended.build_mesh().vertices_m, axis=0)[2] == pytest.approx(2.1)
     cart = vehicle_of(tmp_path, "cart", PART.format("body", "[2, 1, 1]", "{}"))
     pulled = vehicle_of(tmp_path, "pulled", PART.format("bar", "[0.5, 0.1, 0.1]", "{x_m: 1.25}"), extends=cart.name)
-    with pytest.warns(UserWarning, match=r"moves the middle of its bounding box.* by x \+0.25, y \+0.00 m"):
+    with pytest.warns(UserWarning, match=r"shift the center of its bounding box.* by x \+0.25, y \+0.00 m"):
         assert np.ptp(Vehicle.load(pulled).build_mesh().vertices_m, axis=0)[0] == 2.5
     for name, base, told in (
         ("a", "pulled.yaml", "extends 'cart.yaml' itself"),
@@ -227,7 +228,7 @@ def test_a_vehicle_has_the_parts_and_mount_regions_of_the_one_that_it_extends(tm
             Vehicle.load(vehicle_of(tmp_path, name, PART.format("x", "[1, 1, 1]", "{}"), extends=base))
 
 
-def test_what_a_rig_carries_hides_from_its_sensors_as_a_part_of_the_vehicle_does(tmp_path):
+def test_rig_bodies_occlude_like_vehicle_parts(tmp_path):
     """A box ahead of a LiDAR, of the rig and of the vehicle; the reference is the same for rigs with and without it."""
     box = PART.format("box", "[0.1, 1.0, 0.3]", "{x_m: 1.0, z_m: 1.5}")
     plain = Rig.load("front_roof_32").model_dump(mode="json", exclude_unset=True)
@@ -242,7 +243,7 @@ def test_what_a_rig_carries_hides_from_its_sensors_as_a_part_of_the_vehicle_does
     assert [note.split(":")[0] for note in both.reference_record["notes"]] == ["plain", "loaded"]
 
 
-def test_an_actor_that_floats_above_its_ground_is_put_down_with_a_warning(tmp_path):
+def test_floating_actors_are_lowered_with_a_warning(tmp_path):
     floats = vehicle_of(tmp_path, "floats", PART.format("body", "[2, 1, 1]", "{z_m: 0.2}"))
     with pytest.warns(UserWarning, match=r"all parts of floats.yaml are 0.2 m or more above z = 0"):
         build_actor_mesh("actor", VehicleShape(type="vehicle", vehicle=str(floats)), "cart")

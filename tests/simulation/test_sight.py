@@ -53,7 +53,7 @@ def afresh(instant):
 @pytest.mark.parametrize("origin_m", [(0.0, 0.0, 0.0), UTM])
 @pytest.mark.parametrize("actor_moves", [False, True])
 @pytest.mark.parametrize("ego_moves", [False, True])
-def test_every_step_is_that_of_a_scan_afresh(ego_moves, actor_moves, origin_m):
+def test_reused_results_equal_new_scans_every_frame(ego_moves, actor_moves, origin_m):
     scene = SceneGeometry(world(ego_moves, actor_moves, origin_m))
     mounted, self_hits = MountedSensor(LIDAR, scene, LIDAR.max_range_m), []
     for step in (0, 3, 4, 5, 9):
@@ -69,7 +69,7 @@ def test_every_step_is_that_of_a_scan_afresh(ego_moves, actor_moves, origin_m):
 
 
 @pytest.mark.parametrize("moves", [False, True])
-def test_hits_that_are_too_close_give_no_points_and_hide_what_lies_behind(moves):
+def test_too_close_hits_occlude_without_points(moves):
     scene = SceneGeometry(world(moves, moves))
     instant, exact = (
         scene.get_snapshot(3),
@@ -87,7 +87,7 @@ def test_hits_that_are_too_close_give_no_points_and_hide_what_lies_behind(moves)
     np.testing.assert_allclose(seen.range_m, ways_m, rtol=1e-5)
 
 
-def test_a_scan_is_made_again_only_where_something_moves(monkeypatch):
+def test_scans_are_repeated_only_with_motion(monkeypatch):
     scans, original = [], SceneSnapshot.scan
     monkeypatch.setattr(SceneSnapshot, "scan", lambda *args, **options: scans.append(1) or original(*args, **options))
     for moves, expected in [((False, False), 1), ((False, True), 3), ((True, False), 3)]:
@@ -99,7 +99,7 @@ def test_a_scan_is_made_again_only_where_something_moves(monkeypatch):
         assert len(scans) == expected
 
 
-def test_the_ego_is_at_its_own_place_to_the_last_bit():
+def test_the_ego_pose_is_exactly_constant():
     """Coordinates of UTM size: a pose and its inverse make the identity only nearly."""
     made = world(origin_m=UTM)
     turned = replace(made, ego=replace(made.ego, trajectory=driving(UTM, (10, 0, 0), yaw_deg=37.3)), actors=())
@@ -111,7 +111,7 @@ def test_the_ego_is_at_its_own_place_to_the_last_bit():
 
 @pytest.mark.parametrize("origin_m", [(0.0, 0.0, 0.0), UTM])
 @pytest.mark.parametrize(("ego_moves", "actor_moves"), [(False, False), (False, True), (True, True)])
-def test_a_hit_lies_on_the_face_that_it_says_at_the_angle_that_it_says(ego_moves, actor_moves, origin_m):
+def test_hits_lie_on_their_face_at_their_angle(ego_moves, actor_moves, origin_m):
     made = world(ego_moves, actor_moves, origin_m)
     bar, ground = made.static_meshes
     bar = bar._replace(material_indices=np.arange(len(bar.faces), dtype=np.uint8))
@@ -143,7 +143,7 @@ def test_a_hit_lies_on_the_face_that_it_says_at_the_angle_that_it_says(ego_moves
 
 
 @pytest.mark.parametrize("traffic", [False, True], ids=["standing", "driving"])
-def test_the_housing_of_a_sensor_is_in_the_way_of_the_others_alone(traffic):
+def test_housings_occlude_only_other_sensors(traffic):
     """A mast 0.2 m wide, 1 m before the other, hides 11.5 degrees of it."""
     mast = Body(name="mast", shape=Cylinder(type="cylinder", radius_m=0.1, height_m=3.0), poses=(Pose(z_m=-1.5),))
     front = LIDAR.model_copy(update={"name": "front", "mount": Pose(x_m=1.0, z_m=2.5), "housing": (mast,)})

@@ -23,7 +23,7 @@ def same(a, b):
 @pytest.mark.skipif(not find_spec("warp"), reason="Warp is not installed")
 @pytest.mark.parametrize("scenario", ["courtyard", "urban"])
 @pytest.mark.parametrize("device", ["cpu", *["cuda:0"] * torch.cuda.is_available()])
-def test_rays_of_warp_end_where_those_of_embree_do(scenario, device):
+def test_warp_and_embree_hits_agree(scenario, device):
     """But for rounding, and for rays that pass an edge on the other side."""
     by_embree, by_warp = (
         SimulatedFrames(scenario, "kitti", num_frames=2, frame_interval_s=1.0, device=each)[1]
@@ -34,14 +34,14 @@ def test_rays_of_warp_end_where_those_of_embree_do(scenario, device):
             assert (nearest(queries, points).distance > 1e-3).float().mean() < 1e-4
 
 
-def test_another_seed_or_index_gives_another_reference_but_the_same_sensor_cloud():
+def test_seed_and_index_change_only_the_reference():
     a, b, c = frames(seed=0)[0], frames(seed=1)[0], frames(seed=0)[1]
     assert torch.equal(a.sensor, b.sensor)
     assert not torch.equal(a.reference, b.reference)
     assert not torch.equal(a.reference, c.reference)
 
 
-def test_the_ego_is_in_neither_cloud_and_its_hits_are_counted():
+def test_self_hits_are_excluded_and_counted():
     frame = frames(rig="front_roof_128")[0]
     for cloud in (frame.sensor, frame.reference):
         x, y, z = cloud.T
@@ -51,7 +51,7 @@ def test_the_ego_is_in_neither_cloud_and_its_hits_are_counted():
     assert frame.counts["reference_rays"] == 48 * 64
 
 
-def test_sensors_are_fused():
+def test_points_of_all_sensors_are_merged():
     grille, roof = Rig.load("front_grille_128").sensors[0], Rig.load("front_roof_128").sensors[0]
     both = frames(rig=Rig(name="both", sensors=(grille, roof)))[0]
     one, other = frames(rig="front_grille_128")[0], frames(rig="front_roof_128")[0]
@@ -60,7 +60,7 @@ def test_sensors_are_fused():
 
 
 @pytest.mark.parametrize("index", [-7, 6, 100])
-def test_an_index_outside_is_an_index_error(index):
+def test_indices_out_of_range_raise_index_errors(index):
     with pytest.raises(IndexError, match=f"frame {index} of 6"):
         frames()[index]
 
@@ -103,7 +103,7 @@ def lidar(**changes):
     return Rig.model_validate({"name": "r", "sensors": [{**content, **changes}]})
 
 
-def test_several_rigs_see_the_same_instant_and_share_the_reference():
+def test_rigs_share_scene_and_reference_points():
     names = ("front_grille_128", "front_roof_128")
     both = SimulatedFrames(
         "courtyard", rigs={name: name for name in names}, num_frames=2, seed=3, reference_sensor=SMALL
@@ -118,11 +118,11 @@ def test_several_rigs_see_the_same_instant_and_share_the_reference():
 
 @pytest.mark.parametrize("given", [{}, {"rig": "front_roof_128", "rigs": {"a": "front_roof_128"}}])
 def test_one_rig_or_several_are_needed(given):
-    with pytest.raises(ValueError, match="give one rig, or several"):
+    with pytest.raises(ValueError, match="one rig is needed, or several"):
         SimulatedFrames("courtyard", num_frames=1, **given)
 
 
-def test_range_noise_is_along_the_ray_and_has_its_standard_deviation():
+def test_range_noise_is_along_the_ray():
     exact = SimulatedFrames(scenario(), lidar(), num_frames=1, reference_sensor=SMALL)[0].sensor
     frame = SimulatedFrames(scenario(), lidar(range_noise_m=0.05), num_frames=1, reference_sensor=SMALL)[0]
     assert torch.equal(frame.sensor, exact)
@@ -136,7 +136,7 @@ def test_range_noise_is_along_the_ray_and_has_its_standard_deviation():
     assert abs(along.mean()) < 4 * 0.05 / len(along) ** 0.5
 
 
-def test_dropout_takes_its_share_of_the_points():
+def test_dropout_removes_its_share_of_points():
     exact = SimulatedFrames(scenario(), lidar(), num_frames=2, reference_sensor=SMALL)
     thinned = SimulatedFrames(scenario(), lidar(dropout=0.3), num_frames=2, reference_sensor=SMALL)
     count, kept = len(exact[0].sensor), len(thinned[0].sensor)
@@ -145,7 +145,7 @@ def test_dropout_takes_its_share_of_the_points():
     assert not torch.equal(thinned[0].sensor[:50], thinned[1].sensor[:50])
 
 
-def test_a_reference_pose_inside_a_wall_is_drawn_again_and_counted():
+def test_occupied_reference_poses_are_resampled_and_counted():
     close = SimulatedFrames(scenario(wall_x=4.05), lidar(), num_frames=40, reference_sensor=SMALL)
     wide = SimulatedFrames(scenario(wall_x=50.0), lidar(), num_frames=40, reference_sensor=SMALL)
     assert sum(close[index].counts["reference_poses_resampled"] for index in range(40)) > 0
@@ -157,7 +157,7 @@ def test_a_reference_pose_inside_a_wall_is_drawn_again_and_counted():
 
 
 @pytest.mark.parametrize("name", ["urban", "highway", "parking"])
-def test_traffic_plays_the_same_in_any_order_and_starts_anew_at_its_end(name):
+def test_traffic_is_reproducible_in_any_order(name):
     short = Scenario.model_validate({"name": name, "traffic": {"type": name, "duration_s": 1.0, "time_step_s": 0.5}})
     made = SimulatedFrames(short, lidar(), num_frames=5, seed=1, reference_sensor=SMALL)
     in_order = [made[index] for index in range(5)]
@@ -168,7 +168,7 @@ def test_traffic_plays_the_same_in_any_order_and_starts_anew_at_its_end(name):
     assert not torch.equal(in_order[0].sensor, other.sensor)
 
 
-def test_a_longer_time_between_frames_shows_the_same_world_later():
+def test_longer_frame_intervals_show_later_time_steps():
     few = PaperReference(rows=2, columns=2)
     each = SimulatedFrames("parking", "front_roof_32", num_frames=1301, seed=1, reference_sensor=few)
     spread = SimulatedFrames(
@@ -180,7 +180,7 @@ def test_a_longer_time_between_frames_shows_the_same_world_later():
 
 
 @pytest.mark.parametrize("frame_interval_s", [0.0, -0.1, 0.05, 0.15, float("nan"), float("inf")])
-def test_a_time_between_frames_that_is_no_multiple_of_the_time_step_is_refused(frame_interval_s):
+def test_frame_intervals_are_multiples_of_time_steps(frame_interval_s):
     with pytest.raises(
         ValueError, match=r"frame_interval_s: a positive multiple of the time step of .urban., 0.1 s, is needed"
     ):

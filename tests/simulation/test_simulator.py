@@ -28,7 +28,7 @@ def same(a, b):
 
 
 @pytest.mark.parametrize("reference_sensor", [SMALL, SURFACE])
-def test_a_frame_is_a_step_in_tensors(reference_sensor):
+def test_frames_are_observations_as_tensors(reference_sensor):
     seen = simulator(reference_sensor, seed=5).simulate_frame(2)
     rigs = {name: name for name in seen.clouds}
     frame = SimulatedFrames("courtyard", rigs=rigs, num_frames=3, seed=5, reference_sensor=reference_sensor)[2]
@@ -44,7 +44,7 @@ def test_a_frame_is_a_step_in_tensors(reference_sensor):
         np.testing.assert_array_equal(frame.reference_weights.numpy(), seen.reference_weights)
 
 
-def test_a_step_depends_on_seed_and_index_only_and_survives_pickling():
+def test_observations_depend_on_seed_and_index_only():
     made = simulator(scenario=Scenario.model_validate(SHORT), seed=1)
     late = made.simulate_frame(6)
     assert made.simulate_frame(0).counts["moving_bodies"] > 0
@@ -53,7 +53,7 @@ def test_a_step_depends_on_seed_and_index_only_and_survives_pickling():
     assert not same(simulator(scenario=made.scenario, seed=2).simulate_frame(6), late)
 
 
-def test_another_reference_sensor_sees_the_same_bodies_and_leaves_the_first_as_it_is():
+def test_replacing_the_reference_sensor_keeps_the_scene():
     base = simulator(frame_interval_s=0.5)
     other = base.replace_reference_sensor(SURFACE)
     assert other.get_scene_geometry(3)[0] is base.get_scene_geometry(3)[0]
@@ -62,7 +62,7 @@ def test_another_reference_sensor_sees_the_same_bodies_and_leaves_the_first_as_i
     assert len(other.simulate_frame(1).reference_weights) == len(other.simulate_frame(1).reference)
 
 
-def test_labels_are_of_the_objects_in_the_reference_sensors_range():
+def test_labels_are_within_the_reference_range():
     far = simulator(PaperReference(8, 8, max_range_m=60.0), Scenario.model_validate(SHORT))
     near = far.replace_reference_sensor(PaperReference(8, 8, max_range_m=20.0))
     names = [{label.name for label in made.compute_labels(1)} for made in (near, far)]
@@ -70,7 +70,7 @@ def test_labels_are_of_the_objects_in_the_reference_sensors_range():
     assert all(np.hypot(*label.center_m[:2]) < 65.0 for label in far.compute_labels(1))
 
 
-def test_without_a_rig_there_is_the_reference_alone():
+def test_without_rigs_only_the_reference_is_simulated():
     seen = Simulator(Scenario.load("courtyard"), {}, SMALL).simulate_frame(0)
     assert seen.clouds == {}
     np.testing.assert_array_equal(seen.reference, simulator().simulate_frame(0).reference)
@@ -91,7 +91,7 @@ def test_impossible_requests_are_refused(ask, message):
 
 
 @pytest.mark.parametrize("name", list_builtin_names("scenarios"))
-def test_the_egos_box_is_that_of_a_world_of_the_scenario(name):
+def test_ego_boxes_of_scenario_and_scene_agree(name):
     scenario = Scenario.load(name)
     if hasattr(scenario.traffic, "duration_s"):
         scenario = scenario.model_copy(update={"traffic": scenario.traffic.model_copy(update={"duration_s": 1.0})})

@@ -30,14 +30,14 @@ def small(monkeypatch):
     monkeypatch.setattr(memory, "find_memory_limit_bytes", lambda: 1e8)
 
 
-def test_a_machine_has_memory_and_what_is_more_is_refused(small):
+def test_demands_beyond_the_memory_are_refused(small):
     assert 1e8 < find_memory_limit_bytes() < 1e15
     check_memory_fits("a scan", 1e8, "take less")
     with pytest.raises(ValueError, match=r"a scan: 0.2 GB of memory .*, and this machine has 0.1 GB; take less"):
         check_memory_fits("a scan", 2e8, "take less")
 
 
-def test_the_limit_of_a_container_counts(tmp_path, monkeypatch):
+def test_container_memory_limits_apply(tmp_path, monkeypatch):
     (tmp_path / "memory.max").write_text("5000000\n")
     (tmp_path / "none").write_text("max\n")
     monkeypatch.setattr(memory, "CGROUP_LIMITS", (tmp_path / "missing", tmp_path / "none", tmp_path / "memory.max"))
@@ -64,19 +64,19 @@ def test_the_limit_of_a_container_counts(tmp_path, monkeypatch):
         (lambda: count_time_steps(1.0, 1e-320), "inf time steps"),
     ],
 )
-def test_no_number_is_larger_than_there_can_be(make, message):
+def test_numbers_beyond_their_limits_are_refused(make, message):
     with pytest.raises(ValueError, match=message):
         make()
 
 
 @pytest.mark.parametrize("stride", [16, 40])
-def test_a_camera_with_one_used_column_is_as_wide_as_a_pixel(stride):
+def test_a_single_camera_column_spans_one_pixel(stride):
     camera = CameraSensor(name="c", width=16, height=8, fov_deg=90, stride=stride, max_range_m=9)
     ahead = CameraSensor(name="c", width=16, height=8, fov_deg=90, max_range_m=9).horizontal_fov_deg
     assert 0 < camera.horizontal_fov_deg < ahead / 10
 
 
-def test_more_rays_than_there_is_memory_for_are_refused_before_they_are_made(small):
+def test_too_many_rays_are_refused_early(small):
     lidar = Lidar(name="a", channels=1000, columns=1000, **SPACED)
     scenario, rigs = Scenario.load("courtyard"), {"r": Rig(name="r", sensors=(lidar,))}
     with pytest.raises(ValueError, match=r"1,000,012 rays per frame \(1,000,000 of the rig's .*, 12 of the reference\)"):
@@ -86,7 +86,7 @@ def test_more_rays_than_there_is_memory_for_are_refused_before_they_are_made(sma
         fits.replace_reference_sensor(SurfaceReference(AREAS, num_rays=1_000_000))
 
 
-def test_more_steps_and_bodies_than_there_is_memory_for_are_refused(small):
+def test_too_many_time_steps_are_refused(small):
     mesh = Box(type="box", size_m=(4, 2, 1)).build_mesh()
     ego = Actor("ego", "ego", mesh, Trajectory.create_static((0, 0, 0)))
     cars = tuple(Actor(f"car {k}", "car", mesh, Trajectory.create_static((9.0 * k, 9, 0))) for k in range(3))
@@ -97,12 +97,12 @@ def test_more_steps_and_bodies_than_there_is_memory_for_are_refused(small):
 @pytest.mark.parametrize(
     "traffic", [UrbanTraffic(duration_s=600.0, traffic_per_km=100), HighwayTraffic(duration_s=3600.0)]
 )
-def test_more_traffic_than_there_is_memory_for_is_refused_before_anybody_is_made(small, traffic):
+def test_too_much_traffic_is_refused_early(small, traffic):
     with pytest.raises(ValueError, match=r"traffic of about [\d,]+ for [\d,]+ time steps: .* shorten the duration"):
         traffic.build_scene(0)
 
 
-def test_an_actor_that_will_get_into_the_ego_is_known_before_the_run(tmp_path):
+def test_later_overlaps_are_found_before_the_run(tmp_path):
     rows = [f"{t},{20 - 2 * t},0,0,0,0,0" for t in range(11)]
     (tmp_path / "a.csv").write_text("\n".join(["t,x,y,z,roll,pitch,yaw", *rows]))
     box = {"type": "box", "size_m": [4, 2, 1]}
@@ -125,5 +125,5 @@ def test_an_actor_that_will_get_into_the_ego_is_known_before_the_run(tmp_path):
         every_third.check_run(4)
 
 
-def test_traffic_has_two_instants_however_short_it_is():
+def test_traffic_has_at_least_two_time_steps():
     assert len(HighwayTraffic(duration_s=1e-320).build_scene(0).ego.trajectory.times_s) == 2

@@ -51,24 +51,24 @@ def turned(mesh, which):
     ],
 )
 @pytest.mark.parametrize("inside_out", [False, True])
-def test_sound_meshes_are_told_nothing_about(mesh, inside_out):
+def test_meshes_without_defects_cause_no_warning(mesh, inside_out):
     mesh = turned(mesh, slice(None)) if inside_out else mesh
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert check_mesh("it", mesh).faces is mesh.faces
 
 
-def test_what_is_wrong_is_said_with_the_name_and_the_share():
+def test_defects_are_reported_with_name_and_share():
     with pytest.warns(UserWarning, match=r"body 'a': 3 of 15 of its faces are there more than once"):
         once = check_mesh("body 'a'", Mesh(CUBE.vertices_m, np.concatenate([CUBE.faces, CUBE.faces[[0, 5, 5], ::1]])))
     assert len(once.faces) == 12
-    with pytest.warns(UserWarning, match=r"body 'b': the normals of neighbours disagree at 3 of 18 of its inner edges"):
+    with pytest.warns(UserWarning, match=r"body 'b': the normals of neighbors disagree at 3 of 18 of its inner edges"):
         check_mesh("body 'b'", turned(CUBE, [4]))
     with pytest.warns(UserWarning, match=r"body 'c': 6 of 18 of its edges have a face on one side only"):
         check_mesh("body 'c'", Mesh(CUBE.vertices_m, CUBE.faces[2:]))
 
 
-def test_faces_coincide_with_what_looks_the_same_way():
+def test_coincident_faces_have_the_same_visible_side():
     plane, cube = Plane(type="plane", size_m=(30, 30)).build_mesh(), CUBE
     decal = Plane(type="plane", size_m=(0.5, 0.5)).build_mesh().transform(build_transform(np.eye(3), [9, 9, 5e-4]))
     far = decal.transform(build_transform(np.eye(3), [0, 0, 2e-3]))
@@ -87,7 +87,7 @@ def test_faces_coincide_with_what_looks_the_same_way():
     assert counts(turned(plane, slice(None)), sunk)[1] == counts(plane, sunk)[1] == 2
 
 
-def test_how_many_faces_are_looked_at_together_changes_nothing(monkeypatch):
+def test_the_chunk_size_changes_no_result(monkeypatch):
     """A mesh of ten million is looked at in parts: of hills, a ball, and a patch of the hills once more."""
     hills, ball = grid(), Ellipsoid(type="ellipsoid", size_m=(9, 9, 9)).build_mesh()
     hills = hills._replace(vertices_m=hills.vertices_m + [0, 0, 1] * np.sin(hills.vertices_m[:, :1]))
@@ -113,7 +113,7 @@ def test_how_many_faces_are_looked_at_together_changes_nothing(monkeypatch):
 @pytest.mark.filterwarnings("ignore:.*faces lie within 1 mm")
 @pytest.mark.parametrize(("rays", "steps"), [(400, 60), (20, 200)])
 @pytest.mark.parametrize("raised_m", [5e-4, 0.0, -5e-4])
-def test_a_decal_on_the_road_counts_once(at, raised_m, rays, steps):
+def test_decals_on_the_road_count_once(at, raised_m, rays, steps):
     at([2.5, 0.3, 1.0])
     decal = {"name": "decal", "shape": {"type": "plane", "size_m": [8, 6]}, "poses": [{"x_m": 12, "z_m": raised_m}]}
     sensor = SurfaceReference((AHEAD,), num_rays=rays, num_poses=1, bands_m=ALL_HEIGHTS)
@@ -121,7 +121,7 @@ def test_a_decal_on_the_road_counts_once(at, raised_m, rays, steps):
     agrees(sums(scenario(FLOOR, decal), sensor, lambda points: points[:, 0].astype(float), steps=steps), 200.0 * 14)
 
 
-def test_doubled_faces_count_once(at, tmp_path):
+def test_repeated_faces_count_once(at, tmp_path):
     at([2.5, 3.0, 2.5])
     cube = Mesh(CUBE.vertices_m * [1, 1, 0.75] + [10, 0, 0], CUBE.faces)
     twice = file_body(tmp_path, Mesh(cube.vertices_m, np.tile(cube.faces, (2, 1))))
@@ -131,7 +131,7 @@ def test_doubled_faces_count_once(at, tmp_path):
     agrees(found, 2.0 + 2.0 + 4.0)
 
 
-def test_two_bodies_at_one_place_count_once_and_are_named(at):
+def test_coincident_bodies_count_once_and_are_named(at):
     at([2.5, 3.0, 2.5])
     one = box([2, 2, 1.5], x_m=10)
     other = {**one, "name": "again"}
@@ -144,18 +144,18 @@ def test_two_bodies_at_one_place_count_once_and_are_named(at):
 
 
 @pytest.mark.parametrize("flipped", [slice(0, 0), slice(None, None, 2)])
-def test_scenarios_and_movers_name_the_body_of_a_file(tmp_path, flipped):
+def test_mesh_warnings_name_the_body(tmp_path, flipped):
     lying = file_body(tmp_path, turned(Mesh(CUBE.vertices_m, CUBE.faces[2:]), flipped))
-    what = "normals of neighbours disagree" if flipped.step else "6 of 18 of its edges"
+    what = "normals of neighbors disagree" if flipped.step else "6 of 18 of its edges"
     with pytest.warns(UserWarning, match=f"body 'body': .*{what}"):
         scenario({**lying, "poses": [{"z_m": 0.5}]}, FLOOR).build_scene()
     with pytest.warns(UserWarning, match=f"ego: .*{what}"):
         scenario(FLOOR, ego={"shape": lying["shape"]}).build_scene()
 
 
-@pytest.mark.filterwarnings("ignore:.*normals of neighbours disagree")
+@pytest.mark.filterwarnings("ignore:.*normals of neighbors disagree")
 @pytest.mark.parametrize("kind", ["up", "down", "mixed"])
-def test_a_terrain_sheet_gives_its_area_whichever_way_its_faces_look(at, tmp_path, kind):
+def test_terrain_area_is_independent_of_face_orientation(at, tmp_path, kind):
     mesh = grid()
     which = {"up": [], "down": slice(None), "mixed": slice(None, None, 2)}[kind]
     at([2.5, 0.3, 1.0])

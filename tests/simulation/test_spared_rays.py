@@ -47,7 +47,7 @@ def is_near(scan, balls):
 
 @pytest.mark.parametrize("name", SENSORS)
 @pytest.mark.parametrize("radius_m", [0.1, 0.4, 2.0])
-def test_points_near_what_is_asked_about_are_the_same_to_the_bit(scene, name, radius_m):
+def test_needed_points_do_not_change_by_a_bit(scene, name, radius_m):
     instant, sensor = scene.get_snapshot(30, max_distance_m=90.0), SENSORS[name]
     mounted = MountedSensor(sensor, scene, sensor.max_range_m)
 
@@ -70,7 +70,7 @@ def test_points_near_what_is_asked_about_are_the_same_to_the_bit(scene, name, ra
     assert (spared.num_omitted_rays > 0.3 * full.num_rays) == (name != "lidar that takes time") or radius_m > 1
 
 
-def test_a_ray_is_met_exactly_if_it_passes_through_a_ball():
+def test_rays_are_selected_if_they_pass_spheres():
     """But for some millimetres, and a millimetre in a metre far away; at the sensor every ray is."""
     generator = np.random.default_rng(5)
     directions = compute_unit_directions(np.linspace(-89, 89, 50)[:, None], np.linspace(-179, 179, 100)[None])
@@ -90,7 +90,7 @@ def test_a_ray_is_met_exactly_if_it_passes_through_a_ball():
 
 
 @pytest.mark.parametrize("name", ["lidar", "camera"])
-def test_of_many_places_neighbours_are_looked_at_together(scene, name):
+def test_many_points_share_larger_spheres(scene, name):
     """All rays of their own are among those of balls that hold them; where nearly all are, none is spared."""
     sensor, instant = SENSORS[name], scene.get_snapshot(0, max_distance_m=90.0)
     mounted, generator = MountedSensor(sensor, scene, 90.0), np.random.default_rng(9)
@@ -117,7 +117,7 @@ def test_of_many_places_neighbours_are_looked_at_together(scene, name):
     assert mounted.scan(instant, SensorNoise(None), search_spheres=everywhere).num_omitted_rays == 0
 
 
-def test_an_instant_is_placed_once_for_several_rigs_and_few_are_kept(scene):
+def test_rigs_share_snapshots_and_few_are_cached(scene):
     first = scene.get_snapshot(0, max_distance_m=90.0)
     assert scene.get_snapshot(0, max_distance_m=90.0) is first
     assert scene.get_snapshot(0, max_distance_m=80.0) is not first

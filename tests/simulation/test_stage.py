@@ -49,7 +49,7 @@ def places(made):
     return {index: scene.scene.ego.trajectory.positions_m[step] for index, (scene, step) in scenes.items()}
 
 
-def test_shuffled_steps_build_each_world_once(built):
+def test_shuffled_frames_build_each_scene_once(built):
     found = places(simulator())
     assert sorted(built) == [0, 1, 2, 3]
     alone = SHORT.build_scene(run_index=1).ego.trajectory.positions_m
@@ -57,7 +57,7 @@ def test_shuffled_steps_build_each_world_once(built):
 
 
 @pytest.mark.parametrize(("room_for", "workers"), [(0.5, 1), (2.5, 1), (2.5, 4)])
-def test_no_more_worlds_are_kept_than_the_budget_has_room_for(monkeypatch, built, room_for, workers):
+def test_cached_scenes_stay_within_the_budget(monkeypatch, built, room_for, workers):
     size = simulator().get_scene_geometry(0)[0].num_bytes
     monkeypatch.setattr(stage, "find_memory_limit_bytes", lambda: room_for * size / stage.SceneStoreParams().max_memory_share)
     monkeypatch.setattr(stage, "get_worker_info", lambda: SimpleNamespace(num_workers=workers))
@@ -69,7 +69,7 @@ def test_no_more_worlds_are_kept_than_the_budget_has_room_for(monkeypatch, built
     assert built == ([0, 1, 2, 1] if room_for / workers > 2 else [0, 1, 0, 2, 0, 1])
 
 
-def test_a_world_that_is_dropped_is_gone_without_a_collection_of_garbage():
+def test_dropped_scenes_need_no_garbage_collection():
     made = Simulator(SHORT, {"roof": Rig.load("front_roof_128")}, PaperReference(8, 8), max_cached_bytes=0.0)
     made.simulate_frame(0)
     first = weakref.ref(made.get_scene_geometry(0)[0])
@@ -81,7 +81,7 @@ def test_a_world_that_is_dropped_is_gone_without_a_collection_of_garbage():
         gc.enable()
 
 
-def test_worlds_share_what_is_the_same_in_all():
+def test_scenes_share_casters_and_sensors():
     stages = stage.MountedRigStore(stage.SceneStore(SHORT, seed=0), {"roof": Rig.load("front_roof_128")})
     one, other = stages.get_mounted_rigs(0), stages.get_mounted_rigs(1)
     casters = [set(stage.scene_geometry.get_snapshot(0).moving_bodies.casters) for stage in (one, other)]

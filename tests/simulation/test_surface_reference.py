@@ -34,7 +34,7 @@ def along_x(points):
     return points[:, 0].astype(np.float64)
 
 
-def test_a_floor_with_a_hole(at, tmp_path):
+def test_holes_reduce_the_visible_area(at, tmp_path):
     parts = [((-50, 10), (-50, 50)), ((12, 50), (-50, 50)), ((10, 12), (-50, -1)), ((10, 12), (1, 50))]
     floor = sheet_file(tmp_path, [triangle for part in parts for triangle in rectangle(*part)])
     at([2.5, 0.3, 1.0])
@@ -51,7 +51,7 @@ def test_a_floor_with_a_hole(at, tmp_path):
         (rectangle((10, 12), (-1, 1), 1.0), 4.0),  # a cover above it
     ],
 )
-def test_surface_without_ground_below_it_is_counted_and_changes_no_number(at, tmp_path, pit, m2):
+def test_surface_without_ground_changes_no_number(at, tmp_path, pit, m2):
     parts = [((-50, 10), (-50, 50)), ((12, 50), (-50, 50)), ((10, 12), (-50, -1)), ((10, 12), (1, 50))]
     floor = sheet_file(tmp_path, [triangle for part in parts for triangle in rectangle(*part)])
     at([11.0, 0.0, 2.0])
@@ -75,7 +75,7 @@ def test_surface_without_ground_below_it_is_counted_and_changes_no_number(at, tm
 
 
 @pytest.mark.parametrize("turned", [False, True])
-def test_an_open_sheet_is_seen_from_either_side(at, tmp_path, turned):
+def test_sheets_are_visible_from_both_sides(at, tmp_path, turned):
     parts = [((-4, -1), (0, 4)), ((1, 4), (0, 4)), ((-1, 1), (0, 1)), ((-1, 1), (2, 4))]
     upright = np.array([triangle for part in parts for triangle in rectangle(*part)])[..., [2, 0, 1]] + [12, 0, 0]
     sheet = sheet_file(tmp_path, upright[:, ::-1] if turned else upright)
@@ -84,14 +84,14 @@ def test_an_open_sheet_is_seen_from_either_side(at, tmp_path, turned):
     agrees(sums(scenario(sheet, FLOOR), sensor), 8 * 1.5 - 2 * 1)
 
 
-def test_of_a_face_that_is_seen_edge_on_there_is_nothing(at, tmp_path):
+def test_faces_seen_edge_on_give_no_points(at, tmp_path):
     upright = np.array(rectangle((-2, 2), (0, 3)))[..., [2, 0, 1]] + [12, 0, 0]
     at([12.0, -5.0, 1.0])
     sensor = SurfaceReference((AHEAD,), num_rays=400, num_poses=1, bands_m=((0.5, 2.0),))
     assert not sums(scenario(sheet_file(tmp_path, upright), FLOOR), sensor).any()
 
 
-def test_a_sheet_with_a_face_on_either_side_counts_once(at, tmp_path):
+def test_two_sided_sheets_count_once(at, tmp_path):
     one = np.array(rectangle((-2, 2), (0, 3)))[..., [2, 0, 1]] + [12, 0, 0]
     at([2.5, 0.3, 1.0])
     sensor = SurfaceReference((AHEAD,), num_rays=400, num_poses=1, bands_m=((0.5, 2.0),))
@@ -101,7 +101,7 @@ def test_a_sheet_with_a_face_on_either_side_counts_once(at, tmp_path):
 
 @pytest.mark.filterwarnings("ignore:.*faces lie within 1 mm")  # inside out, the bottom looks up as the floor does
 @pytest.mark.parametrize("inside_out", [False, True])
-def test_of_a_box_the_sides_that_are_turned_to_the_place_are_seen(at, tmp_path, inside_out):
+def test_only_facing_sides_of_a_box_count(at, tmp_path, inside_out):
     made = trimesh.creation.box(extents=[2, 2, 1.5])
     made.apply_translation([10, 0, 0.75])
     faces = made.vertices[made.faces]
@@ -113,7 +113,7 @@ def test_of_a_box_the_sides_that_are_turned_to_the_place_are_seen(at, tmp_path, 
     agrees(on_top, 4.0)
 
 
-def test_a_wall_that_another_one_half_hides(at):
+def test_half_occluded_walls_have_half_the_area(at):
     wall, screen = box([0.2, 10, 3], x_m=20), box([0.2, 2, 10], x_m=10, y_m=1)
     at([2.6, 0.0, 1.0])
     sensor = SurfaceReference((((15.0, 25.0), (-6.0, 6.0)),), num_rays=1000, num_poses=1, bands_m=((0.5, 2.0),))
@@ -123,7 +123,7 @@ def test_a_wall_that_another_one_half_hides(at):
     agrees(heights, 1.5 * 1.25 * (10 - hidden_m))
 
 
-def test_the_egos_own_surface_is_in_no_cloud_but_hides(at):
+def test_the_ego_occludes_without_being_sampled(at):
     at([0.0, 0.0, 2.0])  # half a metre above the roof
     around = SurfaceReference((((-5.0, 5.0), (-5.0, 5.0)),), num_rays=2000, num_poses=1, bands_m=ALL_HEIGHTS)
     # The shadow of the roof, four times as far from the place as the roof is.
@@ -133,14 +133,14 @@ def test_the_egos_own_surface_is_in_no_cloud_but_hides(at):
     assert seen.counts["reference_self_hits"] == seen.counts["reference_rays"] - len(seen.reference)
 
 
-def test_a_vehicle_that_pitches_takes_its_boxes_along(at):
+def test_regions_pitch_with_the_vehicle(at):
     at([2.6, 0.0, 1.0])
     ego = {**EGO, "pose": {"z_m": 3.0, "pitch_deg": 5.0}}
     sensor = SurfaceReference((AHEAD,), num_rays=1000, num_poses=2, bands_m=((-6.0, 0.0),), band_frame="vehicle")
     agrees(sums(scenario(FLOOR, ego=ego), sensor), 200.0 / math.cos(math.radians(5)))
 
 
-def test_the_ray_budget_and_the_number_of_places_do_not_move_the_mean():
+def test_the_mean_is_independent_of_sample_sizes():
     made = Scenario.load("courtyard")
     areas = (((0.0, 20.0), (-5.0, 5.0)), ((-10.0, 40.0), (-10.0, 10.0)))
     many = sums(made, SurfaceReference(areas, num_rays=8192, num_poses=4), steps=12)
@@ -155,7 +155,7 @@ def test_the_ray_budget_and_the_number_of_places_do_not_move_the_mean():
     assert spread[1024, 4] < 0.75 * spread[1024, 1]
 
 
-def test_strata_that_overlap_share_their_points_out(at):
+def test_overlapping_strata_share_their_points(at):
     at([2.6, 0.0, 1.0])
     inner = ((6.0, 9.0), (-2.0, 3.0))
     sensor = SurfaceReference((AHEAD, inner, AHEAD), num_rays=900, num_poses=1, bands_m=((-0.5, 0.5), (-0.2, 0.1)))
@@ -167,7 +167,7 @@ def test_strata_that_overlap_share_their_points_out(at):
     assert step.reference_weights[inside].max() < step.reference_weights[~inside].min()
 
 
-def test_nothing_to_see_is_no_point_and_no_square_metre(at):
+def test_empty_surroundings_give_no_points(at):
     at([2.5, 0.0, 1.0])
     empty = SurfaceReference((AHEAD,), num_rays=100, bands_m=((1.0, 2.0), (50.0, 60.0)))
     seen = Simulator(scenario(FLOOR), {}, empty).simulate_frame(0)
@@ -180,7 +180,7 @@ def test_nothing_to_see_is_no_point_and_no_square_metre(at):
     assert hidden.counts["reference_rays"] > 40
 
 
-def test_huge_faces_needles_and_faces_without_area_are_taken_as_they_are(at, tmp_path):
+def test_faces_of_any_proportion_are_sampled_correctly(at, tmp_path):
     at([2.5, 0.3, 1.0])
     huge = rectangle((-1e5, 1e5), (-1e5, 1e5))
     needle = [[[5, 0, 0.6], [1e5, 0, 0.6], [5, 1e-7, 0.6]]]
@@ -229,12 +229,12 @@ def test_threads_workers_and_pickling_change_nothing():
         ({"max_range_m": math.nan}, "max_range_m: a positive distance"),
     ],
 )
-def test_what_makes_no_sense_is_refused(options, message):
+def test_invalid_settings_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         SurfaceReference(**{"areas": (AHEAD,), **options})
 
 
-def test_what_is_hidden_from_a_roadside_rig_counts_as_not_detected():
+def test_surface_hidden_from_roadside_rigs_is_undetected():
     """A wall of 4 m, 10 m from a mast of 6 m, hides the ground to x = 30 m from all that looks from the mast."""
     wall = {"name": "wall", "shape": {"type": "box", "size_m": [0.5, 100, 4]}, "poses": [{"x_m": 10}]}
     floor = {"name": "floor", "shape": {"type": "plane", "size_m": [300, 300]}, "ground": True}
@@ -249,7 +249,7 @@ def test_what_is_hidden_from_a_roadside_rig_counts_as_not_detected():
     assert behind.sum() > 100
     assert nearest(frames[0].reference[behind], frames[0].sensor).distance.min() > 0.4
     assert frames.reference_record["notes"][-1].startswith("Reference positions: anywhere in the regions")
-    with pytest.raises(ValueError, match="looks from the mast of this roadside rig"):
+    with pytest.raises(ValueError, match="close to the mast of this roadside rig"):
         SimulatedFrames(road, rig, num_frames=1, reference_sensor=PaperReference())
     on_car = SimulatedFrames("courtyard", "front_roof_32", num_frames=1).reference_sensor
     assert (on_car.is_over_areas, on_car.shell_m) == (False, 0.5)

@@ -54,7 +54,7 @@ def swept(made, time_s=0.5, lidar=LIDAR, draws=EXACT):
 @pytest.mark.parametrize(
     ("ego_mps", "cars_mps", "turn_deg"), [(20.0, 0.0, 0.0), (0.0, 15.0, 0.0), (20.0, 15.0, 0.0), (20.0, 15.0, 150.0)]
 )
-def test_each_column_is_that_of_a_scan_at_its_own_time(ego_mps, cars_mps, turn_deg):
+def test_columns_equal_scans_at_their_own_time(ego_mps, cars_mps, turn_deg):
     """The slow twin: the whole scene is placed anew for each column."""
     made = world(ego_mps, cars_mps, turn_deg)
     mounted, seen = swept(made)
@@ -94,7 +94,7 @@ def test_each_column_is_that_of_a_scan_at_its_own_time(ego_mps, cars_mps, turn_d
     assert (moved > 15) == (cars_mps > 0)
 
 
-def test_where_nothing_moves_it_is_the_same_to_the_bit():
+def test_static_scenes_give_identical_bits():
     _, still = swept(world())
     _, at_once = swept(world(), lidar=LIDAR.model_copy(update={"scan": None}))
     np.testing.assert_array_equal(still.points.view(np.int32), at_once.points.view(np.int32))
@@ -111,7 +111,7 @@ def test_where_nothing_moves_it_is_the_same_to_the_bit():
 
 
 @pytest.mark.parametrize("car_mps", [0.0, 12.0])
-def test_a_sweep_moves_a_point_by_speed_times_time(car_mps):
+def test_motion_distortion_is_speed_times_time(car_mps):
     """The rear of a car ahead, 8 m before an ego at 20 m/s, at the frame's time: three clouds in closed form."""
     made = world(ego_mps=20.0)
     car = Actor("car", "car", box(4, 6, 1.5), driving((20.0 - car_mps / 2, 0, 0), (5 * car_mps, 0, 0)))
@@ -130,7 +130,7 @@ def test_a_sweep_moves_a_point_by_speed_times_time(car_mps):
     assert np.ptp(landed[rear, 0]) == pytest.approx(car_mps * np.ptp(time_s[rear]), abs=2e-3)
 
 
-def test_the_first_frame_of_a_world_is_as_its_second():
+def test_first_frames_are_simulated_like_later_frames():
     """Before a world begins it is told from how it goes on."""
     made = world(ego_mps=20.0)
     made = replace(made, static_meshes=made.static_meshes[:1], actors=())
@@ -149,7 +149,7 @@ def test_the_first_frame_of_a_world_is_as_its_second():
         (CameraSensor(name="c", width=50, height=30, fov_deg=90, stride=4, max_range_m=9, scan={"period_s": 0.1}), 0),
     ],
 )
-def test_columns_of_a_lidar_and_rows_of_a_camera_follow_each_other(sensor, axis):
+def test_lidar_columns_and_camera_rows_are_consecutive(sensor, axis):
     times_s = sensor.compute_ray_times_s()
     assert times_s.shape == sensor.compute_directions().shape[1:]
     assert (np.diff(times_s, axis=axis) > 0).all()
@@ -160,7 +160,7 @@ def test_columns_of_a_lidar_and_rows_of_a_camera_follow_each_other(sensor, axis)
     np.testing.assert_allclose(later, times_s + 0.12)
 
 
-def test_where_points_of_a_sensor_that_errs_land():
+def test_range_errors_are_along_the_distorted_ray():
     """Along the ray as it was cast, from where the sensor was then."""
     made = world(ego_mps=20.0)
     exact, erring = (
@@ -177,7 +177,7 @@ def test_where_points_of_a_sensor_that_errs_land():
     assert 1.8 < np.ptp(origins[:, 0]) < 2.1
 
 
-def test_a_scan_that_is_longer_than_a_time_step_is_refused():
+def test_scans_longer_than_time_steps_are_refused():
     for ego_mps in (0.0, 1.0):
         with pytest.raises(
             ValueError, match=r"'roof': a scan of period_s 0\.1 is longer than the time step .* 0\.05 s"

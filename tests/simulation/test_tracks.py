@@ -24,7 +24,7 @@ def write(folder, content, name="track.csv"):
     return path
 
 
-def test_a_csv_is_read_in_any_order_of_columns_whatever_else_is_in_it(tmp_path):
+def test_csv_columns_may_have_any_order(tmp_path):
     path = write(tmp_path, "yaw, t, x, note, y, z, roll, pitch\n90, 0, 1, a, 2, 3, 10, 20\n90, 1, 1,, 2, 3, 10, 20\n")
     pose = read_trajectory(path).interpolate(0.5)
     np.testing.assert_allclose(pose[:3, 3], [1, 2, 3])
@@ -162,7 +162,7 @@ def test_missing_files_and_other_formats_are_named(tmp_path):
         read_box_actors(tmp_path / "none.csv")
 
 
-def test_recorded_boxes_become_actors_that_come_and_go(tmp_path):
+def test_recorded_boxes_become_transient_actors(tmp_path):
     rows = [f"{t},a,car,{5 + t},0,0,4,2,1.5,0" for t in (1, 2, 3)] + ["1,b,truck,0,9,0,8,2.5,3,90"]
     a, b = read_box_actors(write(tmp_path, BOXES + "\n".join(rows)))
     assert (a.name, a.category, b.name, b.category) == ("a", "car", "b", "truck")
@@ -217,7 +217,7 @@ def test_a_scenario_of_files_plays(tmp_path):
     assert box_seen == [False, True, True, False, False]
 
 
-def test_a_mover_has_a_pose_or_a_trajectory_not_both(tmp_path):
+def test_actors_have_either_pose_or_trajectory(tmp_path):
     both = SCENARIO.replace("trajectory: ego.csv", "trajectory: ego.csv, pose: {x_m: 1}")
     with pytest.raises(ValueError, match="ego: give a pose or a trajectory, not both"):
         Scenario.load(write(tmp_path, both, "s.yaml"))

@@ -68,12 +68,12 @@ def profile(mesh, x_m):
     return np.array([height_at(mesh, x, 0.013) for x in x_m])
 
 
-def test_these_are_all():
+def test_all_built_in_vehicles_are_tested():
     assert list_builtin_names("vehicles") == sorted(SIZES_M)
 
 
 @pytest.mark.parametrize("name", SIZES_M)
-def test_a_vehicle_stands_on_the_ground_in_the_middle_of_its_box(name):
+def test_vehicles_stand_on_the_ground_and_are_centered(name):
     vertices = load(name).build_mesh().vertices_m
     length, width, height = SIZES_M[name]
     np.testing.assert_allclose(vertices.min(0), [-length / 2, -width / 2, 0], atol=1e-3)
@@ -101,7 +101,7 @@ def test_left_and_right_are_mirror_images(name):
 
 
 @pytest.mark.parametrize("name", WITH_WHEELS)
-def test_wheels_stand_on_the_ground_and_nothing_else_does(name):
+def test_only_wheels_touch_the_ground(name):
     for part in load(name).parts:
         lowest = min(mesh.vertices_m[:, 2].min() for mesh in part.build_meshes())
         if "wheels" in part.name:
@@ -111,14 +111,14 @@ def test_wheels_stand_on_the_ground_and_nothing_else_does(name):
 
 
 @pytest.mark.parametrize("name", AXLES_M)
-def test_the_cars_of_published_rigs_have_their_axles_where_the_rigs_have_them(name):
+def test_axles_of_published_vehicles_match_their_rigs(name):
     (wheels,) = [part for part in load(name).parts if part.name == "wheels"]
     front_m, rear_m = max(pose.x_m for pose in wheels.poses), min(pose.x_m for pose in wheels.poses)
     assert (-rear_m, front_m - rear_m) == pytest.approx(AXLES_M[name], abs=1e-9)
 
 
 @pytest.mark.parametrize("name", CARS)
-def test_a_car_has_a_hood_below_a_raked_windscreen_below_a_roof(name):
+def test_cars_have_hood_windscreen_and_roof(name):
     mesh = load(name).build_mesh()
     x = np.linspace(-0.98, 0.98, 197) * SIZES_M[name][0] / 2
     outline = profile(mesh, x)

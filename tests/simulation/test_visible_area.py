@@ -56,7 +56,7 @@ BANDS = ((-0.5, 0.5), (0.5, 2.0))
 
 
 @pytest.mark.parametrize(("made", "seed"), [(Scenario.load("courtyard"), 0), (Scenario.model_validate(URBAN), 4)])
-def test_both_see_the_same_area_at_the_same_places(made, seed, monkeypatch):
+def test_both_references_measure_the_same_visible_area(made, seed, monkeypatch):
     places = []
 
     def remembered(ego, shell_m, generator):

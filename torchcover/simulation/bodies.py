@@ -1,6 +1,5 @@
-"""Bodies: shapes at places, vehicles put together from them, and hints that one is in other units, or turned."""
+"""Bodies: shapes with poses, vehicles that consist of parts, and checks of both."""
 
-import re
 import warnings
 from functools import cached_property
 from pathlib import Path
@@ -12,6 +11,7 @@ from pydantic import Field, ValidationInfo, model_validator
 from torchcover.geometry import BoundingBox, build_transform
 from torchcover.geometry.arrays import Float64
 from torchcover.simulation import shapes
+from torchcover.simulation.body_size import warn_about_actor_size, warn_about_scenery_size
 from torchcover.simulation.documents import (
     BuiltInDocument,
     Document,
@@ -27,85 +27,35 @@ from torchcover.simulation.returns import Material, get_material_index
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.sound import check_mesh
 
-# No building, and no terrain within a sensor's range, is higher.
-TALLEST_SCENERY_M = 1000.0
-# The longest lorries of the EU (module combinations of 25.25 m) and buses; the longest tram or train unit.
-LONGEST_ON_ROADS_M = 25.25
-LONGEST_M = 100.0
-# Smaller robots exist with any proportions; no car is shorter.
-SHORTEST_CAR_M = 2.0
-SHORTEST_M = 0.2
-# A body that is higher than so many times its length and width is a mast, and no car on its nose.
-MAST_SLENDERNESS = 5.0
-# A vehicle that is moved down onto the ground by more than this is worth a warning; less is rounding in its file.
-LOWERED_M = 0.01
-
-# Words of a category that stand for what is longer than wide and high, and no longer than lorries. Of the others,
-# people are wider than long, and trams longer.
-ROAD_VEHICLES = {"ego", "car", "truck", "lorry", "bus", "van", "suv", "vehicle", "trailer", "taxi", "pickup"}
-ON_FOOT = {"pedestrian", "person", "adult", "child"}
-RAIL_VEHICLES = {"tram", "train", "rail", "railed"}
-
-TURN = (
-    "a vehicle's x axis points forward and z up: turn it in a vehicle document, as the shape of a part with `poses: "
-    "[{angles}]`"
-)
-# Axes of files: where the vehicle's front and top are, and the pose that turns them to x and z.
-WIDE = TURN.format(angles="{yaw_deg: -90}") + " if its y points forward, `{yaw_deg: 90}` if -y does"
-HIGH = (
-    TURN.format(angles="{yaw_deg: 90, roll_deg: 90}")
-    + " if its y points up and its z forward (glTF and GLB), `{roll_deg: 90}` if y points up and x forward"
-)
-UNITS = (
-    "a file in millimetres needs `meters_per_unit: 0.001` beside its `path`, one in centimetres 0.01, one in inches "
-    "0.0254"
-)
-
-
-def warn_about_actor_size(owner: str, mesh: Mesh, category: str) -> None:
-    """Warn if the ego or an actor is as large, as small or as wide as none is."""
-    words = set(re.split(r"[^a-z]+", category.lower()))
-    on_roads = bool(words & ROAD_VEHICLES) and not words & RAIL_VEHICLES
-    x, y, z = np.ptp(mesh.vertices_m, axis=0).tolist()
-    longest_m = max(x, y, z)
-    if longest_m > (LONGEST_ON_ROADS_M if on_roads else LONGEST_M):
-        _warn(owner, (x, y, z), f"far too large{' for a vehicle on a road' if on_roads else ''}; {UNITS}")
-    elif on_roads and longest_m < SHORTEST_M:
-        _warn(owner, (x, y, z), "too small for a vehicle: is its `meters_per_unit` that of its file?")
-    elif on_roads and longest_m > SHORTEST_CAR_M and max(y, z) > x and z < MAST_SLENDERNESS * max(x, y):
-        _warn(owner, (x, y, z), f"wider than long; {WIDE}" if y > z else f"higher than long; {HIGH}")
-
-
-def _warn(owner: str, size_m: tuple[float, float, float], what: str) -> None:
-    x, y, z = (f"{extent_m:,.0f}" if extent_m >= 1000 else f"{extent_m:.3g}" for extent_m in size_m)
-    warnings.warn(f"{owner}: its body is {x} x {y} x {z} m, {what}", stacklevel=4)
+# Smaller shifts of a vehicle are rounding in its file; larger ones are reported.
+MIN_REPORTED_SHIFT_M = 0.01
 
 
 class VehicleShape(Document):
-    """A vehicle from the folder of vehicles, or from a file.
+    """Body of a built-in vehicle or of a vehicle file.
 
     Args:
-        vehicle: Name of a built-in vehicle, or path of a YAML file; relative to the document that names it.
+        vehicle: Name of a built-in vehicle, or path of a YAML file, relative to the document that names it.
     """
 
     type: Literal["vehicle"]
     vehicle: NameOrFile
 
     def build_mesh(self) -> Mesh:
-        """All parts in one mesh, in the vehicle frame."""
-        return self._read.build_mesh()
+        """Build one mesh of all parts, in the vehicle frame."""
+        return self._vehicle.build_mesh()
 
     def build_placed_mesh(self) -> Mesh:
-        """All parts in one mesh, where the document of the vehicle places them."""
-        return self._read.build_placed_mesh()
+        """Build one mesh of all parts, in the frame of the vehicle document."""
+        return self._vehicle.build_placed_mesh()
 
     def collect_content(self) -> dict[str, Any]:
-        """Its parts, wherever they stand."""
-        return self._read.collect_content()
+        """Collect the content of the vehicle and of the files that it names."""
+        return self._vehicle.collect_content()
 
     @cached_property
-    def _read(self) -> "Vehicle":
-        """Once: every survey asks for its form several times."""
+    def _vehicle(self) -> "Vehicle":
+        """Vehicle document, read once."""
         return Vehicle.load(self.vehicle)
 
 
@@ -116,22 +66,30 @@ Shape = Annotated[
 
 
 def build_checked_mesh(shape: Shape, owner: str) -> Mesh:
-    """The form of a body, with warnings if a file has lies in it; see `told`."""
+    """Build the mesh of a shape, with warnings about defects of a mesh file.
+
+    Args:
+        shape: Shape.
+        owner: Name of the body in warnings.
+
+    Warns:
+        UserWarning: See `check_mesh`.
+    """
     return check_mesh(owner, shape.build_mesh()) if isinstance(shape, shapes.MeshFile) else shape.build_mesh()
 
 
 class Body(Document):
-    """A shape with a name, at one or more places.
+    """Named shape at one or more poses.
 
     Args:
-        name: What messages call it.
-        shape: Its form, in its own frame.
-        poses: Where its frame lies in that of the document; one copy for each.
-        material: What it is made of, a built-in material or the path of a YAML file. Not given: ground is `road`, other
-            scenery `brick`, and what moves or is a vehicle `car_paint`, or `clothing` if it walks.
-        ground: In a scenario: whether one drives or walks on it, so that heights are measured from its level faces. If
-            no body of a scenario is, the ground is what is level under the ego and connected with that by steps of at
-            most 0.3 m.
+        name: Name in messages.
+        shape: Shape, in its own frame.
+        poses: Poses of the shape in the frame of the document; one copy for each.
+        material: Built-in material or path of a YAML file. None: ground is `road`, other scenery `brick`, vehicles and
+            moving bodies `car_paint`, and pedestrians `clothing`.
+        ground: In a scenario: True for a body on which one drives or walks, so that heights are measured from its level
+            faces. If a scenario marks none, the ground is what is level under the ego vehicle and connected with that
+            by steps of at most 0.3 m.
     """
 
     name: str
@@ -150,20 +108,22 @@ class Body(Document):
         return self
 
     def collect_content(self) -> dict[str, Any]:
-        """Its keys; of a material from a file what stands there."""
-        own = self.material is not None and is_file_name(self.material)
-        return super().collect_content() | (
-            {"material": Material.load(str(self.material)).collect_content()} if own else {}
-        )
+        """Collect the keys of the body; a material file is replaced by its content."""
+        content = super().collect_content()
+        if self.material is not None and is_file_name(self.material):
+            content["material"] = Material.load(str(self.material)).collect_content()
+        return content
 
     def build_meshes(self) -> list[Mesh]:
-        """One mesh for each pose."""
+        """Build one mesh for each pose.
+
+        Warns:
+            UserWarning: The body is larger than any scenery, or a mesh file has defects.
+        """
         mesh = build_checked_mesh(self.shape, f"body {self.name!r}")
         if self.material is not None or self.ground:
             mesh = mesh.assign_material(self.material or "road")
-        x, y, z = np.ptp(mesh.vertices_m, axis=0).tolist()
-        if min(x, y, z) > TALLEST_SCENERY_M:  # of what may be a whole city
-            _warn(f"body {self.name!r}", (x, y, z), f"far too large; {UNITS}")
+        warn_about_scenery_size(f"body {self.name!r}", mesh)
         return [mesh.transform(pose.to_matrix()) for pose in self.poses]
 
 
@@ -171,14 +131,14 @@ RegionName = Annotated[str, Field(min_length=1)]
 
 
 class Vehicle(BuiltInDocument):
-    """The body of a vehicle, put together from parts.
+    """Body of a vehicle that consists of parts.
 
     Args:
-        name: What messages call it.
-        description: What it is.
-        extends: Another vehicle, by its name or file, whose parts and mount regions it has, too.
-        parts: Its parts, in one frame with x forward and z up: that of the vehicle that it extends.
-        mount_regions: By name, patches of its skin that sensors can be mounted on, in the vehicle frame.
+        name: Name in messages.
+        description: Vehicle and source of its dimensions.
+        extends: Another vehicle, by name or file, whose parts and mount regions are added.
+        parts: Parts in one frame with x forward and z up; the frame of the extended vehicle if there is one.
+        mount_regions: Areas of the body on which sensors can be mounted, by name, in the vehicle frame.
     """
 
     kind: ClassVar[str] = "a vehicle"
@@ -192,14 +152,16 @@ class Vehicle(BuiltInDocument):
 
     @model_validator(mode="before")
     @classmethod
-    def _add_parts_of_base(cls, content: Any, info: ValidationInfo) -> Any:  # noqa: ANN401  (whatever stood in the file)
+    def _add_parts_of_base(cls, content: Any, info: ValidationInfo) -> Any:  # noqa: ANN401  (raw content of a file)
         if not isinstance(content, dict) or not isinstance(content.get("extends"), str):
             return content
-        name = resolve_name_or_file(content["extends"], info)
-        further = read_mapping(find_document(cls.folder, name)).get("extends")
-        if further is not None:  # which may be a ring, too
-            raise ValueError(f"extends: {name} extends {further!r} itself; extend that one, and copy the other parts")
-        base = cls.load(name)
+        base_name = resolve_name_or_file(content["extends"], info)
+        base_of_base = read_mapping(find_document(cls.folder, base_name)).get("extends")
+        if base_of_base is not None:  # a chain may be endless
+            raise ValueError(
+                f"extends: {base_name} extends {base_of_base!r} itself; extend that one, and copy the other parts"
+            )
+        base = cls.load(base_name)
         parts, regions = content.get("parts", ()), content.get("mount_regions", {})
         if not isinstance(parts, list | tuple) or not isinstance(regions, dict):
             return content
@@ -209,67 +171,80 @@ class Vehicle(BuiltInDocument):
     def _check_parts(self) -> Self:
         for part in self.parts:
             if part.ground:
-                raise ValueError(f"part {part.name!r} is ground; only the bodies of a scenario can be, for they rest")
+                raise ValueError(
+                    f"part {part.name!r} is ground; only bodies of a scenario can be, since they do not move"
+                )
             if isinstance(part.shape, VehicleShape):
                 raise ValueError(
-                    f"part {part.name!r} is the vehicle {part.shape.vehicle!r}; a vehicle is put together from other "
-                    "shapes, or it would never end: copy that vehicle's parts"
+                    f"part {part.name!r} is the vehicle {part.shape.vehicle!r}, which may contain this one; copy that "
+                    "vehicle's parts"
                 )
         return self
 
     @model_validator(mode="after")
     def _check_origin(self) -> Self:
         if self.extends is not None:
-            base = Vehicle.load(self.extends).build_placed_mesh().vertices_m
-            shift_m = _middle_m(self.build_placed_mesh().vertices_m) - _middle_m(base)
-            if np.abs(shift_m).max() > LOWERED_M:
+            base_m = Vehicle.load(self.extends).build_placed_mesh().vertices_m
+            shift_m = _compute_center_m(self.build_placed_mesh().vertices_m) - _compute_center_m(base_m)
+            if np.abs(shift_m).max() > MIN_REPORTED_SHIFT_M:
                 warnings.warn(
-                    f"vehicle {self.name!r}: what it adds to {self.extends} moves the middle of its bounding box, from "
-                    f"which mounts are measured, by x {shift_m[0]:+.2f}, y {shift_m[1]:+.2f} m; subtract that from "
-                    f"mounts on {self.extends} to keep them at the same spot",
+                    f"vehicle {self.name!r}: its additions to {self.extends} shift the center of its bounding box, "
+                    f"from which mounts are measured, by x {shift_m[0]:+.2f}, y {shift_m[1]:+.2f} m; subtract "
+                    f"that from mounts on {self.extends} to keep them at the same spot",
                     stacklevel=2,
                 )
         return self
 
     def build_mesh(self) -> Mesh:
-        """All parts in one mesh, in the vehicle frame; painted, where they do not say their material."""
+        """Build one mesh of all parts in the vehicle frame; parts without a material are `car_paint`."""
         return move_to_vehicle_frame(self.build_placed_mesh())
 
     def build_placed_mesh(self) -> Mesh:
-        """All parts in one mesh, where the document places them."""
-        meshes = [mesh for part in self.parts for mesh in part.build_meshes()]
-        return merge_meshes(
-            [mesh.assign_material("car_paint") if mesh.material_indices is None else mesh for mesh in meshes]
-        )
+        """Build one mesh of all parts in the frame of the document; parts without a material are `car_paint`."""
+        meshes = []
+        for part in self.parts:
+            for mesh in part.build_meshes():
+                meshes.append(mesh.assign_material("car_paint") if mesh.material_indices is None else mesh)
+        return merge_meshes(meshes)
 
     def collect_content(self) -> dict[str, Any]:
-        """Its body; where sensors may be mounted on it means nothing to those that are."""
-        return {
-            key: value for key, value in super().collect_content().items() if key not in ("mount_regions", "extends")
-        }
+        """Collect the parts of the body; mount regions do not affect mounted sensors."""
+        content = super().collect_content()
+        return {key: value for key, value in content.items() if key not in ("mount_regions", "extends")}
 
 
 def get_mount_regions(shape: Shape | None) -> dict[str, MountRegion]:
-    """Where sensors can be mounted on a body: on a vehicle that says it."""
+    """Get the mount regions of a body by name; empty for shapes other than vehicles.
+
+    Args:
+        shape: Shape of the ego vehicle; None for the default.
+    """
     if not isinstance(shape, VehicleShape):
         return {}
     return Vehicle.load(shape.vehicle).mount_regions
 
 
 def describe_windows(shape: Shape | None) -> str:
-    """Say which materials of a body look transparent and stop rays, and how to let these pass; empty if none does."""
+    """Describe which materials of a mesh file look transparent but stop rays; empty if there are none.
+
+    Args:
+        shape: Shape of the ego vehicle; the mesh files of all its parts are checked.
+
+    Returns:
+        Finding and remedy for the first such mesh file.
+    """
     parts: tuple[Body, ...] = Vehicle.load(shape.vehicle).parts if isinstance(shape, VehicleShape) else ()
     for mesh in (shape, *(part.shape for part in parts)):
         if isinstance(mesh, shapes.MeshFile) and (names := mesh.list_transparent_materials()):
             return (
-                f"{mesh.path.name}: {', '.join(map(repr, names))} look transparent and stop rays; to let rays pass, "
-                f"give its shape `transparent: [{', '.join(names)}]` in a vehicle file"
+                f"{mesh.path.name}: {', '.join(repr(name) for name in names)} look transparent and stop rays; to let "
+                f"rays pass, give its shape `transparent: [{', '.join(names)}]` in a vehicle file"
             )
     return ""
 
 
-def _middle_m(vertices_m: Float64) -> Float64:
-    """(2,) middle of the bounding box, seen from above."""
+def _compute_center_m(vertices_m: Float64) -> Float64:
+    """Compute the (2,) center of the bounding box in bird's-eye view."""
     return np.asarray((vertices_m.min(axis=0) + vertices_m.max(axis=0))[:2] / 2)
 
 
@@ -277,8 +252,8 @@ def move_to_vehicle_frame(mesh: Mesh, *, keep_height: bool = False) -> Mesh:
     """Move a mesh so that the origin lies on the ground under the center of its bounding box.
 
     Args:
-        mesh: The mesh, in any frame.
-        keep_height: Whether a mesh above z = 0 stays so high above the ground. One that reaches below is lifted anyway.
+        mesh: Mesh in any frame with z up.
+        keep_height: True to keep a mesh above z = 0 at its height; a mesh that reaches below is lifted in any case.
     """
     box = BoundingBox.from_points(mesh.vertices_m)
     (x0, y0, z0), (x1, y1, _) = box.lower_m, box.upper_m
@@ -287,27 +262,39 @@ def move_to_vehicle_frame(mesh: Mesh, *, keep_height: bool = False) -> Mesh:
 
 
 def build_actor_mesh(name: str, shape: Shape, category: str = "ego", *, keep_height: bool = False) -> Mesh:
-    """The body of the ego or of an actor in its vehicle frame; a warning if it is too large, too small or turned.
+    """Build the body of the ego vehicle or of an actor in its vehicle frame.
 
-    `keep_height` is that of `move_to_vehicle_frame`.
+    Args:
+        name: Name in messages.
+        shape: Shape of the body.
+        category: Class name; pedestrians are `clothing`, all others `car_paint`, unless their material is given.
+        keep_height: See `move_to_vehicle_frame`.
+
+    Warns:
+        UserWarning: The body has an impossible size or proportions, or is moved down onto the ground.
     """
     mesh = shape.build_placed_mesh() if isinstance(shape, VehicleShape) else build_checked_mesh(shape, name)
     bottom_m = float(mesh.vertices_m[:, 2].min())
-    if isinstance(shape, VehicleShape) and category != "ego" and bottom_m > LOWERED_M and not keep_height:
+    is_lowered = category != "ego" and bottom_m > MIN_REPORTED_SHIFT_M and not keep_height
+    if isinstance(shape, VehicleShape) and is_lowered:
         warnings.warn(
-            f"{name}: all parts of {get_shape_name(shape)} are {bottom_m:.3g} m or more above z = 0, and it is put on the "
-            "ground; give it a part that stands on the ground, or the z_m of its lowest point in the pose",
+            f"{name}: all parts of {get_shape_name(shape)} are {bottom_m:.3g} m or more above z = 0, and it is moved "
+            "down onto the ground; give it a part that stands on the ground, or its lowest z_m in the pose",
             stacklevel=3,
         )
     mesh = move_to_vehicle_frame(mesh, keep_height=keep_height)
     if mesh.material_indices is None:
-        mesh = mesh.assign_material("clothing" if category in ON_FOOT else "car_paint")
+        is_pedestrian = category in ("pedestrian", "person", "adult", "child")
+        mesh = mesh.assign_material("clothing" if is_pedestrian else "car_paint")
     warn_about_actor_size(name, mesh, category)
     return mesh
 
 
 def get_shape_name(shape: Shape) -> str:
-    """What a picture or a table calls a body: the name of a built-in vehicle, the name of a file, or the kind of shape.
+    """Get the name of a body for tables: the name of a built-in vehicle, of a file, or the type of the shape.
+
+    Args:
+        shape: Shape.
 
     Example:
         >>> get_shape_name(VehicleShape(type="vehicle", vehicle="here/my_van.yaml"))
@@ -319,7 +306,10 @@ def get_shape_name(shape: Shape) -> str:
 
 
 def create_body_shape(name_or_path: str | Path) -> VehicleShape | shapes.MeshFile:
-    """The shape that a name or a path means: a vehicle's, unless it is a file that is no YAML.
+    """Create the shape of a built-in vehicle, a vehicle file (YAML), or a mesh file in meters.
+
+    Args:
+        name_or_path: Name of a built-in vehicle, or path.
 
     Example:
         >>> create_body_shape("suv").type, create_body_shape("robot.stl").type
@@ -332,13 +322,23 @@ def create_body_shape(name_or_path: str | Path) -> VehicleShape | shapes.MeshFil
 
 
 def merge_meshes(meshes: list[Mesh]) -> Mesh:
-    """One mesh with the vertices and faces of all."""
-    offsets = np.cumsum([0, *(len(mesh.vertices_m) for mesh in meshes[:-1])])
-    outward = [mesh.is_outward for mesh in meshes if mesh.is_outward is not None]
+    """Merge meshes into one.
+
+    Args:
+        meshes: At least one mesh.
+
+    Returns:
+        Mesh with the vertices, faces and materials of all. `is_outward` is known if all faces of all meshes are
+        outward, since closed outward surfaces that share edges form one closed outward surface.
+    """
+    first_vertices = np.cumsum([0, *(len(mesh.vertices_m) for mesh in meshes[:-1])])
+    outward_masks = [mesh.is_outward for mesh in meshes if mesh.is_outward is not None]
+    is_outward = None
+    if len(outward_masks) == len(meshes) and all(mask.all() for mask in outward_masks):
+        is_outward = np.concatenate(outward_masks)
     return Mesh(
         np.concatenate([mesh.vertices_m for mesh in meshes]),
-        np.concatenate([mesh.faces + offset for mesh, offset in zip(meshes, offsets, strict=True)]),
+        np.concatenate([mesh.faces + first for mesh, first in zip(meshes, first_vertices, strict=True)]),
         np.concatenate([mesh.filled_material_indices for mesh in meshes]),
-        # Those of surfaces that share edges, all of them closed and turned outwards, are one that is.
-        np.concatenate(outward) if len(outward) == len(meshes) and all(one.all() for one in outward) else None,
+        is_outward,
     )

@@ -121,7 +121,7 @@ def find_ground_faces(
     is_ground = np.isin(groups, groups[ground_surfaces])[surfaces]
     first_face = 0
     for mask in ground_masks:
-        num_level = np.count_nonzero(mask)
+        num_level = int(np.count_nonzero(mask))
         mask[mask] = is_ground[first_face : first_face + num_level]
         first_face += num_level
     return ground_masks
@@ -129,9 +129,9 @@ def find_ground_faces(
 
 def _find_surfaces_at(caster: RayCaster, positions_m: Float64, is_sheet: Bools, params: GroundFaceParams) -> Int64:
     """Find the surfaces on which positions stand; if none is near, surfaces far below, or else sheets above."""
-    near = _find_surfaces_near(caster, positions_m, params.max_height_m)
-    if (near >= 0).any():
-        return near[near >= 0]
+    surfaces = _find_surfaces_near(caster, positions_m, params.max_height_m)
+    if (surfaces >= 0).any():
+        return surfaces[surfaces >= 0]
     for z_sign in (-1.0, 1.0):
         limit_m = np.full(len(positions_m), np.inf, dtype=np.float32)
         directions = build_vertical_directions(len(positions_m), z_sign)

@@ -160,7 +160,7 @@ class GroundHeightPyramid(NamedTuple):
         columns, rows = np.floor((upper_m[:2] - corner_m) / cell_m + params.relative_rounding).astype(np.int64) + 1
         levels = [_rasterize_heights(meshes, corner_m, cell_m, int(columns), int(rows), params.relative_rounding)]
         while max(levels[-1].shape) > 2:
-            levels.append(_halve_resolution(levels[-1]))
+            levels.append(_merge_cells(levels[-1]))
         return cls(corner_m, cell_m, levels)
 
     def compute_ground_bounds_m(
@@ -249,12 +249,12 @@ def _rasterize_heights(
     highest_m = np.full(columns * rows, -np.inf)
     for _, corners_m in iterate_mesh_parts(meshes):
         lower_m, upper_m = corners_m.min(axis=0), corners_m.max(axis=0)
-        # All cells of the bounding box of a triangle count, so that none is overlooked.
+        # Every cell of the bounding box of a triangle counts, so that no cell is missed.
         first_cell = np.floor((lower_m[:2] - corner_m[:, None]) / cell_m + relative_rounding).astype(np.int64)
         last_cell = np.ceil((upper_m[:2] - corner_m[:, None]) / cell_m - relative_rounding).astype(np.int64) - 1
         last_cell = np.maximum(last_cell, first_cell)
         slopes, offsets_m = _fit_planes(corners_m - np.append(corner_m, 0.0)[None, :, None])
-        # Within a cell the height is that of the plane at the center of the cell, plus or minus this.
+        # Largest difference between the height of a plane within a cell and at the center of the cell.
         deviation_m = cell_m / 2 * np.abs(slopes).sum(axis=0)
         for triangle, column, row in _iterate_triangle_cells(first_cell, last_cell - first_cell + 1):
             x_slope, y_slope = slopes.take(triangle, axis=1) * cell_m
@@ -292,7 +292,7 @@ def _fit_planes(triangles_m: Float64) -> tuple[Float64, Float64]:
     return slopes, first[2] - (slopes * first[:2]).sum(axis=0)
 
 
-def _halve_resolution(grid: Float32) -> Float32:
+def _merge_cells(grid: Float32) -> Float32:
     """Merge 2 x 2 cells of (2, columns, rows) lowest and highest heights."""
     columns, rows = (side + side % 2 for side in grid.shape[1:])
     padded = np.empty((2, columns, rows), dtype=np.float32)

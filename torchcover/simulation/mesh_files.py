@@ -165,7 +165,7 @@ def _compute_doubled_area(a: Float64, b: Float64, c: Float64) -> Float64:
 
 
 class _MeshPart(NamedTuple):
-    """One mesh of a file: vertices in meters, (F, 3) faces, names of object and material, and transparency."""
+    """Mesh of a file: vertices in meters, (F, 3) faces, names of object and material, and transparency."""
 
     vertices: NDArray[np.float64]
     faces: NDArray[np.int64]
@@ -321,7 +321,7 @@ def _split_corners(line: bytes) -> list[bytes]:
 
 
 def _make_obj_indices_positive(lines: list[bytes]) -> None:
-    """Replace negative indices of OBJ faces, which count back from the last vertex so far, in place."""
+    """Replace negative indices of OBJ faces, which count back from the previous vertex, in place."""
     counts = {b"v": 0, b"vt": 0, b"vn": 0}
     for number, line in enumerate(lines):
         key, *words = line.partition(b"#")[0].split() or [b""]

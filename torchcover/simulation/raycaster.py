@@ -275,7 +275,7 @@ class RayCaster:
         origins = np.ndarray((num_rays, 3), np.float32, origin_m.astype(np.float32).tobytes(), strides=(0, 4))
         hits = self.cast_from_each(origins, directions, limit_m)
         if len(self.find_touched_bodies(origin_m)):
-            self._recast_rays_that_start_on_faces(origin_m, directions, limit_m, hits)
+            self._continue_rays_from_faces(origin_m, directions, limit_m, hits)
         return hits
 
     def cast_from_each(self, origins_m: Float32, directions: Float32, limit_m: Float32) -> Hits:
@@ -341,17 +341,17 @@ class RayCaster:
             self._last_touched = (position_m.tobytes(), touched)
         return touched
 
-    def _recast_rays_that_start_on_faces(
+    def _continue_rays_from_faces(
         self, origin_m: NDArray[np.floating], directions: Float32, limit_m: Float32, hits: Hits
     ) -> None:
         """Continue rays beyond a face on whose plane they start, which they hit by rounding only; changes `hits`."""
 
-        def starts_on_plane(faces: Int64) -> Bools:
+        def is_start_on_plane(faces: Int64) -> Bools:
             plane_distances_m = self._faces.compute_plane_distances_m(origin_m, faces)
             return np.asarray(plane_distances_m <= self._faces.compute_contact_distances_m(faces))
 
         rays, faces = np.flatnonzero(hits.body_indices >= 0), self._compute_face_indices(hits)
-        rays = rays[starts_on_plane(faces[rays])]
+        rays = rays[is_start_on_plane(faces[rays])]
         range_m, faces, travelled_m = hits.range_m[rays], faces[rays], np.zeros(len(rays))
         for attempt in range(1, 13):
             if len(rays) == 0:
@@ -367,8 +367,9 @@ class RayCaster:
             is_hit, range_m, faces = new_hits.body_indices >= 0, new_hits.range_m, self._compute_face_indices(new_hits)
             hits.range_m[rays] = np.where(is_hit, travelled_m + range_m, limit_m[rays])
             hits.body_indices[rays], hits.triangle_indices[rays] = new_hits.body_indices, new_hits.triangle_indices
-            again = is_hit & starts_on_plane(faces)
-            rays, travelled_m, range_m, faces = rays[again], travelled_m[again], range_m[again], faces[again]
+            is_blocked = is_hit & is_start_on_plane(faces)
+            rays, travelled_m = rays[is_blocked], travelled_m[is_blocked]
+            range_m, faces = range_m[is_blocked], faces[is_blocked]
 
     def find_enclosing_bodies(self, position_m: NDArray[np.floating]) -> Int64:
         """Find the bodies inside which a (3,) position lies; an open surface has no inside.

@@ -149,7 +149,7 @@ class SearchSpheres(NamedTuple):
         block_center = (tile.min_block_directions + tile.max_block_directions) / 2
         block_half_size = (tile.max_block_directions - tile.min_block_directions) / 2
         for chunk in np.array_split(in_cone, len(in_cone) * len(tile.block_rays) // pairs_per_chunk + 1):
-            # Compare chords between unit directions: those of a block are within half its diagonal of its center.
+            # Compare chords between unit directions: each direction of a block is within half its diagonal of its center.
             chord = 2 * np.sin(angle[chunk] / 2)[:, None] + np.linalg.norm(block_half_size, axis=0)
             squared_distance = 1 + (block_center**2).sum(axis=0) - 2 * towards[chunk] @ block_center
             is_touched = squared_distance <= chord**2 + params.angle_rounding_rad**2
@@ -396,7 +396,7 @@ def find_blocks_towards_boxes(
     """
     block_range_m = range_m.take(tile.block_rays).max(axis=1)
     normals = (outlines.normals @ vehicle_R_sensor).reshape(-1, 3)
-    # No direction within the bounds of a block has a smaller product with a normal.
+    # These are the smallest products of a normal with any direction within the bounds of a block.
     bounds = np.vstack([tile.min_block_directions, tile.max_block_directions]).astype(np.float32)
     split_normals = np.hstack([np.maximum(normals, 0.0), np.minimum(normals, 0.0)]).astype(np.float32)
     min_products = (split_normals @ bounds).reshape(len(outlines.normals), 4, bounds.shape[1])

@@ -75,7 +75,7 @@ class ActorDescription(Document):
         return Actor(name, category, self.build_mesh(name, category), self.load_trajectory())
 
     def load_trajectory(self) -> Trajectory:
-        """Load the trajectory; that of a body at rest has one pose."""
+        """Load the trajectory; a body at rest has one pose."""
         if self.trajectory is not None:
             return read_trajectory(self.trajectory)
         return Trajectory.from_poses([0.0], (self.pose or Pose()).to_matrix()[None])

@@ -79,7 +79,7 @@ class SceneGeometry:
 
     @property
     def _bodies(self) -> list[Actor]:
-        """All actors and the ego vehicle: static bodies, then moving bodies."""
+        """Ego vehicle and actors: static bodies, then moving bodies."""
         return self._static_actors + self._moving_actors
 
     def _build_scenery(self) -> list[Mesh]:

@@ -1,4 +1,4 @@
-"""A cache of scenes on disk, in torchcover/scenes of $XDG_CACHE_HOME or ~/.cache: one file of arrays and JSON each."""
+"""Disk cache of generated scenes, in torchcover/scenes of $XDG_CACHE_HOME or ~/.cache: one npz file per scene."""
 
 import hashlib
 import json
@@ -28,30 +28,43 @@ from torchcover.simulation.sumo.simulating import find_sumo_home
 from torchcover.simulation.traffic.fleet import load_bodies
 from torchcover.simulation.world import Actor, Scene
 
-OWN_NAME = re.compile(r"[0-9a-f]{64}\.(npz|[0-9a-f]{32})")  # scenes, and temporary files of them; all others stay
-KINDS: dict[str, Any] = {kind.__name__: kind for kind in (Scene, Actor, Trajectory, Mesh)}
+# Types in the JSON of a cached scene, by name.
+ENCODED_TYPES: dict[str, Any] = {encoded.__name__: encoded for encoded in (Scene, Actor, Trajectory, Mesh)}
 
 
 class SceneCache:
-    """The scenes of a scenario; those that are built are kept, up to TORCHCOVER_CACHE_GB (1), the oldest go first."""
+    """Cache of the scenes of a scenario with generated traffic.
+
+    New scenes are written until the cache has TORCHCOVER_CACHE_GB (1 by default); then the oldest are deleted.
+
+    Args:
+        scenario: Scenario.
+        seed: Seed of the traffic.
+        no_cache: True to neither read nor write files.
+    """
 
     def __init__(self, scenario: Scenario, seed: int, *, no_cache: bool = False) -> None:
         self._scenario, self._seed = scenario, seed
-        # The code of other packages may change unnoticed.
-        is_known = not scenario.is_repeating and type(scenario.traffic).__module__.startswith("torchcover.")
-        self._limit_bytes = 1e9 * read_limit_gb("TORCHCOVER_CACHE_GB", 1.0) if is_known and not no_cache else 0.0
+        # Traffic of other packages is not cached, since its code is not part of the hash.
+        is_cacheable = not scenario.is_repeating and type(scenario.traffic).__module__.startswith("torchcover.")
+        self._limit_bytes = 1e9 * read_limit_gb("TORCHCOVER_CACHE_GB", 1.0) if is_cacheable and not no_cache else 0.0
         self._folder = _open_folder() if self._limit_bytes else None
 
     def build(self, run_index: int, ego_mesh: Mesh | None) -> Scene:
-        """Return the scene of a run, as `Scenario.world` builds it, to the bit; one of traffic is cached."""
+        """Build the scene of a run, or read it from the cache; both are equal to the last bit.
+
+        Args:
+            run_index: Index of the run through the scenario, see `Scenario.build_scene`.
+            ego_mesh: Mesh of the ego vehicle that scenes share; None for a scenario without traffic.
+        """
         if self._folder is None or ego_mesh is None:
             return self._scenario.build_scene(self._seed, run_index, ego_mesh)
         key = hashlib.sha256(f"{_hash_sources(self._scenario)} {self._seed} {run_index}".encode()).hexdigest()
         path, bodies = self._folder / f"{key}.npz", {**load_bodies(), "ego": ego_mesh}
         try:
-            if _stat_own(path):
+            if _get_status_of_own_file(path):
                 scene = read_scene(path, bodies)
-                with suppress(OSError):  # it may be read-only
+                with suppress(OSError):  # the file may be read-only
                     os.utime(path)
                 return scene
         except (BadFileError, FileNotFoundError) as error:
@@ -61,45 +74,51 @@ class SceneCache:
             scene = self._scenario.build_scene(self._seed, run_index, ego_mesh)
         for warning in raised:
             warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
-        if not any(issubclass(warning.category, UserWarning) for warning in raised):  # which a reader would not get
+        # A scene with warnings is not cached, since a reader would not see them.
+        if not any(issubclass(warning.category, UserWarning) for warning in raised):
             self._write(path, encode_scene(key, scene, bodies))
         return scene
 
     def _write(self, path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-        """Write a scene; before it, delete the oldest until there is room."""
-        temporary, room_bytes = (
-            path.with_suffix(f".{uuid4().hex}"),
-            self._limit_bytes - sum(array.nbytes for array in arrays.values()),
-        )
+        """Write a scene after deleting the oldest files until there is room; warn and stop caching on errors."""
+        room_bytes = self._limit_bytes - sum(array.nbytes for array in arrays.values())
         if room_bytes < 0:
             return
+        temporary_path = path.with_suffix(f".{uuid4().hex}")
         try:
-            files = [(status, place) for place in path.parent.iterdir() if (status := _stat_own(place))]
-            for status, place in sorted(files, key=lambda file: -file[0].st_mtime_ns):
+            files = []
+            for file_path in path.parent.iterdir():
+                if status := _get_status_of_own_file(file_path):
+                    files.append((status, file_path))
+            for status, file_path in sorted(files, key=lambda file: -file[0].st_mtime_ns):
                 room_bytes -= status.st_size
                 if room_bytes < 0:
-                    place.unlink(missing_ok=True)
-            with temporary.open("xb") as file:
-                np.savez(file, **arrays)  # type: ignore[arg-type]  # of no other keyword
-            os.replace(temporary, path)
+                    file_path.unlink(missing_ok=True)
+            with temporary_path.open("xb") as file:
+                np.savez(file, **arrays)  # type: ignore[arg-type]  # keys are never other keywords
+            os.replace(temporary_path, path)
         except OSError as error:
             with suppress(OSError):
-                temporary.unlink()
+                temporary_path.unlink()
             self._folder = None
-            _warn_without(OSError(error.errno, error.strerror, str(path.parent)))
+            _warn_about_missing_cache(OSError(error.errno, error.strerror, str(path.parent)))
 
 
-def _stat_own(path: Path) -> os.stat_result | None:
-    """Return the status of a file of this cache: by its name, regular, of this user, without other names; else None."""
+def _get_status_of_own_file(path: Path) -> os.stat_result | None:
+    """Get the status of a file of this cache: by name a scene or a temporary file of one, regular, without hard links.
+
+    Returns:
+        None for all other files, which are neither read nor deleted.
+    """
     with suppress(OSError):
         status = path.lstat()
         is_own = S_ISREG(status.st_mode) and status.st_uid == os.getuid() and status.st_nlink == 1
-        return status if is_own and OWN_NAME.fullmatch(path.name) else None
+        return status if is_own and re.fullmatch(r"[0-9a-f]{64}\.(npz|[0-9a-f]{32})", path.name) else None
     return None
 
 
 def _open_folder() -> Path | None:
-    """Return the folder of scenes; None, with a warning, if it is a link, or others may write to it."""
+    """Create the cache folder; None, with a warning, if it is a link, or other users can write to it."""
     base = os.environ.get("XDG_CACHE_HOME", "")
     try:
         folder = Path(base if os.path.isabs(base) else Path.home() / ".cache", "torchcover", "scenes")
@@ -109,28 +128,36 @@ def _open_folder() -> Path | None:
                 raise OSError(f"{folder}: it is a link, or others may write to it")
         if not os.access(folder, os.W_OK):
             raise OSError(f"{folder}: it may not be written to")
-    except (OSError, RuntimeError) as error:  # RuntimeError: there is no home
-        _warn_without(error)
+    except (OSError, RuntimeError) as error:  # RuntimeError: the user has no home folder
+        _warn_about_missing_cache(error)
         return None
     return folder
 
 
-def _warn_without(error: Exception) -> None:
+def _warn_about_missing_cache(error: Exception) -> None:
     remedy = "--set no_cache=true, or TORCHCOVER_CACHE_GB=0, asks for none"
     warnings.warn(f"scenes are not cached ({error}); {remedy}", stacklevel=3)
 
 
 def _hash_sources(scenario: Scenario) -> str:
-    """Hash what scenes follow from but seed and run: traffic and ego, code, libraries; no sensors, weather or names."""
+    """Hash everything that determines scenes except seed and run: traffic, ego vehicle, code, and libraries.
+
+    Sensors, weather and names of the scenario do not affect scenes.
+    """
     assert scenario.traffic is not None
-    sources: list[object] = [__version__, _hash_code(), np.__version__, np.show_config(mode="dicts")["SIMD Extensions"]]
-    sources += [shapely.__version__, shapely.geos_version_string, list_builtin_names("materials")]
-    sources += [
+    sources: list[object] = [
+        __version__,
+        _hash_code(),
+        np.__version__,
+        np.show_config(mode="dicts")["SIMD Extensions"],
+        shapely.__version__,
+        shapely.geos_version_string,
+        list_builtin_names("materials"),
         hash_builtin_documents("road_users"),
         type(scenario.traffic).__name__,
         scenario.traffic.collect_content(),
+        (scenario.ego or ActorDescription()).collect_content(),
     ]
-    sources.append((scenario.ego or ActorDescription()).collect_content())
     with suppress(ImportError, OSError):  # SUMO is not installed
         sources.append((find_sumo_home() / "bin" / "sumo").stat().st_mtime_ns)
     return hashlib.sha256(json.dumps(sources, sort_keys=True, default=repr).encode()).hexdigest()
@@ -138,28 +165,40 @@ def _hash_sources(scenario: Scenario) -> str:
 
 @cache
 def _hash_code() -> str:
+    """Hash the code that builds scenes."""
     package, digest = Path(__file__).parents[1], hashlib.sha256()
-    for path in sorted(path for room in ("files", "geometry", "simulation") for path in (package / room).rglob("*.py")):
+    paths: list[Path] = []
+    for folder in ("files", "geometry", "simulation"):
+        paths += (package / folder).rglob("*.py")
+    for path in sorted(paths):
         digest.update(f"{path.relative_to(package)} {path.stat().st_size} ".encode() + path.read_bytes())
     return digest.hexdigest()
 
 
 def encode_scene(key: str, scene: Scene, bodies: Mapping[str, Mesh]) -> dict[str, NDArray[Any]]:
-    """Return a scene as arrays by number, and `scene`: the JSON of its key and of itself, in bytes.
+    """Encode a scene as arrays; repeated arrays are stored once.
 
-    An array that is there several times is written once; of `bodies`, which scenes share, the names only.
+    Args:
+        key: Key of the scene, the stem of its file name.
+        scene: Scene.
+        bodies: Meshes that scenes share, by name; only the names are stored.
+
+    Returns:
+        Arrays by number, and `scene`: JSON of the key and the scene as (bytes,) uint8.
     """
-    names, arrays, number_of = {id(mesh): name for name, mesh in bodies.items()}, dict[str, Any](), dict[object, str]()
+    body_names = {id(mesh): name for name, mesh in bodies.items()}
+    arrays: dict[str, Any] = {}
+    array_numbers: dict[object, str] = {}
 
     def encode(value: Any) -> Any:  # noqa: ANN401
         if isinstance(value, np.ndarray):
             memory = value.__array_interface__["data"], value.shape, value.strides, value.dtype.str
-            number = number_of.setdefault(memory, str(len(number_of)))
+            number = array_numbers.setdefault(memory, str(len(array_numbers)))
             arrays[number] = value
             return {"array": number}
-        if id(value) in names:
-            return {"body": names[id(value)]}
-        if type(value).__name__ in KINDS:
+        if id(value) in body_names:
+            return {"body": body_names[id(value)]}
+        if type(value).__name__ in ENCODED_TYPES:
             items = value if isinstance(value, Mesh) else [getattr(value, field.name) for field in fields(value)]
             return {type(value).__name__: [encode(item) for item in items]}
         return [encode(item) for item in value] if isinstance(value, tuple) else value
@@ -170,22 +209,32 @@ def encode_scene(key: str, scene: Scene, bodies: Mapping[str, Mesh]) -> dict[str
 
 @guard_reader("a scene")
 def read_scene(path: Path, bodies: Mapping[str, Mesh]) -> Scene:
-    """Read a scene, whose key is the stem of the path, without running code of it; its arrays are read-only."""
-    arrays, meshes = read_npz(path, partial(check_dtype_kind, "biuf")), dict[str, Mesh]()
+    """Read a scene without executing code of the file; its arrays are read-only.
+
+    Args:
+        path: File whose stem is the key of the scene.
+        bodies: Meshes that scenes share, by name.
+
+    Raises:
+        BadFileError: The file is damaged, or has another scene.
+        FileNotFoundError: There is no such file.
+    """
+    arrays = read_npz(path, partial(check_dtype_kind, "biuf"))
     for array in arrays.values():
         array.flags.writeable = False
-    key, scene = parse_json(arrays["scene"].tobytes().decode())
+    key, encoded_scene = parse_json(arrays["scene"].tobytes().decode())
     if key != path.stem:
         raise ValueError("it holds another scene")
+    meshes: dict[str, Mesh] = {}
 
     def decode(value: Any) -> Any:  # noqa: ANN401
         if not isinstance(value, dict):
-            return tuple(map(decode, value)) if isinstance(value, list) else value
+            return tuple(decode(item) for item in value) if isinstance(value, list) else value
         ((kind, items),) = value.items()
         if kind in ("array", "body"):
             return arrays[items] if kind == "array" else bodies[items]
-        part = KINDS[kind](*map(decode, items))
-        return meshes.setdefault(str(items), part) if kind == "Mesh" else part  # actors share meshes
+        decoded = ENCODED_TYPES[kind](*[decode(item) for item in items])
+        return meshes.setdefault(str(items), decoded) if kind == "Mesh" else decoded  # actors share meshes
 
-    world: Scene = decode(scene)
-    return world
+    scene: Scene = decode(encoded_scene)
+    return scene

@@ -160,7 +160,7 @@ class MountedSensor:
             return self._static_scan
         max_selected_share = 0.9  # with more rays than this, the selection does not pay off
         tiles, ego_hit_range_m, is_cast = self.tiles, self.ego_hit_range_m, None
-        # A ray that is cast at another time than that of the frame starts elsewhere.
+        # A ray that is not cast at the time of the frame starts at another position.
         can_omit_rays = bool(ego_hit_range_m) and self._ray_times is None and not self._is_static
         if search_spheres is not None and can_omit_rays:
             masks = self._select_rays(search_spheres)

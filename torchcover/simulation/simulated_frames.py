@@ -17,7 +17,7 @@ from torchcover.detection.boxes import Boxes
 from torchcover.detection.inside import add_point_counts
 from torchcover.frames.frame import Frame, Measurement
 from torchcover.frames.source import FrameDataset
-from torchcover.geometry.arrays import Float32, Float64, Int64
+from torchcover.geometry.arrays import Float64
 from torchcover.simulation.instant import SensorScan
 from torchcover.simulation.kinds import REFERENCE_SENSORS
 from torchcover.simulation.reference_sensor import PaperReference, ReferenceSensor
@@ -31,8 +31,6 @@ from torchcover.simulation.simulator import Observation, Simulator
 from torchcover.simulation.surface_reference import SurfaceReference
 
 DEFAULT_REFERENCE = "surface"
-# Larger numbers of frames would take years.
-MAX_STEPS = 1_000_000_000
 
 
 class SimulatedFrames(FrameDataset):
@@ -61,10 +59,8 @@ class SimulatedFrames(FrameDataset):
             each rig and of the reference on it. Names of objects are unique within a run of the scenario.
         vehicle: Vehicle that carries the rigs: built-in name, YAML file, or mesh file. None for the ego vehicle of the
             scenario, else the vehicle that the rigs name, else an SUV.
-        max_cached_bytes: See `Simulator`.
+        max_cached_bytes, no_cache, device: See `Simulator`.
         search_radius_m: See `Simulator`: clouds then contain hardly more than the points close to the reference.
-        no_cache: See `Simulator`.
-        device: See `Simulator`.
 
     Raises:
         FileNotFoundError: An unknown name or file.
@@ -95,8 +91,9 @@ class SimulatedFrames(FrameDataset):
         no_cache: bool = False,
         device: str | None = None,
     ) -> None:
-        if not 1 <= num_frames <= MAX_STEPS:
-            raise ValueError(f"num_frames: a number from 1 to {MAX_STEPS:,} is needed; got {num_frames}")
+        max_frames = 1_000_000_000  # more would take years
+        if not 1 <= num_frames <= max_frames:
+            raise ValueError(f"num_frames: a number from 1 to {max_frames:,} is needed; got {num_frames}")
         rigs_by_name = _load_rigs(rig, rigs)
         scenario = scenario if isinstance(scenario, Scenario) else Scenario.load(scenario)
         scenario = set_ego(scenario, rigs_by_name, vehicle)
@@ -246,10 +243,10 @@ class SimulatedFrames(FrameDataset):
         Raises:
             ValueError: The sensor cannot be used for a roadside rig.
         """
-        other = copy.copy(self)
-        fitted = _fit_to_rigs(reference_sensor, self.rigs, self.scenario)
-        other.simulator = self.simulator.replace_reference_sensor(fitted)
-        return other
+        fitted_sensor = _fit_to_rigs(reference_sensor, self.rigs, self.scenario)
+        frames = copy.copy(self)
+        frames.simulator = self.simulator.replace_reference_sensor(fitted_sensor)
+        return frames
 
     def __len__(self) -> int:
         return self.num_frames
@@ -275,21 +272,21 @@ class SimulatedFrames(FrameDataset):
             counts=observation.counts,
             block_index=self.simulator.get_block_index(index),
         )
-        return (
-            add_boxes(frame, self._boxes(index, observation.sampled_point_counts), self.rigs) if self.boxes else frame
-        )
+        return add_boxes(frame, self._build_boxes(index, observation), self.rigs) if self.boxes else frame
 
-    def _boxes(self, index: int, drawn: Int64 | None) -> Boxes:
-        found = self.simulator.compute_labels(index)
-        rows = [[*label.center_m, *label.size_m, label.yaw_rad] for label in found]
-        velocities = np.array([label.velocity_mps for label in found])
+    def _build_boxes(self, index: int, observation: Observation) -> Boxes:
+        """Build the boxes of all objects in range of the reference sensor."""
+        labels = self.simulator.compute_labels(index)
+        rows = [[*label.center_m, *label.size_m, label.yaw_rad] for label in labels]
+        velocities = np.array([label.velocity_mps for label in labels])
+        counts, object_indices = observation.sampled_point_counts, [label.object_index for label in labels]
         return Boxes.from_rows(
             torch.tensor(rows, dtype=torch.float32, device="cpu").view(-1, 7),
             velocity_mps=torch.tensor(velocities, dtype=torch.float32, device="cpu").view(-1, 2),
-            ids=tuple(label.name for label in found),
-            categories=tuple(label.category for label in found),
-            sampled_points=None if drawn is None else torch.from_numpy(drawn[[label.object_index for label in found]]),
-            bottom_heights_m=torch.from_numpy(self.simulator.compute_bottom_heights_m(index, found)),
+            ids=tuple(label.name for label in labels),
+            categories=tuple(label.category for label in labels),
+            sampled_points=None if counts is None else torch.from_numpy(counts[object_indices]),
+            bottom_heights_m=torch.from_numpy(self.simulator.compute_bottom_heights_m(index, labels)),
         )
 
 
@@ -299,8 +296,8 @@ def _fit_to_rigs(sensor: ReferenceSensor, rigs: Mapping[str, Rig], scenario: Sce
         return sensor
     if isinstance(sensor, PaperReference):
         raise ValueError(
-            "reference paper: it looks from the mast of this roadside rig, so that what is hidden from both is in no "
-            "number; use the reference surface, which looks from anywhere in the regions then"
+            "reference paper: its positions are close to the mast of this roadside rig, so that common blind spots "
+            "are in no number; use the reference surface, whose positions are then anywhere in the regions"
         )
     return sensor.extend_to_areas() if isinstance(sensor, SurfaceReference) else sensor
 
@@ -320,13 +317,13 @@ def build_rig_fields(rigs: Mapping[str, Rig], scans: Mapping[str, Sequence[Senso
         sensor_names = [sensor.name for sensor in rigs[name].sensors]
         point_counts[name] = dict(zip(sensor_names, [len(scan.points) for scan in rig_scans], strict=True))
         if any(scan.measured_points is not None for scan in rig_scans):
-            measured_points = [
-                scan.points if scan.measured_points is None else scan.measured_points for scan in rig_scans
-            ]
-            errors_m = [_get_range_errors_m(scan) for scan in rig_scans]
-            measurements[name] = Measurement(
-                torch.from_numpy(np.concatenate(measured_points)), torch.from_numpy(np.concatenate(errors_m))
-            )
+            points, errors_m = [], []
+            for scan in rig_scans:
+                no_errors_m = np.zeros(len(scan.points), dtype=np.float32)
+                points.append(scan.points if scan.measured_points is None else scan.measured_points)
+                errors_m.append(no_errors_m if scan.range_error_m is None else scan.range_error_m)
+            measured_points = torch.from_numpy(np.concatenate(points))
+            measurements[name] = Measurement(measured_points, torch.from_numpy(np.concatenate(errors_m)))
     return {"clouds": clouds, "measurements": measurements, "sensor_point_counts": point_counts}
 
 
@@ -347,10 +344,6 @@ def add_boxes(frame: Frame, boxes: Boxes, rigs: Mapping[str, Rig]) -> Frame:
             num_points = torch.tensor([len(cloud) for cloud in sensor_clouds], device="cpu")
             multiplicities[name] = pixels_per_sample.repeat_interleave(num_points)
     return replace(frame, boxes=add_point_counts(boxes, clouds, multiplicities))
-
-
-def _get_range_errors_m(scan: SensorScan) -> Float32:
-    return np.zeros(len(scan.points), dtype=np.float32) if scan.range_error_m is None else scan.range_error_m
 
 
 def create_reference_sensor(
@@ -374,7 +367,7 @@ def create_reference_sensor(
     """
     kind = REFERENCE_SENSORS.get(DEFAULT_REFERENCE if name is None else name)
     if kind is None:
-        raise ValueError(f"reference {name}: {' or '.join(f'`{known}`' for known in REFERENCE_SENSORS)} is needed")
+        raise ValueError(f"reference {name}: {' or '.join(f'`{key}`' for key in REFERENCE_SENSORS)} is needed")
     return kind.from_query_plan(query_plan or RegionsOfInterest().build_query_plan(), num_rays)
 
 
@@ -395,13 +388,13 @@ def create_object_reference(query_plan: QueryPlan | None = None) -> SurfaceRefer
 
 
 def _load_rigs(rig: Rig | str | Path | None, rigs: Mapping[str, Rig | str | Path] | None) -> dict[str, Rig]:
+    """Load one rig or several rigs by name."""
     if (rig is None) == (rigs is None):
-        raise ValueError("give one rig, or several as rigs={name: rig}")
+        raise ValueError("one rig is needed, or several as rigs={name: rig}")
     if rig is not None:
-        loaded = _load_rig(rig)
-        return {loaded.name: loaded}
-    return {name: _load_rig(rig_or_name) for name, rig_or_name in (rigs or {}).items()}
-
-
-def _load_rig(rig: Rig | str | Path) -> Rig:
-    return rig if isinstance(rig, Rig) else Rig.load(rig)
+        rig = rig if isinstance(rig, Rig) else Rig.load(rig)
+        return {rig.name: rig}
+    rigs_by_name: dict[str, Rig] = {}
+    for name, rig_or_path in (rigs or {}).items():
+        rigs_by_name[name] = rig_or_path if isinstance(rig_or_path, Rig) else Rig.load(rig_or_path)
+    return rigs_by_name

@@ -143,7 +143,7 @@ class SceneStore:
         if run_index in self._scenes:
             geometry = self._scenes.pop(run_index)
         else:
-            self._free_memory()
+            self._release_scenes()
             if self._ego_mesh is None and self.scenario.traffic is not None:
                 self._ego_mesh = self.scenario.build_ego_mesh()
             scene = self._disk_cache.build(run_index, self._ego_mesh)
@@ -151,7 +151,7 @@ class SceneStore:
         self._scenes[run_index] = geometry
         return geometry
 
-    def _free_memory(self) -> None:
+    def _release_scenes(self) -> None:
         """Drop scenes until another one of the largest size fits."""
         max_bytes = self._max_cached_bytes
         if max_bytes is None:
