@@ -1,4 +1,4 @@
-"""What the tests of the simulation share."""
+"""Shared fixtures of the simulation tests."""
 
 import numpy as np
 import pytest
@@ -6,12 +6,12 @@ import pytest
 
 @pytest.fixture
 def at(monkeypatch):
-    """Let every place be this one."""
+    """Fix the reference position."""
 
-    def put(place_m):
+    def put(position_m):
         monkeypatch.setattr(
             "torchcover.simulation.surface_reference.sample_position_in_shell",
-            lambda *_: np.array(place_m, dtype=np.float64),
+            lambda *_: np.array(position_m, dtype=np.float64),
         )
 
     return put

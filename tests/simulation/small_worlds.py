@@ -1,4 +1,4 @@
-"""Small worlds, and the square metres of them that a surface reference sees."""
+"""Small scenarios, and the area in m² that a surface reference observes in them."""
 
 import math
 
@@ -21,14 +21,14 @@ def scenario(*bodies, ego=EGO, **keys):
 
 
 def sums(made, sensor, value=lambda points: np.ones(len(points)), steps=40, first=0):
-    """(steps,) sum over the points of weight times a value of them."""
+    """Sum area weight times a value over the reference points of each frame; (steps,)."""
     simulator = Simulator(made, {}, sensor)
     seen = [simulator.simulate_frame(index) for index in range(first, first + steps)]
     return np.array([(step.reference_weights.astype(np.float64) * value(step.reference)).sum() for step in seen])
 
 
 def agrees(samples, exact, within=0.02):
-    """The mean is the exact value within 4 standard errors, and these are small."""
+    """Assert that the mean is exact within 4 standard errors, and that these are small."""
     error = samples.std(ddof=1) / math.sqrt(len(samples))
     assert error <= within * abs(exact)
     assert abs(samples.mean() - exact) <= 4 * error + 1e-5 * abs(exact), (samples.mean(), exact, error)

@@ -1,4 +1,4 @@
-"""The published rigs carry the numbers of their sources, in the vehicle frame."""
+"""Built-in rigs have the numbers of their sources, in the vehicle frame."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ from torchcover.simulation.bodies import Vehicle
 
 RIGS = list_builtin_names("rigs")
 
-# Centre of the box in the frame of the source: metres before the rear axle, height of the source's origin.
+# Center of the box in the frame of the source: meters ahead of the rear axle, height of the source's origin.
 NUSCENES, KITTI, WAYMO, ARGOVERSE, EDGAR = (1.385, 0.0), (1.337, 0.0), (1.461, 0.0), (1.339, 0.30), (1.5915, 0.338)
 
 # Rig, sensor, frame, position as published (rear axle; x forward, y left, z up).
@@ -75,7 +75,7 @@ CARLA = {
     "place3d2024_optimised_detection": ((0.5, -0.4, 0, -0.1), (0.5, 0.1, 0, -0.5), (2.5, 2.6, 2.8, 2.7)),
     "place3d2024_optimised_segmentation": ((0, 0.6, 0.4, 0.1), (0.5, 0.3, 0, -0.6), (2.6, 2.8, 2.5, 2.8)),
 }
-# Roll in radians in CARLA, where a positive one lowers the right side, as here.
+# Roll in radians in CARLA; a positive roll lowers the right side, as in this package.
 ROLLS = {
     "hu2022_line_roll": (-0.28, 0, 0, 0.28),
     "hu2022_pyramid_roll": (-0.28, 0, 0, 0.28),
@@ -85,7 +85,7 @@ ROLLS = {
     "place3d2024_optimised_detection": (-0.3, -0.2, 0, 0),
     "place3d2024_optimised_segmentation": (-0.3, 0, 0, 0.2),
 }
-# Placements whose rolls are in another rig in degrees.
+# Placements with a second rig that reads the rolls as degrees.
 IN_DEGREES = [name for name in ROLLS if name.startswith("place3d2024")]
 
 
@@ -95,7 +95,7 @@ def mounted(rig, sensor):
 
 
 def looks(matrix, direction=(1.0, 0.0, 0.0)):
-    """Azimuth and elevation in degrees of a direction in the sensor's frame, in the vehicle frame."""
+    """Convert a direction of the sensor frame to azimuth and elevation in degrees in the vehicle frame."""
     x, y, z = matrix[:3, :3] @ direction
     return np.rad2deg(np.arctan2(y, x)), np.rad2deg(np.arcsin(z))
 
@@ -181,7 +181,7 @@ def test_the_pitched_placement_looks_down():
         ("waymo", "side_left", 88.8, 0.0),
         ("waymo", "side_right", -92.2, 0.0),
         ("waymo", "rear", 178.4, 0.0),
-        # The source turns the sensor's z axis out: 90 degrees less 1.369065 rad, and 1.7552732 rad less 90 degrees.
+        # The source turns the sensor's z axis outwards: 90 degrees less 1.369065 rad, and 1.7552732 rad less 90 degrees.
         ("edgar", "innovusion_front", 0.0, -11.558),
         ("edgar", "innovusion_rear", 180.0, -10.570),
     ],
@@ -266,7 +266,7 @@ def test_roof_rigs_differ_only_in_their_rows():
 
 @pytest.mark.parametrize("rig", sorted(set(RIGS) - {"front_grille_128"}))
 def test_rays_reach_the_ground_in_front(rig):
-    """A gross error of a mount, such as a roll of 180 degrees, leaves no ray for the road ahead."""
+    """With a gross error of a mount, such as a roll of 180 degrees, no ray hits the road ahead."""
     reached = 0
     for sensor in Rig.load(rig).sensors:
         matrix, directions = sensor.mount.to_matrix(), sensor.compute_directions().reshape(3, -1)

@@ -1,4 +1,4 @@
-"""A camera in a scene: its depth image and its cloud are two views of the same hits."""
+"""Cameras in a scene: depth image and cloud describe the same hits."""
 
 import numpy as np
 import pytest
@@ -44,7 +44,7 @@ def test_unprojected_depth_images_equal_the_hits(lens):
     cloud = model.to_vehicle(model.unproject(torch.from_numpy(image), depth_kind="distance")).numpy()
     tiles = split_into_tiles(sensor.compute_directions())
     scan = instant.scan(vehicle_T_mount, tiles, max_range_m=60.0)
-    # The image shows the ego's hood, the scan leaves it out.
+    # The image shows the hood of the ego vehicle, the scan excludes it.
     assert len(cloud) == len(scan.points) + scan.self_hits
     in_order = lambda points: points[np.lexsort(points.round(2).T)]  # noqa: E731
     x, y, z = cloud.T
@@ -56,13 +56,13 @@ def test_unprojected_depth_images_equal_the_hits(lens):
 
 
 def test_outermost_pixels_define_the_field_of_view():
-    # 100 degrees to the edges of the outermost pixels; their centres lie half a pixel inside.
+    # 100 degrees to the edges of the outermost pixels; their centers lie half a pixel inside.
     expected = 2 * np.rad2deg(np.arctan(np.tan(np.deg2rad(50)) * 159 / 160))
     assert camera(mount={}).horizontal_fov_deg == pytest.approx(expected, abs=0.02)
 
 
 def test_pixels_without_a_ray_are_not_counted():
-    # A fold within the image: beyond it there is nothing.
+    # The distortion cannot be inverted beyond a circle within the image.
     folded = camera("brown_conrady", coefficients=[-0.35, 0.0, 0.0, 0.0])
     missing = int(np.isnan(folded.compute_directions()[0]).sum())
     assert 0 < missing < 160 * 120

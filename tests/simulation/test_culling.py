@@ -1,4 +1,4 @@
-"""Nothing that could be hit is left out: the same bits as with every ray cast at every body."""
+"""Culling is conservative: scans have the same bits as with every ray cast at every body."""
 
 import numpy as np
 import pytest
@@ -32,7 +32,7 @@ def scene(request):
 
 
 def at_every_body(instant, vehicle_T_sensor, tiles, max_range_m):
-    """The slow twin: range and body of every ray, cast at every body in turn."""
+    """Cast every ray at every body in turn: slow reference implementation."""
     origin_m, answers = vehicle_T_sensor[:3, 3], []
     for tile in tiles:
         directions = rotate(vehicle_T_sensor[:3, :3], tile.directions)
@@ -73,7 +73,7 @@ def test_culling_does_not_change_a_scan(scene, step, sensor):
 
 
 def test_grouped_casting_starts_correctly_on_a_body():
-    """Two coincide: what a ray hits then is the last of them, as it is when they are cast at in turn."""
+    """Of two coincident bodies a ray hits the last one, as with separate casts."""
     car, away = Box(type="box", size_m=(4, 2, 1.5)).build_mesh(), np.array([0.0, 3.0])
     places = [(0, 0, 0), (8, 1, 0), (8, 1, 0), (9, -4, 0), (-7, 2, 0)]
     ways = [
@@ -97,7 +97,7 @@ def test_grouped_casting_starts_correctly_on_a_body():
 
 
 def boxes_around(generator, count):
-    """(count, 8, 3) corners of boxes of all forms and orientations, some around the origin, and their poses."""
+    """Sample boxes of all sizes and orientations, some around the origin: (count, 8, 3) corners, sizes, poses."""
     corners = BoundingBox((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)).corners_m
     sizes = generator.uniform(0.05, 1.0, size=(count, 3)) * 10 ** generator.uniform(-1, 1.3, size=(count, 1))
     places = generator.normal(size=(count, 3)) * 10 ** generator.uniform(-1, 1.5, size=(count, 1))
@@ -113,7 +113,7 @@ def test_empty_tiles_have_no_candidate_blocks():
 
 
 def test_no_ray_that_hits_a_box_is_culled():
-    """Directions to points inside boxes, the corners included, pass every test for those boxes."""
+    """Directions to points inside boxes, including corners, pass every test for these boxes."""
     generator = np.random.default_rng(0)
     corners_m, sizes, poses = boxes_around(generator, 300)
     origin_m = np.array([0.3, -0.2, 0.1])

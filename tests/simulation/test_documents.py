@@ -1,4 +1,4 @@
-"""YAML documents: what is wrong is said in one line that names the file and the key."""
+"""YAML documents: mistakes are reported in one line that names file and key."""
 
 import warnings
 

@@ -1,4 +1,4 @@
-"""What carries a rig: the first that is given of `vehicle`, the scenario's own ego, the rig's vehicle, an SUV."""
+"""Choice of the ego vehicle: `vehicle`, the ego of the scenario, the vehicle of the rig, or an SUV, in this order."""
 
 import numpy as np
 import pytest
@@ -58,7 +58,7 @@ def test_rigs_of_different_vehicles_need_a_common_one():
         length_m(given(), *two)
     assert length_m(given(), *two, vehicle="suv") == pytest.approx(4.90)
     assert length_m(given(shape=BOX), *two) == pytest.approx(6.0)
-    # The same, and one that goes on any, are no conflict.
+    # Equal vehicles, and a rig without a vehicle, do not conflict.
     assert length_m(given(), rig("sedan"), rig("sedan"), rig()) == pytest.approx(4.77)
 
 
@@ -79,7 +79,7 @@ def test_vehicle_paths_are_relative_to_their_document(tmp_path, monkeypatch):
     of_rig = set_ego(given(), {"r": Rig.load("../own/rig.yaml")})
     assert (of_rig.ego_name, of_rig.compute_ego_box().size_m) == ("cart.yaml", (3.0, 1.5, 1.0))
     assert Scenario.load("../own/scene.yaml").compute_ego_box().size_m == (3.0, 1.5, 1.0)
-    # An option is meant from where the user is.
+    # The path of an option is relative to the working directory.
     with pytest.raises(FileNotFoundError, match=r"vehicle: cart\.yaml: no such file"):
         set_ego(given(), {"r": rig()}, "cart.yaml")
     assert set_ego(given(), {"r": rig()}, "../own/cart.yaml").ego_name == "cart.yaml"
@@ -96,6 +96,6 @@ def test_frames_depend_on_the_vehicle_and_name_it():
     assert [each.description["vehicle"] for each in frames] == ["suv", "van"]
     assert frames[0].content["scenario"] != frames[1].content["scenario"]
     np.testing.assert_allclose(np.ptp(frames[1].ego_outline_m, axis=0), [5.93, 2.02])
-    # What a rig names and what does not carry it change no frame, nor what a checkpoint is of.
+    # The vehicle that a rig names does not matter if another one is chosen, not even for checkpoints.
     named = SimulatedFrames(scenario, rig("sedan"), num_frames=1, reference_sensor=SMALL, vehicle="van")
     assert named.content == frames[1].content

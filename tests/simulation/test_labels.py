@@ -1,4 +1,4 @@
-"""Labels are the boxes of the bodies, seen from the vehicle."""
+"""Labels: boxes of bodies in the vehicle frame."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ def test_labels_are_poses_in_the_vehicle_frame():
     assert (label.name, label.category, label.size_m) == ("truck 1", "truck", (4.0, 2.0, 1.5))
     np.testing.assert_allclose(label.center_m, [20.0, 0.0, 0.75], atol=1e-6)
     assert label.yaw_rad == pytest.approx(-np.pi / 2)
-    # Over ground along the vehicle's axes: the ego's own speed is not subtracted.
+    # Velocity over ground along the axes of the vehicle: the speed of the ego is not subtracted.
     np.testing.assert_allclose(label.velocity_mps, [0.0, -5.0], atol=1e-6)
 
 

@@ -1,4 +1,4 @@
-"""A LiDAR starts from a model; what it says itself wins."""
+"""LiDAR models: keys of the sensor override keys of its model."""
 
 import numpy as np
 import pytest
@@ -155,5 +155,6 @@ def test_a_wrong_sensor_is_named(tmp_path, keys, message):
 
 def test_a_wrong_model_file_is_named(tmp_path):
     (tmp_path / "own.yaml").write_text("{name: own, elevations_deg: [95], horizontal_fov_deg: 90, columns: 4}")
-    with pytest.raises(ValueError, match=r"sensors\.0: .*own\.yaml: max_range_m: a value is needed; the key is missing; elevations_deg\.0: .*90"):
+    message = r"sensors\.0: .*own\.yaml: max_range_m: a value is needed; the key is missing; elevations_deg\.0: .*90"
+    with pytest.raises(ValueError, match=message):
         read(tmp_path, "model: own.yaml")

@@ -1,4 +1,4 @@
-"""Heights above the local ground: closed forms; neither the ego's attitude nor hills make obstacles of roads."""
+"""Heights above the local ground against closed forms, on hills and for any attitude of the ego vehicle."""
 
 import dataclasses
 import math
@@ -28,7 +28,7 @@ EGO_MESH = Box(type="box", size_m=(4, 2, 1.5)).build_mesh()
 
 
 def sheet(heights, half=60.0, every=5.0, down=False):
-    """A terrain over a square; `heights` of x and y."""
+    """Build a terrain over a square from heights as a function of x and y."""
     side = np.arange(-half, half + every / 2, every)
     x, y = np.meshgrid(side, side, indexing="ij")
     number = np.arange(x.size).reshape(x.shape)
@@ -47,7 +47,7 @@ def solid(size, x=0.0, y=0.0, z=0.0, yaw=0.0):
 
 
 def wedge(x, y, z):
-    """A closed ramp that rises along x."""
+    """Build a closed ramp that rises along x."""
     (x0, x1), (y0, y1), (z0, z1) = x, y, z
     bottom = [[x0, y0, z0], [x1, y0, z0], [x1, y1, z0], [x0, y1, z0]]
     top = [[x1, y0, z1], [x1, y1, z1]]
@@ -81,7 +81,7 @@ def test_ramps_connect_a_bridge_with_the_road():
     down = wedge((10, 30), (-3, 3), (0, 5)).transform(build_transform(convert_euler_to_rotation(180, 0, 0), [80, 0, 0]))
     ground = ground_of([PLANE, up, deck, down])
     found = heights(ground, [20, 0, 2.5], [20, 0, 3.5], [40, 0, 6], [40, 0, 2], [40, 0, 4.6], [40, 10, 6], [55, 0, 6])
-    # On the ramp, above it, above the deck, below it, in it (where the road is the ground), beside, on the way down.
+    # On the ramp, above it, above the bridge, below it, in it (the road is the ground), next to it, on the way down.
     np.testing.assert_allclose(found, [0, 1, 1, 2, 4.6, 6, 6 - 3.75], atol=1e-5)
     # A bridge without a ramp is a roof.
     np.testing.assert_allclose(heights(ground_of([PLANE, deck]), [40, 0, 6]), [6], atol=1e-5)
@@ -126,14 +126,14 @@ def test_heights_are_along_the_world_vertical():
 def test_steep_or_distant_faces_are_not_ground():
     assert find_level_faces(wedge((0, 1), (0, 1), (0, 0.9))).sum() == 2
     assert find_level_faces(wedge((0, 1), (0, 1), (0, 1.1))).sum() == 0
-    for seed in range(50):  # 45 degrees, whatever rounding makes of that
+    for seed in range(50):  # 45 degrees up to rounding
         turn, side = build_transform(convert_euler_to_rotation(seed, 0, 0), [seed, 7.3, -0.1]), 1 / (1 + seed)
         assert find_level_faces(wedge((0, side), (0, 1), (0, side)).transform(turn)).sum() == 2
     walls = [solid((0.2, 40, 5), 5), solid((0.2, 40, 5), -5)]
     assert np.isnan(heights(ground_of(walls), [0, 0, 1])).all()
     roof = solid((9, 9, 0.2), 0, 0, 3)
     assert np.isnan(heights(ground_of([*walls, roof]), [0, 0, 4])).all()
-    # Far below, or a sheet above if there is nothing else: the ego is below the ground.
+    # Ground far below counts; without any, a sheet above counts: the ego is below the ground.
     for z in (0.9, 1.5, -30.0):
         assert math.isclose(heights(ground_of([PLANE, roof], [(0, 0, z)]), [20, 0, 1])[0], 1, abs_tol=1e-5)
     assert math.isclose(heights(ground_of([PLANE, roof], [(0, 0, 3.3)]), [0, 0, 4])[0], 0.8, abs_tol=1e-5)
@@ -222,7 +222,7 @@ def test_both_band_frames_agree_on_level_ground(at):
 
 
 def test_sunken_bodies_count_from_the_ground_up(at):
-    """A ledge of 4 x 4 m, which is ground: the upper 5 cm of its front lie on its top, as kerbs do."""
+    """The upper 5 cm of the front of a ledge of 4 x 4 m count as its top, as for curbs."""
     at([2.6, 0.0, 2.0])
     ledge = {"name": "ledge", "ground": True, "shape": {"type": "box", "size_m": [4, 4, 2]}, "poses": [{"x_m": 12}]}
     for sunk_m in (0.0, 1.0, 1.6):
@@ -230,7 +230,7 @@ def test_sunken_bodies_count_from_the_ground_up(at):
         high_m = 2.0 - sunk_m
         front = SurfaceReference((((9.5, 14.5), (-2.5, 2.5)),), 300, 1, ((0.5, 2.0),))
         agrees(sums(made, front, steps=20), 4 * max(high_m - 0.05 - 0.5, 0))
-        if high_m < 2:  # from where the top is seen
+        if high_m < 2:  # the top is visible from here
             area = SurfaceReference((((10.0, 14.0), (-2.0, 2.0)),), 300, 1, ((-0.5, 0.5),))
             agrees(sums(made, area, steps=20), 16 + 4 * min(high_m, 0.5 + 0.05))
 
@@ -246,7 +246,7 @@ def test_moving_bodies_are_cut_by_height_above_ground(at):
     only = [scan(world, OBSTACLE, seed) for seed in range(60)]
     for one in only:
         assert ((one.heights_m >= 0.5) & (one.heights_m < 2)).all()
-    # The side that is turned to the ego, and the rear, which is upright: 1.5 m of each, within a bevel of the slope.
+    # Side and upright rear that face the ego: 1.5 m of each, up to a bevel by the slope.
     weights = np.array([one.weights[one.points[:, 1] > -3.001].sum() for one in only], dtype=np.float64)
     agrees(weights, 6 * 1.5, within=0.05)
 
@@ -256,7 +256,7 @@ def attitudes():
 
 
 def test_heights_are_independent_of_ego_attitude():
-    """The same places in the world, whichever way the ego leans."""
+    """The same world positions have the same heights for any attitude of the ego vehicle."""
     static = [sheet(lambda x, y: 0.03 * x), solid((3, 3, 2.5), 20, 2), solid((8, 3, 0.15), -20, 0, -0.6)]
     rng = np.random.default_rng(4)
     places = np.column_stack([rng.uniform(-50, 50, (2000, 2)), rng.uniform(-1, 4, 2000)])
@@ -279,7 +279,7 @@ def test_positions_below_ground_are_refused():
     roof = sheet(lambda x, y: 0 * x + 3, half=5)
     inside = solid((4, 4, 2), 8)
     instant = SceneGeometry(resting([PLANE, roof, inside])).get_snapshot(0)
-    assert not instant.is_occupied(np.array([3.0, 0.0, 0.5]))  # under an open roof whose faces look up
+    assert not instant.is_occupied(np.array([3.0, 0.0, 0.5]))  # under an open roof whose faces point up
     assert instant.is_occupied(np.array([8.0, 0.0, 1.0]))
 
 

@@ -1,4 +1,4 @@
-"""Polygons of mesh files cover their own area, and objects or materials that are named let rays pass."""
+"""Mesh files: polygons keep their area, and rays pass transparent objects and materials."""
 
 import json
 import struct
@@ -13,7 +13,7 @@ from torchcover.simulation import CameraSensor, Pose, Rig, Scenario, SimulatedFr
 from torchcover.simulation.mesh_files import triangulate
 from torchcover.simulation.shapes import Box, MeshFile
 
-# An L of 5 square meters whose first corner does not see its last ones, and a dart: both wrong as a fan.
+# An L of 5 m² and a dart: for both, a fan from the first corner is wrong.
 L_SHAPE = [(1.5, -0.5), (-0.5, -0.5), (-0.5, 1.5), (-1.5, 1.5), (-1.5, -1.5), (1.5, -1.5)]
 DART = [(0.0, 0.0), (2.0, 1.0), (0.5, 1.0), (1.0, 2.0)]
 
@@ -24,7 +24,7 @@ def shoelace(points):
 
 
 def as_obj(points):
-    """Two copies; the second counts back from its last vertex, which is no longer the last of the file."""
+    """Format two copies as OBJ; the second has negative indices, and another vertex follows it."""
     low, high = ("".join(f"v {x} {y} {z}\n" for x, y in points) for z in (0, 1))
     back = " ".join(f"{k}//-1" for k in range(-len(points), 0))
     ahead = " ".join(f"{k + 1}" for k in range(len(points)))
@@ -90,7 +90,7 @@ def test_concave_polygons_keep_their_area(tmp_path, name, write, points):
 
 
 def test_polygons_keep_their_area_in_any_plane():
-    """Stars seen from their middle, and a square with a hole that is joined to its outline by a cut."""
+    """Star-shaped polygons, and a square with a hole that a cut joins to its outline."""
     random = np.random.default_rng(0)
     hole = [(0, 0), (4, 0), (4, 4), (0, 4), (0, 0), (1, 1), (1, 3), (3, 3), (3, 1), (1, 1)]
     shapes = [np.array(hole, dtype=np.float64)]
@@ -108,7 +108,7 @@ def test_polygons_keep_their_area_in_any_plane():
 
 
 def as_glb(meshes):
-    """A GLB of triangles: name -> (three corners, material number); material 1 is called glass and blends."""
+    """Build a GLB of triangles: name -> (three corners, material number); material 1 is called glass and blends."""
     data, document = b"", {"asset": {"version": "2.0"}, "scene": 0, "nodes": [], "meshes": [], "accessors": []}
     document["materials"] = [{"name": "paint"}, {"name": "glass", "alphaMode": "BLEND"}]
     document["bufferViews"] = []
@@ -140,7 +140,7 @@ def test_rays_pass_transparent_objects_and_materials(tmp_path):
     assert sorted(areas(read().build_mesh())) == [0.5, 2.0, 8.0, 32.0]
     assert sorted(areas(read("glass").build_mesh())) == [0.5, 2.0]
     assert sorted(areas(read("rear", "body").build_mesh())) == [2.0, 8.0]
-    assert np.ptp(read("glass").build_mesh().vertices_m, axis=0)[0] == 8.0  # its frame stays
+    assert np.ptp(read("glass").build_mesh().vertices_m, axis=0)[0] == 8.0  # the frame remains
     assert (read().list_transparent_materials(), read("glass").list_transparent_materials()) == (["glass"], [])
     with pytest.raises(ValueError, match="no object or material is called 'window'; it has 'body', 'door', 'glass'"):
         read("window").build_mesh()
@@ -159,7 +159,7 @@ def test_mtl_materials_have_names_and_opacity(tmp_path, opacity):
 
 
 def test_blocked_cameras_are_told_about_transparent_windows(tmp_path):
-    """A closed car of glass sides: the message names the material and the key, and with the key it looks out."""
+    """In a closed car with glass sides the message names material and key; with the key the camera sees through."""
     box = Box(type="box", size_m=(4.0, 2.0, 1.5)).build_mesh()
     sides = {f"side {k}": (box.vertices_m[face], 0 if k < 2 else 1) for k, face in enumerate(box.faces)}
     (tmp_path / "car.glb").write_bytes(as_glb(sides))
@@ -173,7 +173,7 @@ def test_blocked_cameras_are_told_about_transparent_windows(tmp_path):
         (tmp_path / "car.yaml").write_text(f"name: car\nparts: [{{name: body, shape: {shape}}}]\n")
         frames = SimulatedFrames(courtyard, rig, num_frames=1, vehicle=tmp_path / "car.yaml")
         with warnings.catch_warnings(), pytest.raises(ValueError, match=told) if told else nullcontext():
-            warnings.simplefilter("ignore")  # its windows are holes
+            warnings.simplefilter("ignore")  # windows become holes
             assert len(frames[0].sensor) > 100
 
 
@@ -209,7 +209,7 @@ def test_latin_1_text_equals_utf_8_text(tmp_path):
     ],
 )
 def test_missing_packages_are_not_reported_as_damage(tmp_path, name, content, error, told):
-    """trimesh would read compressed glTF as points that all are at the origin."""
+    """trimesh would read compressed glTF as points at the origin."""
     text = f'{{"asset": {{}}, "extensionsRequired": ["{content}"]}}' if name == "a.gltf" else content
     (tmp_path / name).write_text(text)
     with pytest.raises(error, match=rf"{name}: .*{told}"):

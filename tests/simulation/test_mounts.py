@@ -1,4 +1,4 @@
-"""Sensors are where sensors can be: above the ground and outside of bodies, at every step."""
+"""Mounting positions are above the ground and outside of bodies in every frame."""
 
 import warnings
 
@@ -11,12 +11,12 @@ from torchcover.simulation.scene import SceneGeometry
 
 EGO = {"shape": {"type": "box", "size_m": [4, 2, 1]}}
 GROUND = {"name": "ground", "shape": {"type": "plane", "size_m": [400, 400]}}
-# 5 m ahead of the ego's place at the start, above its roof.
+# 5 m ahead of the start position, above the roof of the ego.
 BAR = {"name": "bar", "shape": {"type": "box", "size_m": [1, 8, 1]}, "poses": [{"x_m": 5.0, "z_m": 1.5}]}
 
 
 def simulator(tmp_path, mount, *, speed_mps=0.0, bodies=(), actors=()):
-    """A sensor `top` of the rig `mine`; with a speed, the ego drives along x for five steps of a second."""
+    """Simulate a sensor `top` of the rig `mine`; with a speed, the ego drives along x for five seconds."""
     ego, steps = EGO, {}
     if speed_mps:
         rows = [f"{t},{speed_mps * t},0,0,0,0,0" for t in range(6)]
@@ -36,7 +36,7 @@ def test_sensors_below_the_ground_are_refused(tmp_path, mount, speed_mps):
 
 
 def test_distant_mounts_suggest_wrong_units(tmp_path):
-    # The box of the ego ends at 2 m ahead and 1 m up: 20 m from its upper front edge on either axis.
+    # The ego box ends 2 m ahead and 1 m up: 20 m from its upper front edge on either axis.
     assert len(simulator(tmp_path, {"x_m": 2.0, "z_m": 20.9}).simulate_frame(0).clouds["mine"]) > 0
     with pytest.raises(ValueError, match=r"'top' at .* lies 1799 m away from the ego .*in meters.* millimeters\?"):
         simulator(tmp_path, {"z_m": 1800.0}).simulate_frame(0)

@@ -1,4 +1,4 @@
-"""Points of their own for objects: they find all of an object that is seen, and move no other number."""
+"""Object strata: additional points cover the visible surface of objects and change no other number."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ EGO = Actor(
 
 
 def there(x_m, y_m=0.0, z_m=0.0, *, size_m=(2.0, 2.0, 1.5), moves=False, until_s=None):
-    """A box at a place; one that moves gets there at 1 s."""
+    """Place a box; a moving one arrives there at 1 s."""
     place = [x_m, y_m, z_m]
     track = Trajectory.from_arrays([0.0, 1.0], [[x_m + 5.0, y_m, z_m], place], np.zeros((2, 3)))
     if until_s is not None:
@@ -50,12 +50,12 @@ def scans(made, sensor, steps=40, step=1):
 
 
 def m2(found, which=lambda x, y, z: x > 5.0):
-    """(scans,) square metres of the points of which something holds."""
+    """Sum the area in m² of the points that satisfy a condition; (scans,)."""
     return np.array([scan.weights.astype(np.float64)[which(*scan.points.T)].sum() for scan in found])
 
 
 def worlds_with(actor_of):
-    """The same box as an actor at rest, as one that moves, and parked."""
+    """Build the same box as an actor at rest, a moving actor, and a static actor."""
     return [world([actor_of(moves=False)]), world([actor_of(moves=True)]), world(parked=[actor_of(moves=False)])]
 
 
@@ -64,7 +64,7 @@ def test_visible_object_surface_is_sampled_outside_areas_too(at, made):
     at([2.5, 3.0, 2.5])
     found = scans(made, SurfaceReference(BEHIND, num_rays=100, num_poses=1, points_per_object=64))
     assert all(scan.sampled_point_counts.tolist() == [64] for scan in found)
-    # One in each of 64 equal parts of the three faces, none of which is hidden: no scan is off by more than a part.
+    # One point in each of 64 equal parts of three visible faces: no scan deviates by more than a part.
     np.testing.assert_allclose(m2(found), 3.0 + 3.0 + 4.0, rtol=1e-5)
     agrees(m2(found, lambda x, y, z: (x > 5.0) & (z > 1.49999)), 4.0)
     agrees(m2(found, lambda x, y, z: (x > 5.0) & (z < 0.75)), 3.0)
@@ -96,10 +96,10 @@ def test_each_object_has_the_requested_points(at):
     made = world([there(10.0), there(30.0, moves=True)], parked=[there(90.0)])
     (scan,) = scans(made, SurfaceReference(BEHIND, num_rays=100, num_poses=4, points_per_object=10), steps=1)
     assert scan.sampled_point_counts.tolist() == [12, 12, 12]
-    # In addition to the others, half of which had no surface to be on.
+    # Added to the other points, half of which found no surface.
     assert 36 + 40 < scan.num_rays < 36 + 60
     (scan,) = scans(made, SurfaceReference((AHEAD,), num_rays=400, num_poses=4), steps=1)
-    # Without points of their own, objects have their share of those of the areas.
+    # Without object strata, objects have their share of the points of the areas.
     assert scan.sampled_point_counts[0] > 0
     assert scan.sampled_point_counts[1:].tolist() == [0, 0]
 
@@ -200,7 +200,7 @@ def test_visibility_tells_hidden_objects_from_distant_ones(at):
     assert seen.observed.tolist() == [True, False, False, True]
     assert seen.hidden.tolist() == [False, True, False, False]
     assert seen.sampled_points.tolist()[1:] == [64, 0, 64]
-    # Its front: the roof is too flat for the rig to hit it at all.
+    # Only the front: the rig hits no part of the roof at this flat angle.
     assert abs(float(seen.share[0]) - 3 / 11) < 0.05
     assert seen.share[3] == 0.0
     assert torch.equal(frame.boxes.select(seen.hidden).sampled_points, torch.tensor([64]))

@@ -1,4 +1,4 @@
-"""What a step does not need is left out, counted, and does not change it."""
+"""Omitted work: unneeded casts are omitted and counted, and do not change a frame."""
 
 import numpy as np
 import pytest

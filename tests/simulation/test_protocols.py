@@ -1,4 +1,4 @@
-"""What every kind of sensor and every reference sensor promises, and that another one is a class and one line."""
+"""Laws that hold for every sensor and reference sensor; a new one needs a class and one line."""
 
 import pickle
 from dataclasses import dataclass
@@ -36,7 +36,7 @@ RANGES = {"min_range_m": 1.0, "max_range_m": 60.0, "range_noise_m": 0.02, "dropo
 
 
 class Altimeter(RangeSensor):
-    """Looks down ahead: the smallest sensor there is."""
+    """Smallest possible sensor: it points down ahead."""
 
     type: Literal["altimeter"] = "altimeter"
     name: str
@@ -52,7 +52,7 @@ class Altimeter(RangeSensor):
 
 @dataclass(frozen=True)
 class DownReference:
-    """Looks straight down from its place: the smallest reference sensor there is."""
+    """Smallest possible reference sensor: it points straight down."""
 
     name: ClassVar[str] = "down"
     has_area_weights: ClassVar[bool] = True
@@ -80,7 +80,7 @@ class DownReference:
         return build_transform(np.eye(3), sample_position_in_shell(ego_box, self.shell_m, rng))
 
 
-# Keys of one sensor of each kind, beside name, type, mount and ranges.
+# Keys of one sensor of each type, in addition to name, type, mount and ranges.
 KEYS = {
     "lidar": {"channels": 4, "vertical_fov_deg": [-20, 10], "horizontal_fov_deg": 90, "columns": 16},
     "camera": {"width": 24, "height": 16, "fov_deg": 80},
@@ -97,7 +97,7 @@ KEYS = {
 
 @pytest.fixture(params=[*SENSORS, "altimeter"])
 def sensor(request, monkeypatch):
-    """A sensor of each kind, from the keys of a rig's file."""
+    """Create a sensor of each type from keys of a rig file."""
     monkeypatch.setitem(SENSORS, "altimeter", Altimeter)
     keys = {"type": request.param, "name": "a", "mount": MOUNT, **RANGES, **KEYS[request.param]}
     (made,) = Rig.model_validate({"name": "r", "sensors": [keys]}).sensors
@@ -107,7 +107,7 @@ def sensor(request, monkeypatch):
 
 @pytest.fixture(params=[*REFERENCE_SENSORS, "down"])
 def reference_sensor(request, monkeypatch):
-    """A reference sensor of each pattern, from areas and a number of rays."""
+    """Create a reference sensor of each kind from areas and a number of rays."""
     monkeypatch.setitem(REFERENCE_SENSORS, "down", DownReference)
     made = REFERENCE_SENSORS[request.param].from_query_plan(ASKED, 900)
     assert made.name == request.param
@@ -137,14 +137,14 @@ def test_fields_of_view_contain_all_rays(sensor):
 
 
 def hits_of(sensor, range_m, ray=None):
-    """Hits of all rays, or of some, at these distances."""
+    """Create hits of all or some rays at given ranges."""
     pixel_of_ray = np.flatnonzero(~np.isnan(sensor.compute_directions()[0]))
     ray = np.arange(len(pixel_of_ray)) if ray is None else ray
     return RayHits(ray, np.broadcast_to(range_m, len(ray)).astype(np.float32), pixel_of_ray)
 
 
 def hit_by(returns, count):
-    """Which of so many hits give a point."""
+    """List the hits that give a point."""
     return np.arange(count) if returns.hit_indices is None else returns.hit_indices
 
 
@@ -162,7 +162,7 @@ def test_only_hits_within_range_limits_give_points(sensor):
 
 
 def test_beams_are_measured_independently(sensor):
-    """Hits that are taken away change nothing about those of beams that keep theirs, in any number of places."""
+    """Removing hits of some beams does not change the points of other beams, for any number of positions."""
     beams, random = sensor.compute_beam_indices(), np.random.default_rng(5)
     whole = hits_of(sensor, random.uniform(0.5, 9.0, len(hits_of(sensor, 1.0).ray_indices)))
     of_ray = whole.ray_indices if beams is None else beams.ravel()[whole.pixel_indices]
@@ -188,7 +188,7 @@ def test_beams_are_measured_independently(sensor):
 
 
 def test_random_numbers_do_not_depend_on_the_hits(sensor):
-    """Else what one thread meets would decide what another draws."""
+    """Otherwise the hits of one thread would affect the random numbers of another."""
     rays = len(hits_of(sensor, 1.0).ray_indices)
     used, fresh = (SensorNoise(np.random.default_rng(2), num_rays=rays) for _ in range(2))
     sensor.measure(hits_of(sensor, 1.0, np.empty(0, dtype=np.int64)), used)
@@ -242,7 +242,7 @@ def test_the_scenario_decides_the_range_of_sensors(sensor, monkeypatch):
     assert torch.equal(reference, whole)
     assert (near_m <= reach_m).all()
     assert (away_m > reach_m).any()
-    if sensor.compute_beam_indices() is None:  # else points of a beam are made of all its hits
+    if sensor.compute_beam_indices() is None:  # otherwise a point depends on all hits of its beam
         assert len(near_m) == (away_m <= reach_m).sum()
     monkeypatch.setattr(Scenario, "compute_max_range_m", lambda *_: 1.0)
     assert targets() == 0 < of_targets or sensor.type == "altimeter"

@@ -1,4 +1,4 @@
-"""Laws of the radar: cells, one point in each, on a true surface, whatever the number of rays in it."""
+"""Radar: one point per cell, on a surface, for any number of rays per cell."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ KEYS = {
     "azimuth_cell_deg": 5, "range_cell_m": 0.5, "max_range_m": 40,
 }  # fmt: skip
 EGO = {"shape": {"type": "box", "size_m": [4.0, 2.0, 2.0]}}
-# Its face is at x = 22.1, which is 20 m ahead.
+# The face is at x = 22.1, 20 m ahead of the radar.
 WALL = {"name": "wall", "shape": {"type": "box", "size_m": [1, 200, 60]}, "poses": [{"x_m": 22.6, "z_m": -20}]}
 
 
@@ -20,7 +20,7 @@ def radar(**keys):
 
 
 def points_of(sensor, *bodies):
-    """What it sees, with the radar as the origin."""
+    """Compute the points in the radar frame."""
     scenario = Scenario.model_validate({"name": "s", "ego": EGO, "bodies": [WALL, *bodies]})
     rig = Rig(name="r", sensors=(sensor,))
     [scan] = Simulator(scenario, {"r": rig}, PaperReference(2, 2)).simulate_scans(0)["r"]
@@ -28,7 +28,7 @@ def points_of(sensor, *bodies):
 
 
 def cells_of(sensor, points_m):
-    """(N, 2) the cells of azimuth and of range that points lie in."""
+    """Compute the (N, 2) azimuth and range cells of points."""
     azimuth_deg = np.rad2deg(np.arctan2(points_m[:, 1], points_m[:, 0]))
     across = (azimuth_deg + sensor.horizontal_fov_deg / 2) / sensor.horizontal_fov_deg * sensor.num_azimuth_cells
     along = np.linalg.norm(points_m, axis=1) / sensor.range_cell_m
@@ -36,25 +36,25 @@ def cells_of(sensor, points_m):
 
 
 def by_cell(sensor, *bodies):
-    """The point of each cell that has one."""
+    """Get the point of each occupied cell."""
     points_m = points_of(sensor, *bodies)
     return dict(zip(map(tuple, cells_of(sensor, points_m).tolist()), points_m, strict=True))
 
 
 def test_walls_fill_the_cells_they_cross():
-    """Wide: of azimuth a, the wall is 20 m / cos(a) away on the horizon, and a little more above and below it."""
+    """At azimuth a, the wall is 20 m / cos(a) away on the horizon, and slightly more above and below."""
     sensor = radar(vertical_fov_deg=[0, 0], ray_spacing_m=0.02)
     points_m = points_of(sensor)
     edges = np.deg2rad(np.linspace(-30, 30, 13))
     low, high = np.sort(20 / np.cos([edges[:-1], edges[1:]]), axis=0)
-    nearest = np.floor(low / 0.5)  # of the two cells about the middle, 20 m is the low one
+    nearest = np.floor(low / 0.5)  # 20 m is in the lower of the two central cells
     expected = {(k, n) for k in range(12) for n in np.arange(nearest[k], np.floor(high[k] / 0.5) + 1).astype(int)}
     assert set(map(tuple, cells_of(sensor, points_m).tolist())) == expected
     assert len(points_m) == len(expected)
 
 
 def test_points_are_central_hits_of_cells():
-    """Against a slow twin, at random ranges in several places."""
+    """Compared with a slow implementation at random ranges and positions."""
     sensor, random = radar(min_range_m=3.0, range_cell_m=2.0), np.random.default_rng(3)
     rays = sensor.num_rays
     beams = sensor.compute_beam_indices().ravel()
@@ -73,7 +73,7 @@ def test_points_are_central_hits_of_cells():
 
 
 def test_more_rays_per_cell_find_the_same_surfaces():
-    """A box before a wall: no more cells come, and the ranges of their points come to rest."""
+    """With more rays, a box ahead of a wall occupies no more cells, and ranges converge."""
     box = {"name": "box", "shape": {"type": "box", "size_m": [2, 2, 3]}, "poses": [{"x_m": 12.0, "y_m": 2.0}]}
     finest = by_cell(radar(ray_spacing_m=0.05), box)
     missing, moved_m = [], []
@@ -89,12 +89,12 @@ def test_more_rays_per_cell_find_the_same_surfaces():
 
 
 def test_road_hits_do_not_replace_body_points():
-    """Where both are in one cell, the point lies on what fills more of its view."""
+    """In a shared cell, the point lies on the body that fills more of the view."""
     floor = {"name": "floor", "shape": {"type": "plane", "size_m": [200, 200]}}
     body = {"name": "body", "shape": {"type": "box", "size_m": [0.4, 3, 1.8]}, "poses": [{"x_m": 7.55}]}
     sensor = radar(horizontal_fov_deg=10, azimuth_cell_deg=5, vertical_fov_deg=[-15, 15])
     points_m = points_of(sensor, floor, body)
-    # Its face is 5.25 m ahead, the floor before it from 5.0 m on in the same cell.
+    # The face is 5.25 m ahead; the floor from 5.0 m on is in the same cell.
     in_its_cell = points_m[cells_of(sensor, points_m)[:, 1] == 10]
     assert len(in_its_cell) == 2
     np.testing.assert_allclose(in_its_cell[:, 0], 5.25, atol=1e-4)
@@ -113,7 +113,7 @@ def test_noise_and_dropout_apply_per_cell():
 
 def test_rays_fill_the_fov_at_the_requested_spacing():
     sensor = radar(azimuth_cell_deg=7.0)
-    assert sensor.num_azimuth_cells == 9  # of 6.67 degrees: none is wider
+    assert sensor.num_azimuth_cells == 9  # cells of 6.67 degrees; none is wider
     x, y, z = sensor.compute_directions()
     assert sensor.num_rays == x.size == sensor.compute_beam_indices().size
     azimuth_deg, elevation_deg = np.rad2deg(np.arctan2(y, x)), np.rad2deg(np.arcsin(z))

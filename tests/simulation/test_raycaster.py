@@ -1,4 +1,4 @@
-"""The ray caster against closed forms and against a slow intersection test in float64."""
+"""Ray caster against closed forms and a slow intersection test in float64."""
 
 import os
 from functools import partial
@@ -25,7 +25,7 @@ if find_spec("warp"):
 
 @pytest.fixture(params=LIBRARIES, autouse=True)
 def library(request, monkeypatch):
-    """Whoever casts, casts alike, and wherever: every test here is about all."""
+    """Run every test with Embree and with Warp."""
     if request.param.startswith("Warp"):
         device = "cuda:0" if "GPU" in request.param else "cpu"
         monkeypatch.setitem(globals(), "RayCaster", partial(raycaster.RayCaster, device=device))
@@ -54,7 +54,7 @@ def box_at(x, y=0.0, size=1.0):
 
 
 def slow_hits(mesh, origin, directions):
-    """Möller-Trumbore in float64: (N,) distance to the nearest face, inf for a miss."""
+    """Compute (N,) ranges by Möller-Trumbore in float64; inf for a miss."""
     a, b, c = (mesh.vertices_m[mesh.faces[:, k]] for k in range(3))
     nearest = np.full(directions.shape[1], np.inf)
     for i, direction in enumerate(directions.T.astype(np.float64)):
@@ -75,7 +75,7 @@ def test_agrees_with_a_slow_intersection_in_float64():
     mesh, directions = random_mesh(200), random_directions(600)
     hits = RayCaster([mesh]).cast(HERE, directions, endless(directions))
     expected = slow_hits(mesh, HERE, directions)
-    # A ray through the very border of a face may go either way in float32.
+    # A ray exactly through a border of a face may hit or miss in float32.
     assert (np.isfinite(hits.range_m) == np.isfinite(expected)).mean() > 0.995
     assert ((hits.body_indices >= 0) == np.isfinite(hits.range_m)).all()
     both = np.isfinite(hits.range_m) & np.isfinite(expected)
@@ -119,7 +119,7 @@ def test_distant_bodies_do_not_affect_near_hits(gap_m):
 
 @pytest.mark.parametrize("width_m", [1e-5, 1e-3, 1.0])
 def test_a_narrow_face_in_front_is_hit(width_m):
-    """Rounding says little about the plane of a sliver; it is never so little that a wall 1 cm ahead is passed."""
+    """The plane of a sliver is ill-defined, but a ray never passes a wall 1 cm ahead."""
     along, across = np.array([0.3, 1.0, 1.0]), np.array([-0.2, 1.0, -1.0])
     ahead = np.cross(across, along) / np.linalg.norm(np.cross(across, along))
     corners = [0.01 * ahead - along - width_m * across, 0.01 * ahead + along - width_m * across]
@@ -131,7 +131,7 @@ def test_a_narrow_face_in_front_is_hit(width_m):
 
 
 def planes_of(mesh):
-    """(F, 3) outward unit normals of a convex body, and (F,) distances of its planes."""
+    """Compute (F, 3) outward unit normals and (F,) plane distances of a convex body."""
     first, second, third = mesh.vertices_m[mesh.faces].transpose(1, 0, 2)
     normals = np.cross(second - first, third - first)
     normals /= np.linalg.norm(normals, axis=1)[:, None]
@@ -147,7 +147,7 @@ def planes_of(mesh):
     ],
 )
 def test_rays_leave_all_faces_at_their_origin(shape):
-    """From places on edges and in corners: outwards to the walls of a room, inwards to the other side of the body."""
+    """From edges and corners, rays go outwards to the walls of a room and inwards to the opposite side."""
     mesh, generator = (
         shape.build_mesh().transform(build_transform(convert_euler_to_rotation(10.0, 20.0, 30.0), [1.0, 2.0, 3.0])),
         NUMBERS(5),
@@ -267,7 +267,7 @@ def test_building_scenes_starts_no_threads():
 
 
 def stacked(sizes):
-    """Slabs upon each other, and the places of their middles."""
+    """Stack slabs on each other."""
     tops = np.cumsum([size[2] for size in sizes])
     boxes = [Box(type="box", size_m=size).build_mesh() for size in sizes]
     starts = [np.array([0.0, 0.0, top - size[2]]) for top, size in zip(tops, sizes, strict=True)]
@@ -276,7 +276,7 @@ def stacked(sizes):
 
 @pytest.mark.parametrize("seed", range(12))
 def test_touching_bodies_leave_no_gap_between_them(seed):
-    """The faces in which they touch are there twice: which of the two a ray met would be up to rounding."""
+    """Touching bodies have coincident faces, so that the order of ray hits depends on rounding."""
     numbers = NUMBERS(seed)
     turn = build_transform(
         convert_euler_to_rotation(*numbers.uniform(-np.pi, np.pi, 3) * (seed % 3 > 0)), numbers.uniform(-50, 50, 3)
@@ -291,7 +291,7 @@ def test_touching_bodies_leave_no_gap_between_them(seed):
 
 
 def test_sheets_do_not_enclose_positions():
-    """Convex bodies against their half spaces; bodies within bodies, and one of two parts that touch."""
+    """Convex bodies against half spaces, nested bodies, and a body of two touching parts."""
     ball, cube = Ellipsoid(type="ellipsoid", size_m=(4, 3, 2)).build_mesh(), box_at(0.0, size=2.0)
     caster = RayCaster([ball, Plane(type="plane", size_m=(9, 9)).build_mesh(), cube])
     places = NUMBERS(0).uniform(-2.2, 2.2, (2000, 3))
@@ -310,7 +310,7 @@ def test_sheets_do_not_enclose_positions():
 
 
 def behind_all(mesh, place):
-    """Whether a place lies behind every face of a convex body."""
+    """Return True for a position behind every face of a convex body."""
     a, b, c = mesh.vertices_m[mesh.faces].transpose(1, 0, 2)
     return bool((((place - a) * np.cross(b - a, c - a)).sum(axis=1) < 0).all())
 

@@ -1,4 +1,4 @@
-"""Tiles hold every ray once, and each lies in its cone."""
+"""Ray tiles have each ray once, within their cone."""
 
 import numpy as np
 import pytest

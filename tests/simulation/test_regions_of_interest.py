@@ -1,4 +1,4 @@
-"""What is asked about: the document, and what follows from it for one vehicle."""
+"""Regions of interest: the document, and the query plan for one vehicle."""
 
 import math
 
@@ -70,7 +70,7 @@ def test_regions_inside_the_vehicle_cause_a_warning():
     hidden = RegionsOfInterest(regions={"hold": rectangle((-0.4, 0.4), (-0.3, 0.3))})
     with pytest.warns(UserWarning, match="region 'hold' lies within the vehicle"):
         hidden.build_query_plan(ROBOT_M)
-    assert hidden.build_query_plan().regions[0].name == "hold"  # of no vehicle nobody can say so
+    assert hidden.build_query_plan().regions[0].name == "hold"  # without a vehicle this is unknown
 
 
 def test_regions_without_cell_centers_are_refused():

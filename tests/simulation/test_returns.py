@@ -1,4 +1,4 @@
-"""The law of returns: what it says where that is known, and that nothing bad makes more of them."""
+"""Range-limited returns: closed forms, and worse conditions never give more returns."""
 
 import re
 
@@ -27,7 +27,7 @@ KEYS = {
 @pytest.mark.parametrize("range_at_10_percent_m", [40.0, 200.0])
 @pytest.mark.parametrize("reflectivity", [0.1, 0.4])
 def test_half_of_rays_return_at_rated_range(range_at_10_percent_m, reflectivity):
-    """Four times as bright is twice as far."""
+    """Four times the reflectivity doubles the range."""
     range_m = range_at_10_percent_m * np.sqrt(reflectivity / 0.1)
     excess = compute_log_excess(range_m, 1.0, reflectivity, 1.0, range_at_10_percent_m)
     assert compute_return_probability(excess, 0.3) == pytest.approx(MAX_RETURN_PROBABILITY / 2, abs=1e-15)
@@ -38,7 +38,7 @@ def test_half_of_rays_return_at_rated_range(range_at_10_percent_m, reflectivity)
 
 
 def test_road_returns_fall_with_cubed_range():
-    """cos = h / R: where half the rays return is at (R10^2 h)^(1/3)."""
+    """With cos = h / R, half of the rays return at (R10^2 h)^(1/3)."""
     range_m = (60.0**2 * 1.9) ** (1 / 3)
     assert compute_log_excess(range_m, 1.9 / range_m, 0.1, 1.0, 60.0) == pytest.approx(0.0, abs=1e-14)
 
@@ -123,7 +123,7 @@ ROOF = {
 
 
 def seen(weather=None, index=0, bodies=None, **keys):
-    """Which rays of a LiDAR on a plain return at a step."""
+    """Simulate a LiDAR on a plane in one frame."""
     scenario = Scenario.model_validate(PLAIN | {"weather": weather or {}} | ({"bodies": bodies} if bodies else {}))
     rig = Rig.model_validate({"name": "rig", "sensors": [ROOF | keys]})
     return Simulator(scenario, {"rig": rig}, PaperReference(rows=2, columns=2)).simulate_scans(index)["rig"][0]
@@ -161,13 +161,13 @@ def test_returns_from_a_plane_follow_the_law():
     ids=["fog", "rain", "wet", "short", "factors", "dropout"],
 )
 def test_worse_conditions_never_add_returns(worse, keys):
-    """The same random numbers: not one return more, and fewer in all."""
+    """With the same random numbers, no return is added and some are lost."""
     clear, bad = seen(), seen(worse, **keys)
     assert set(bad.ray_indices.tolist()) < set(clear.ray_indices.tolist())
 
 
 def test_rows_have_separate_range_factors():
-    """The lower half of them hardly sees anything."""
+    """The rows of the lower half have few returns."""
     factors = np.where(np.arange(40) < 20, 1e-3, 1.0).tolist()
     lower, every = seen(range_factors=factors).points, seen().points
     assert len(lower) < 0.6 * len(every)
@@ -175,7 +175,7 @@ def test_rows_have_separate_range_factors():
 
 
 def test_reflective_surfaces_return_from_farther_away():
-    """Paint, a sign and nothing at all in place of the road."""
+    """Paint, a traffic sign and a black surface in place of the road."""
 
     def of(material):
         ground = {"name": "plain", "shape": {"type": "plane", "size_m": [400.0, 400.0]}, "material": material}
@@ -188,7 +188,7 @@ def test_reflective_surfaces_return_from_farther_away():
 
 
 def test_material_paths_are_relative_to_the_scenario(tmp_path):
-    """It counts as what stands there: black returns nothing, and what else it is called makes no difference."""
+    """Only the content counts: black returns nothing, whatever its name."""
     of = []
     for reflectivity in (0.0, "retroreflective", 0.0):
         (tmp_path / "own.yaml").write_text(yaml.safe_dump({"name": "own", "reflectivity": reflectivity}))
@@ -202,7 +202,7 @@ def test_material_paths_are_relative_to_the_scenario(tmp_path):
 
 
 def test_saved_rigs_keep_materials_of_housings(tmp_path, monkeypatch):
-    """And so it is with any file that a document names."""
+    """The same holds for any file that a document names."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "there").mkdir()
     (tmp_path / "own.yaml").write_text(yaml.safe_dump({"name": "own", "reflectivity": 0.4}))
@@ -218,7 +218,7 @@ def test_saved_rigs_keep_materials_of_housings(tmp_path, monkeypatch):
 
 
 def test_reflectivity_is_constant_over_body_and_time():
-    """Of black cars, hardly one ray returns; and a step later it is the same cars."""
+    """Black cars have few returns, and the same cars are black one frame later."""
     bodies = [
         PLAIN["bodies"][0],
         *(

@@ -1,4 +1,4 @@
-"""The ego occludes and is not seen; what moves is where it should be; the result knows no absolute place."""
+"""Scenes: the ego occludes, actors follow their trajectories, and absolute positions do not matter."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ def box(*size_m):
 
 
 def world(origin_m=(0, 0, 0), yaw_deg=0.0, moving=True, ego_moves=False):
-    """A wall 10 m ahead of the start, a car 6 m to the left that drives at 2 m/s, an ego that may drive at 1 m/s."""
+    """Build a wall 10 m ahead, a car 6 m to the left that drives at 2 m/s, and an ego that may drive at 1 m/s."""
     place = build_transform(convert_euler_to_rotation(yaw_deg, 0, 0), origin_m)
 
     def along(start, way):
@@ -52,7 +52,7 @@ def test_the_ego_occludes_and_gives_no_points():
     seen = scan(world(moving=False))
     x, y, z = seen.points.T
     assert not ((np.abs(x) < 1.999) & (np.abs(y) < 0.999) & (z < 1.001)).any()
-    # From 0.5 m above the roof's centre, its edge at x = 2 hides the ground up to x = 2 * 1.5 / 0.5 = 6.
+    # From 0.5 m above the center of the roof, its edge at x = 2 hides the ground up to x = 2 * 1.5 / 0.5 = 6.
     ground_ahead = (np.abs(z) < 1e-3) & (np.abs(y) < 0.3) & (x > 0)
     assert 5.99 < x[ground_ahead].min() < 6.3
     directions = np.concatenate([tile.directions for tile in SPHERE], axis=1)

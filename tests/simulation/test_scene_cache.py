@@ -1,4 +1,4 @@
-"""Worlds on disk: the same to the bit as those that are built, whatever has become of the disk meanwhile."""
+"""Scene cache: cached scenes equal built scenes, whatever happens to the disk."""
 
 import dataclasses
 import json
@@ -27,7 +27,7 @@ def lot(ego=EGO, **keys):
 
 @pytest.fixture(autouse=True)
 def disk(monkeypatch, tmp_path):
-    """A disk for worlds, and nothing said so far: the files on it, and how often a world was built."""
+    """Provide an empty cache folder: a function that lists its files, and the runs that were built."""
     monkeypatch.setenv("TORCHCOVER_CACHE_GB", "1")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
 
@@ -169,7 +169,7 @@ def test_a_scene_file_runs_no_code(disk, tmp_path):
 
 
 def special(path, kind, target):
-    """Make a path of the cache something that is not of it."""
+    """Create a foreign file, link or folder at a path of the cache."""
     if kind == "link":
         path.symlink_to(target)
     elif kind == "hard link":
@@ -233,7 +233,7 @@ def test_the_oldest_scenes_are_deleted_for_new_ones(disk, monkeypatch):
         world_of(lot(), run)
     size = max(path.stat().st_size for path in files())
     _age(files())
-    world_of(lot(), 0)  # which makes it the newest
+    world_of(lot(), 0)  # now it is the newest file
     built.clear()
     monkeypatch.setenv("TORCHCOVER_CACHE_GB", str(3.1 * size / 1e9))
     world_of(lot(), 4)
@@ -264,7 +264,7 @@ def no_home(monkeypatch, tmp_path):
     def nobody(path):
         return path
 
-    monkeypatch.setattr(os.path, "expanduser", nobody)  # as of a user whom the system does not know
+    monkeypatch.setattr(os.path, "expanduser", nobody)  # a user without a home folder
 
 
 def a_file(monkeypatch, tmp_path):
@@ -343,7 +343,7 @@ def test_scenes_with_warnings_are_not_cached(disk, monkeypatch):
 
 def test_traffic_of_other_packages_is_not_cached(disk):
     class Elsewhere(ParkingTraffic):
-        """Whose code nobody hashes."""
+        """Traffic whose code is not hashed."""
 
     world_of(lot().model_copy(update={"traffic": Elsewhere(**LOT)}))
     assert disk[0]() == []

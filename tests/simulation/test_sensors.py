@@ -1,4 +1,4 @@
-"""Where the rays of the LiDAR and of the reference sensor point."""
+"""Ray directions of the LiDAR and of the paper reference."""
 
 import numpy as np
 import pytest

@@ -41,7 +41,7 @@ def signed_volume(mesh):
 
 
 def edge_counts(mesh):
-    """How often each directed edge occurs; in a closed, consistently turned mesh each has exactly one opposite."""
+    """Count directed edges; in a closed mesh with consistent normals each has exactly one opposite."""
     directed = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
     forward = {tuple(edge) for edge in directed.tolist()}
     return len(directed), len(forward), forward == {(b, a) for a, b in forward}
@@ -93,7 +93,7 @@ def test_invalid_mesh_files_are_named(tmp_path, content, message):
 
 
 def ply_of(mesh, faces=slice(None)):
-    """The mesh as an ASCII PLY file with only some of its faces."""
+    """Format some faces of a mesh as an ASCII PLY file."""
     corners = [" ".join(f"{value:.9g}" for value in vertex) for vertex in mesh.vertices_m]
     triangles = [f"3 {a} {b} {c}" for a, b, c in mesh.faces[faces].tolist()]
     header = ["ply", "format ascii 1.0", f"element vertex {len(corners)}"]
@@ -114,9 +114,9 @@ CAR = Box(type="box", size_m=(4.9, 1.94, 1.63))
 @pytest.mark.parametrize("shape", [CAR, Cylinder(type="cylinder", radius_m=2, height_m=5)])
 def test_closed_meshes_cause_no_warning_in_any_format(tmp_path, shape):
     mesh = shape.build_mesh()
-    # Warnings are errors here: what is read without one has all its faces.
+    # Warnings are errors in tests: a mesh that is read without a warning is complete.
     assert len(mesh_file(tmp_path, ply_of(mesh)).build_mesh().faces) == len(mesh.faces)
-    # Each face with corners of its own, as STL has it; then with half of the faces flipped.
+    # Each face has separate corners, as in STL; then half of the faces are flipped.
     apart = mesh._replace(
         vertices_m=mesh.vertices_m[mesh.faces.ravel()], faces=np.arange(mesh.faces.size).reshape(-1, 3)
     )
@@ -124,7 +124,7 @@ def test_closed_meshes_cause_no_warning_in_any_format(tmp_path, shape):
     flipped = mesh.faces.copy()
     flipped[::2] = flipped[::2, ::-1]
     mesh_file(tmp_path, ply_of(mesh._replace(faces=flipped))).build_mesh()
-    # A face without area is no hole.
+    # A face without area does not make a hole.
     mesh_file(tmp_path, ply_of(mesh._replace(faces=np.vstack([mesh.faces, [[0, 0, 1]]])))).build_mesh()
 
 
@@ -143,7 +143,7 @@ def test_bodies_in_millimeters_are_reported(tmp_path):
     shape = mesh_file(tmp_path, in_millimetres((4.9, 1.94, 1.63)))
     with pytest.warns(UserWarning, match=r"body 'parked car': its body is 4,900 x 1,940 x 1,630 m"):
         Body(name="parked car", shape=shape).build_meshes()
-    # With the remedy there is nothing to say; nor of a city of 5 km, nor of a train.
+    # With the remedy there is no warning, nor for a city of 5 km or a train.
     Body(name="parked car", shape=shape.model_copy(update={"meters_per_unit": 0.001})).build_meshes()
     Body(name="city", shape=Box(type="box", size_m=(5000, 5000, 400))).build_meshes()
     ActorDescription(shape=Box(type="box", size_m=(75, 2.6, 3.6))).build_actor("tram", "tram")
@@ -184,7 +184,7 @@ def test_suggested_rotations_give_x_forward_z_up(pose, forward, up):
     [
         ("ego", (25.25, 2.55, 4.0)),
         ("ego", (0.281, 0.306, 0.141)),  # a small robot
-        ("ego", (0.68, 0.57, 1.25)),  # one with a flag
+        ("ego", (0.68, 0.57, 1.25)),  # a robot with a flag
         ("car", (2.34, 1.48, 1.56)),
         ("pedestrian", (0.3, 0.52, 1.75)),
         ("motorcycle", (2.1, 0.8, 2.2)),
@@ -229,7 +229,7 @@ def test_vehicles_inherit_parts_and_mount_regions(tmp_path):
 
 
 def test_rig_bodies_occlude_like_vehicle_parts(tmp_path):
-    """A box ahead of a LiDAR, of the rig and of the vehicle; the reference is the same for rigs with and without it."""
+    """A box ahead of a LiDAR belongs to the rig or to the vehicle; rigs with and without it share the reference."""
     box = PART.format("box", "[0.1, 1.0, 0.3]", "{x_m: 1.0, z_m: 1.5}")
     plain = Rig.load("front_roof_32").model_dump(mode="json", exclude_unset=True)
     pose, shape = {"x_m": 1.0, "z_m": 1.5}, {"type": "box", "size_m": [0.1, 1.0, 0.3]}
@@ -239,7 +239,7 @@ def test_rig_bodies_occlude_like_vehicle_parts(tmp_path):
     other = SimulatedFrames("courtyard", "front_roof_32", num_frames=1, vehicle=extended)[0]
     np.testing.assert_array_equal(both[0].clouds["loaded"], other.sensor)
     assert len(both[0].clouds["plain"]) - len(other.sensor) > 500
-    assert both[0].counts["sensor_self_hits"] > 2 * 3380  # those of the vehicle, twice
+    assert both[0].counts["sensor_self_hits"] > 2 * 3380  # the warning of the vehicle, twice
     assert [note.split(":")[0] for note in both.reference_record["notes"]] == ["plain", "loaded"]
 
 

@@ -1,4 +1,4 @@
-"""What a mounted sensor need not look at again is the same to the last bit, and what comes between is seen."""
+"""Mounted sensors: reused results are identical, and occluders between sensor and ego are seen."""
 
 from dataclasses import replace
 
@@ -35,7 +35,7 @@ def driving(start, way, yaw_deg=0.0):
 
 
 def world(ego_moves=True, actor_moves=True, origin_m=(0.0, 0.0, 0.0)):
-    """An ego at up to 1 m/s under a bar that hangs 0.1 m above its roof, and a car beside it."""
+    """Build an ego at up to 1 m/s under a bar 0.1 m above its roof, with a car next to it."""
     origin_m = np.array(origin_m)
     bar = box(0.4, 6, 0.1).transform(Pose(x_m=4.0, z_m=1.1).to_matrix())
     static = [bar, Plane(type="plane", size_m=(200, 200)).build_mesh()]
@@ -63,7 +63,7 @@ def test_reused_results_equal_new_scans_every_frame(ego_moves, actor_moves, orig
         np.testing.assert_array_equal(seen.ray_indices, expected.ray_indices)
         assert (seen.num_rays, seen.self_hits) == (expected.num_rays, expected.self_hits)
         self_hits.append(seen.self_hits)
-    # The bar comes between the sensor and the ego's body while the ego passes below it.
+    # The bar is between sensor and ego body while the ego passes below it.
     assert self_hits[0] > 500
     assert (min(self_hits) < self_hits[0] - 20) == ego_moves
 
@@ -100,7 +100,7 @@ def test_scans_are_repeated_only_with_motion(monkeypatch):
 
 
 def test_the_ego_pose_is_exactly_constant():
-    """Coordinates of UTM size: a pose and its inverse make the identity only nearly."""
+    """With coordinates of UTM size, a pose times its inverse is not exactly the identity."""
     made = world(origin_m=UTM)
     turned = replace(made, ego=replace(made.ego, trajectory=driving(UTM, (10, 0, 0), yaw_deg=37.3)), actors=())
     for step in (0, 3, 7):
@@ -124,7 +124,7 @@ def test_hits_lie_on_their_face_at_their_angle(ego_moves, actor_moves, origin_m)
     vehicle_T_world = invert(ego.trajectory.interpolate(time_s))
     there = {0: bar.transform(vehicle_T_world), 1: ground.transform(vehicle_T_world)}
     there[2] = car.mesh.transform(vehicle_T_world @ car.trajectory.interpolate(time_s))
-    # Resting bodies before what never was one, which is before those that move.
+    # Order of the bodies: static actors, static meshes, moving bodies.
     of_body = {(False, False): [-1, 2, 0, 1], (False, True): [-1, 0, 1, 2], (True, True): [0, 1, -1, 2]}
     number = np.array(of_body[ego_moves, actor_moves])[struck.body_indices]
     assert set(number) == {0, 1, 2}
@@ -144,7 +144,7 @@ def test_hits_lie_on_their_face_at_their_angle(ego_moves, actor_moves, origin_m)
 
 @pytest.mark.parametrize("traffic", [False, True], ids=["standing", "driving"])
 def test_housings_occlude_only_other_sensors(traffic):
-    """A mast 0.2 m wide, 1 m before the other, hides 11.5 degrees of it."""
+    """A mast 0.2 m wide, 1 m ahead of the other sensor, occludes 11.5 degrees."""
     mast = Body(name="mast", shape=Cylinder(type="cylinder", radius_m=0.1, height_m=3.0), poses=(Pose(z_m=-1.5),))
     front = LIDAR.model_copy(update={"name": "front", "mount": Pose(x_m=1.0, z_m=2.5), "housing": (mast,)})
     level = {"columns": 360, "channels": 4, "vertical_fov_deg": (-20.0, -5.0)}

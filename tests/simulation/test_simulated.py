@@ -1,4 +1,4 @@
-"""A simulated frame is a pure function of scenario, rig, seed and index."""
+"""Simulated frames: pure functions of scenario, rig, seed and index."""
 
 from importlib.util import find_spec
 
@@ -24,7 +24,7 @@ def same(a, b):
 @pytest.mark.parametrize("scenario", ["courtyard", "urban"])
 @pytest.mark.parametrize("device", ["cpu", *["cuda:0"] * torch.cuda.is_available()])
 def test_warp_and_embree_hits_agree(scenario, device):
-    """But for rounding, and for rays that pass an edge on the other side."""
+    """Except for rounding, and rays that pass an edge on the other side."""
     by_embree, by_warp = (
         SimulatedFrames(scenario, "kitti", num_frames=2, frame_interval_s=1.0, device=each)[1]
         for each in (None, device)
@@ -175,7 +175,7 @@ def test_longer_frame_intervals_show_later_time_steps():
         "parking", "front_roof_32", num_frames=3, seed=1, reference_sensor=few, frame_interval_s=65.0
     )
     assert (each.frame_interval_s, spread.frame_interval_s) == (0.1, 65.0)
-    for index in range(3):  # the last one plays in another world
+    for index in range(3):  # the last frame is in another scene
         assert torch.equal(spread[index].sensor, each[650 * index].sensor)
 
 

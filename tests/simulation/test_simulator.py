@@ -1,4 +1,4 @@
-"""The simulator: steps without tensors, and what it knows of the ego before it builds a world."""
+"""Simulator: frames without tensors, and the ego vehicle before a scene is built."""
 
 import pickle
 

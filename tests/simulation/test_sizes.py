@@ -1,4 +1,4 @@
-"""What has no room is refused before it is made, with its size."""
+"""Memory limits: demands that do not fit are refused early, with their size."""
 
 import pytest
 
@@ -26,7 +26,7 @@ AREAS = (((0.0, 20.0), (-5.0, 5.0)),)
 
 @pytest.fixture
 def small(monkeypatch):
-    """A machine of 100 MB."""
+    """Simulate a machine with 100 MB."""
     monkeypatch.setattr(memory, "find_memory_limit_bytes", lambda: 1e8)
 
 
@@ -79,7 +79,8 @@ def test_a_single_camera_column_spans_one_pixel(stride):
 def test_too_many_rays_are_refused_early(small):
     lidar = Lidar(name="a", channels=1000, columns=1000, **SPACED)
     scenario, rigs = Scenario.load("courtyard"), {"r": Rig(name="r", sensors=(lidar,))}
-    with pytest.raises(ValueError, match=r"1,000,012 rays per frame \(1,000,000 of the rig's .*, 12 of the reference\)"):
+    message = r"1,000,012 rays per frame \(1,000,000 of the rig's .*, 12 of the reference\)"
+    with pytest.raises(ValueError, match=message):
         Simulator(scenario, rigs, PaperReference(rows=3, columns=4))
     fits = Simulator(scenario, {}, PaperReference(rows=3, columns=4))
     with pytest.raises(ValueError, match=r"1,000,000 of the reference\): 0.3 GB"):

@@ -1,4 +1,4 @@
-"""Meshes that lie: sheets that face the wrong way, faces that are there twice, decals, bodies with holes."""
+"""Mesh checks: flipped sheets, repeated faces, decals, bodies with holes."""
 
 import warnings
 
@@ -76,19 +76,19 @@ def test_coincident_faces_have_the_same_visible_side():
     def counts(*meshes):
         return [int(mask.sum()) for mask in find_coincident_faces(meshes, [False] * len(meshes))]
 
-    assert counts(plane, cube) == [0, 0]  # it stands on the plane, and nobody sees its bottom
+    assert counts(plane, cube) == [0, 0]  # its bottom on the plane is invisible
     assert counts(plane, decal)[1] == 2
     assert counts(plane, decal)[0] >= 1
     assert counts(plane, far) == [0, 0]
     assert counts(plane, plane) == [2, 2]
     assert counts(cube, cube) == [12, 12]
-    # A pavement whose top is in the plane of a sheet, whichever way the sheet looks.
+    # The top of a sidewalk is in the plane of a sheet, for either orientation of the sheet.
     sunk = Mesh(cube.vertices_m - [0, 0, 2], cube.faces)
     assert counts(turned(plane, slice(None)), sunk)[1] == counts(plane, sunk)[1] == 2
 
 
 def test_the_chunk_size_changes_no_result(monkeypatch):
-    """A mesh of ten million is looked at in parts: of hills, a ball, and a patch of the hills once more."""
+    """Large meshes are processed in chunks: hills, a ball, and a repeated patch of the hills."""
     hills, ball = grid(), Ellipsoid(type="ellipsoid", size_m=(9, 9, 9)).build_mesh()
     hills = hills._replace(vertices_m=hills.vertices_m + [0, 0, 1] * np.sin(hills.vertices_m[:, :1]))
     meshes = [hills, ball, hills.select_faces(np.arange(30, 50))]

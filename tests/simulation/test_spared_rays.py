@@ -1,4 +1,4 @@
-"""Rays that hit nothing near what is asked about are not cast, and what is near is the same to the bit."""
+"""Omitted rays: rays that cannot give needed points are not cast, and needed points are identical."""
 
 import numpy as np
 import pytest
@@ -40,7 +40,7 @@ def scene():
 
 
 def is_near(scan, balls):
-    """(N,) of its points, which ones lie in a ball."""
+    """Return the (N,) mask of points within a sphere."""
     away_m = np.linalg.norm(scan.points[:, None].astype(float) - balls.centers_m, axis=2)
     return (away_m <= balls.radius_m).any(axis=1)
 
@@ -71,7 +71,7 @@ def test_needed_points_do_not_change_by_a_bit(scene, name, radius_m):
 
 
 def test_rays_are_selected_if_they_pass_spheres():
-    """But for some millimetres, and a millimetre in a metre far away; at the sensor every ray is."""
+    """Up to some millimeters, plus a millimeter per meter of range; a sphere at the sensor selects all rays."""
     generator = np.random.default_rng(5)
     directions = compute_unit_directions(np.linspace(-89, 89, 50)[:, None], np.linspace(-179, 179, 100)[None])
     pose = ROOF.to_matrix()
@@ -91,7 +91,7 @@ def test_rays_are_selected_if_they_pass_spheres():
 
 @pytest.mark.parametrize("name", ["lidar", "camera"])
 def test_many_points_share_larger_spheres(scene, name):
-    """All rays of their own are among those of balls that hold them; where nearly all are, none is spared."""
+    """Larger spheres select all rays of the spheres that they replace; if nearly all are needed, all are cast."""
     sensor, instant = SENSORS[name], scene.get_snapshot(0, max_distance_m=90.0)
     mounted, generator = MountedSensor(sensor, scene, 90.0), np.random.default_rng(9)
     full = mounted.scan(instant, SensorNoise(np.random.default_rng(7), num_rays=len(mounted.ray_pixel_indices)))

@@ -1,4 +1,4 @@
-"""Stages: which worlds are built, which are kept, and what they share."""
+"""Scene stores: built, cached and shared objects."""
 
 import gc
 import weakref
@@ -9,7 +9,7 @@ import pytest
 
 from torchcover.simulation import PaperReference, Rig, Scenario, Simulator, stage
 
-# Six instants a run.
+# Six frames per run.
 SHORT = Scenario.model_validate(
     {
         "name": "lot",
@@ -28,7 +28,7 @@ ORDER = np.random.default_rng(0).permutation(24).tolist()
 
 @pytest.fixture
 def built(monkeypatch):
-    """The numbers of the runs whose worlds were built, in order."""
+    """Record the runs whose scenes were built, in order."""
     episodes, world = [], Scenario.build_scene
 
     def counted(self, seed=0, run_index=0, ego_mesh=None):
@@ -44,7 +44,7 @@ def simulator():
 
 
 def places(made):
-    """Of each step in a shuffled order, where the ego is in its world."""
+    """Get the ego position of each frame, in a shuffled order."""
     scenes = {index: made.get_scene_geometry(index) for index in ORDER}
     return {index: scene.scene.ego.trajectory.positions_m[step] for index, (scene, step) in scenes.items()}
 
@@ -59,13 +59,14 @@ def test_shuffled_frames_build_each_scene_once(built):
 @pytest.mark.parametrize(("room_for", "workers"), [(0.5, 1), (2.5, 1), (2.5, 4)])
 def test_cached_scenes_stay_within_the_budget(monkeypatch, built, room_for, workers):
     size = simulator().get_scene_geometry(0)[0].num_bytes
-    monkeypatch.setattr(stage, "find_memory_limit_bytes", lambda: room_for * size / stage.SceneStoreParams().max_memory_share)
+    memory_bytes = room_for * size / stage.SceneStoreParams().max_memory_share
+    monkeypatch.setattr(stage, "find_memory_limit_bytes", lambda: memory_bytes)
     monkeypatch.setattr(stage, "get_worker_info", lambda: SimpleNamespace(num_workers=workers))
     built.clear()
     made = simulator()
     for run in (0, 1, 0, 2, 0, 1):
         made.get_scene_geometry(6 * run)
-    # Two worlds at most: 2 takes the place of 1, which was asked for longest ago.
+    # At most two scenes: scene 2 replaces scene 1, the least recently used.
     assert built == ([0, 1, 2, 1] if room_for / workers > 2 else [0, 1, 0, 2, 0, 1])
 
 

@@ -1,4 +1,4 @@
-"""The surface reference: its weights add up to the area that is seen, whatever the number of rays and places."""
+"""Surface reference: weights add up to the visible area, for any number of rays and positions."""
 
 import math
 import pickle
@@ -69,7 +69,7 @@ def test_surface_without_ground_changes_no_number(at, tmp_path, pit, m2):
         metric.update(*clouds, heights_m=torch.from_numpy(step.reference_heights_m))
     assert metric.compute().counts["no_ground_points"] == sum(map(int, map(np.sum, in_no_band))) > 0
     without = Simulator(scenario(floor), {}, sensor)
-    if m2 == 4.0 and pit[0][0][2] < 0:  # nothing of the floor is hidden, and no number of the floor is drawn otherwise
+    if m2 == 4.0 and pit[0][0][2] < 0:  # the floor is fully visible, and its random numbers are the same
         for index, (step, mask) in enumerate(pairs):
             assert np.array_equal(step.reference[~mask], without.simulate_frame(index).reference)
 
@@ -99,7 +99,7 @@ def test_two_sided_sheets_count_once(at, tmp_path):
     agrees(sums(scenario(both, FLOOR), sensor), 4 * 1.5)
 
 
-@pytest.mark.filterwarnings("ignore:.*faces lie within 1 mm")  # inside out, the bottom looks up as the floor does
+@pytest.mark.filterwarnings("ignore:.*faces lie within 1 mm")  # inside out, the bottom points up like the floor
 @pytest.mark.parametrize("inside_out", [False, True])
 def test_only_facing_sides_of_a_box_count(at, tmp_path, inside_out):
     made = trimesh.creation.box(extents=[2, 2, 1.5])
@@ -126,7 +126,7 @@ def test_half_occluded_walls_have_half_the_area(at):
 def test_the_ego_occludes_without_being_sampled(at):
     at([0.0, 0.0, 2.0])  # half a metre above the roof
     around = SurfaceReference((((-5.0, 5.0), (-5.0, 5.0)),), num_rays=2000, num_poses=1, bands_m=ALL_HEIGHTS)
-    # The shadow of the roof, four times as far from the place as the roof is.
+    # The shadow of the roof, at four times the distance of the roof.
     agrees(sums(scenario(box([1, 1, 1], x_m=90), FLOOR), around), 100.0 - 10.0 * 8.0)
     seen = Simulator(scenario(FLOOR), {}, around).simulate_frame(0)
     assert np.abs(seen.reference[:, 2]).max() < 1e-4
@@ -151,7 +151,7 @@ def test_the_mean_is_independent_of_sample_sizes():
         assert abs(few.mean() - many.mean()) < 4 * error
         assert error < 0.1 * many.mean() or rays == 1
         spread[rays, places] = few.std()
-    # More places a step say more, at the same number of rays.
+    # More positions per frame reduce the error, at the same number of rays.
     assert spread[1024, 4] < 0.75 * spread[1024, 1]
 
 
@@ -235,7 +235,7 @@ def test_invalid_settings_are_refused(options, message):
 
 
 def test_surface_hidden_from_roadside_rigs_is_undetected():
-    """A wall of 4 m, 10 m from a mast of 6 m, hides the ground to x = 30 m from all that looks from the mast."""
+    """A wall of 4 m, 10 m from a mast of 6 m, hides the ground up to x = 30 m from the mast."""
     wall = {"name": "wall", "shape": {"type": "box", "size_m": [0.5, 100, 4]}, "poses": [{"x_m": 10}]}
     floor = {"name": "floor", "shape": {"type": "plane", "size_m": [300, 300]}, "ground": True}
     mast = {"shape": {"type": "cylinder", "radius_m": 0.1, "height_m": 6}, "pose": {}}

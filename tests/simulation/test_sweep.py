@@ -1,4 +1,4 @@
-"""Rays that are cast one after the other hit what they would have hit, each at its own time."""
+"""Motion distortion: each ray has the hit of its own time."""
 
 from dataclasses import replace
 
@@ -29,14 +29,14 @@ def box(*size_m):
 
 
 def driving(start, way, turn_deg=0.0):
-    """Ten seconds, from before the world begins."""
+    """Build a trajectory of ten seconds that begins before the scene."""
     return Trajectory.from_arrays(
         [-5.0, 5.0], [np.subtract(start, way), np.add(start, way)], [[-turn_deg, 0, 0], [turn_deg, 0, 0]]
     )
 
 
 def world(ego_mps=0.0, cars_mps=0.0, turn_deg=0.0, step_s=PERIOD_S):
-    """An ego between two walls, with a car that comes closer beside it and one that crosses far ahead."""
+    """Build an ego between two walls, an approaching car next to it, and a car that crosses far ahead."""
     ground, wall = Plane(type="plane", size_m=(400, 400)).build_mesh(), box(60, 0.5, 4)
     walls = [wall.transform(Pose(y_m=y_m).to_matrix()) for y_m in (-9.0, 12.0)]
     ego = Actor("ego", "ego", box(4, 2, 1), driving((0, 0, 0), (5 * ego_mps, 0, 0), turn_deg))
@@ -55,7 +55,7 @@ def swept(made, time_s=0.5, lidar=LIDAR, draws=EXACT):
     ("ego_mps", "cars_mps", "turn_deg"), [(20.0, 0.0, 0.0), (0.0, 15.0, 0.0), (20.0, 15.0, 0.0), (20.0, 15.0, 150.0)]
 )
 def test_columns_equal_scans_at_their_own_time(ego_mps, cars_mps, turn_deg):
-    """The slow twin: the whole scene is placed anew for each column."""
+    """Compared with a slow implementation that places the whole scene for each column."""
     made = world(ego_mps, cars_mps, turn_deg)
     mounted, seen = swept(made)
     _, raw = swept(made, lidar=LIDAR.model_copy(update={"scan": ScanTimes(period_s=PERIOD_S, deskewed=False)}))
@@ -99,7 +99,7 @@ def test_static_scenes_give_identical_bits():
     _, at_once = swept(world(), lidar=LIDAR.model_copy(update={"scan": None}))
     np.testing.assert_array_equal(still.points.view(np.int32), at_once.points.view(np.int32))
     assert still.measured_points is None
-    # An ego that stands, in a world in which others drive: what rests is the same, and its landed points are true.
+    # An ego at rest among moving actors: hits on static bodies are the same, and their measured points are exact.
     moving = world(cars_mps=15.0)
     _, seen = swept(moving)
     _, at_once = swept(moving, lidar=LIDAR.model_copy(update={"scan": None}))
@@ -112,7 +112,7 @@ def test_static_scenes_give_identical_bits():
 
 @pytest.mark.parametrize("car_mps", [0.0, 12.0])
 def test_motion_distortion_is_speed_times_time(car_mps):
-    """The rear of a car ahead, 8 m before an ego at 20 m/s, at the frame's time: three clouds in closed form."""
+    """The rear of a car 8 m ahead of an ego at 20 m/s: three clouds in closed form."""
     made = world(ego_mps=20.0)
     car = Actor("car", "car", box(4, 6, 1.5), driving((20.0 - car_mps / 2, 0, 0), (5 * car_mps, 0, 0)))
     mounted, seen = swept(replace(made, static_meshes=made.static_meshes[:1], actors=(car,)))
@@ -123,15 +123,15 @@ def test_motion_distortion_is_speed_times_time(car_mps):
     rear = (seen.points[:, 2] > 0.3) & (seen.points[:, 2] < 1.4) & (np.abs(seen.points[:, 0] - 8.0) < 0.01)
     landed = seen.points if seen.measured_points is None else seen.measured_points
     assert rear.sum() > 5
-    # As it came from the sensor: by the speed relative to the ego.
+    # Without motion compensation: distorted by the speed relative to the ego.
     np.testing.assert_allclose(as_cast_m[rear, 0], 8.0 + (car_mps - 20.0) * time_s[rear], atol=2e-3)
-    # With the ego's motion undone: by the car's own, and what stands is where it is.
+    # With motion compensation: distorted by the speed of the car only; static points are exact.
     np.testing.assert_allclose(landed[rear, 0], 8.0 + car_mps * time_s[rear], atol=2e-3)
     assert np.ptp(landed[rear, 0]) == pytest.approx(car_mps * np.ptp(time_s[rear]), abs=2e-3)
 
 
 def test_first_frames_are_simulated_like_later_frames():
-    """Before a world begins it is told from how it goes on."""
+    """Motion before the begin of a scene is taken from its first frames."""
     made = world(ego_mps=20.0)
     made = replace(made, static_meshes=made.static_meshes[:1], actors=())
     (_, first), (_, later), (_, at_once) = (
@@ -161,7 +161,7 @@ def test_lidar_columns_and_camera_rows_are_consecutive(sensor, axis):
 
 
 def test_range_errors_are_along_the_distorted_ray():
-    """Along the ray as it was cast, from where the sensor was then."""
+    """Errors are along the ray as it was cast, from the sensor position at that time."""
     made = world(ego_mps=20.0)
     exact, erring = (
         swept(made, lidar=LIDAR.model_copy(update={"range_noise_m": sigma_m}), draws=draws)[1]

@@ -33,7 +33,7 @@ def test_csv_columns_may_have_any_order(tmp_path):
 
 @pytest.mark.parametrize("unit", ["rad", "deg"])
 def test_headings_that_look_like_radians_are_reported(tmp_path, unit):
-    """A bend to the left, backwards, and parked cars; degrees of the same drives are no cause for a warning."""
+    """A left bend, a reverse drive, and parked cars; the same drives in degrees cause no warning."""
     turn = np.linspace(0.0, 1.2, 30)
     for way, place in ((turn, 1.0), (turn + np.pi, -1.0)):
         x_m, y_m = place * 20 * np.sin(turn), place * 20 * (1 - np.cos(turn))
@@ -91,7 +91,7 @@ UNIX_S = 1_700_000_000
 
 
 def scenario_at(folder, ego_s, actor_s, boxes_s):
-    """A run of 4 s of an ego, an actor and a box that drive at 2, 3 and 4 m/s from times of their own clocks."""
+    """Build a run of 4 s of an ego, an actor and a box at 2, 3 and 4 m/s, each with a different start time."""
     for name, start_s, speed in (("ego", ego_s, 2), ("actor", actor_s, 3)):
         rows = "".join(f"{start_s + k / 4:.6f},{speed * k / 4},{10 * speed},0,0,0,0\n" for k in range(17))
         write(folder, HEADER + rows, f"{name}.csv")

@@ -1,4 +1,4 @@
-"""The built-in vehicles are closed, stand on the ground, and have the size and the silhouette of the real ones."""
+"""Built-in vehicles: closed, on the ground, with the size and silhouette of real vehicles."""
 
 import numpy as np
 import pytest
@@ -30,7 +30,7 @@ SIZES_M = {
     "volkswagen_multivan": (4.973, 1.941, 1.903),
     "volkswagen_passat_estate": (4.775, 1.820, 1.516),
 }
-# Rear axle behind the centre as in the rig of the same car, and wheelbase.
+# Rear axle behind the center as in the rig of the same car, and wheelbase.
 AXLES_M = {
     "chrysler_pacifica": (1.461, 3.089),
     "ford_fusion": (1.339, 2.850),
@@ -49,7 +49,7 @@ def load(name):
 
 
 def height_at(mesh, x_m, y_m):
-    """Height of the highest surface over a point of the ground; -inf where there is none."""
+    """Compute the height of the highest surface over a ground position; -inf without surface."""
     a, b, c = (mesh.vertices_m[mesh.faces[:, corner]] for corner in range(3))
 
     def area(p, q, r):
@@ -64,7 +64,7 @@ def height_at(mesh, x_m, y_m):
 
 
 def profile(mesh, x_m):
-    """The outline of a vehicle along its middle."""
+    """Compute the height profile of a vehicle along its center line."""
     return np.array([height_at(mesh, x, 0.013) for x in x_m])
 
 
@@ -92,7 +92,7 @@ def test_every_part_is_closed_and_faces_outwards(name):
 
 @pytest.mark.parametrize("name", SIZES_M)
 def test_left_and_right_are_mirror_images(name):
-    # Part by part: the corners of all copies of a part, and of their mirror image, are the same points.
+    # For each part, the corners of all copies and of their mirror image are the same points.
     for part in load(name).parts:
         corners = np.concatenate([mesh.vertices_m for mesh in part.build_meshes()])
         rounded = {tuple(corner) for corner in (np.round(corners, 6) + 0.0).tolist()}
@@ -127,7 +127,7 @@ def test_cars_have_hood_windscreen_and_roof(name):
     assert 0.4 * roof < hood < 0.72 * roof
     front_of_roof = x[outline > 0.95 * roof].max()
     foot = x[outline > hood + 0.05].max()
-    # The windscreen: between foot and roof the outline falls all the way, at a rake of 25 to 65 degrees.
+    # Windscreen: between its foot and the roof the profile is monotonic, at a rake of 25 to 65 degrees.
     windscreen = outline[(x > front_of_roof) & (x < foot)]
     assert (np.diff(windscreen) < 0).all()
     rake = np.rad2deg(np.arctan2(0.95 * roof - hood - 0.05, foot - front_of_roof))

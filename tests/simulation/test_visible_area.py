@@ -1,4 +1,4 @@
-"""The surface reference beside its slow twin: rays over directions, each weighted with the area that it stands for."""
+"""Surface reference compared with a slow implementation: rays over directions, weighted by area."""
 
 import numpy as np
 import pytest
@@ -12,11 +12,11 @@ from torchcover.simulation import Scenario, Simulator, SurfaceReference, sample_
 
 
 def visible_area(scene, place_m, box_m, rays, seed, max_range_m=250.0):
-    """Points on the surface within a box that a place sees, and the square metres that each stands for.
+    """Compute visible surface points within a box from a position, with the area in m² of each.
 
-    Rays aim at points drawn evenly from the box, so that there are rays * (far^3 - near^3) / (3 volume) of them for
-    each solid angle, where near and far are where they enter and leave it. One that hits at a distance d under an angle
-    stands for d^2 / |cos| of surface for each solid angle; |cos| is never clipped.
+    Rays aim at points sampled uniformly in the box, so that their density per solid angle is
+    rays * (far^3 - near^3) / (3 volume), where near and far are the ranges at which they enter and leave the box. A hit
+    at distance d represents d^2 / |cos| of surface per solid angle; |cos| is never clipped.
     """
     low, high = np.array(box_m, dtype=np.float64).T
     evenly = SobolEngine(3, scramble=True, seed=seed).draw(rays, dtype=torch.float64).numpy()
@@ -38,7 +38,7 @@ def visible_area(scene, place_m, box_m, rays, seed, max_range_m=250.0):
 
 
 def _scene(world, step):
-    """Everything at one time in the vehicle frame, first the ego."""
+    """Build the scene at one time in the vehicle frame, the ego first."""
     time_s = step * world.time_step_s
     vehicle_T_world = invert(world.ego.trajectory.interpolate(time_s))
     scene = EmbreeScene(robust=True)
@@ -82,8 +82,8 @@ def test_both_references_measure_the_same_visible_area(made, seed, monkeypatch):
 
 
 def _sums(found, low, high):
-    """Square metres in a band, and the sums over them of the distance from the vehicle and of y."""
+    """Compute the area in a band, and the area-weighted sums of the distance from the vehicle and of y."""
     points_m, m2 = (np.concatenate(part).astype(np.float64) for part in zip(*found, strict=True))
     m2 = m2 * (points_m[:, 2] >= low) * (points_m[:, 2] < high)
-    # The twin's box is a little higher than the bands: its rays are few at its borders.
+    # The box is slightly higher than the bands, since its rays are few at the borders.
     return np.array([m2.sum(), (m2 * np.linalg.norm(points_m, axis=1)).sum(), (m2 * points_m[:, 1]).sum()])
