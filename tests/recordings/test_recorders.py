@@ -220,7 +220,7 @@ def test_incomplete_recording_is_refused_and_can_be_resumed(both, simulated_once
         ValueError, match=r"part: an incomplete recording with 2 frames; .* `torchcover record --resume`"
     ):
         open_recording(tmp_path / "part")
-    with pytest.raises(ValueError, match=r"holds a part of a recording, 2 frames; go on with it \(--resume\), or"):
+    with pytest.raises(ValueError, match=r"holds a part of a recording, 2 frames; continue it \(--resume\), or"):
         write_recording(both, tmp_path / "part", layout)
     write_recording(both, tmp_path / "part", layout, resume=True)
     write_recording(both, tmp_path / "part", layout, resume=True)  # there is nothing left to do
@@ -244,7 +244,7 @@ def test_different_recordings_cannot_be_resumed(both, simulated_once, tmp_path):
     for folder in (tmp_path / "part", tmp_path / "whole"):
         with pytest.raises(ValueError, match=rf"{folder.name}: of another recording, with another rig both, boxes; ch"):
             write_recording(simulated(REAR, steps=3, boxes=False), folder, resume=True)
-        with pytest.raises(ValueError, match=rf"{folder.name}: . frames are there; got 1 steps; choose another folder"):
+        with pytest.raises(ValueError, match=rf"{folder.name}: . frames are there; got 1; choose another folder"):
             write_recording(simulated(FRONT, REAR, steps=1), folder, resume=True)
 
 

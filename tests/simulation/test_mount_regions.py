@@ -9,7 +9,7 @@ import trimesh
 
 from torchcover.simulation import list_builtin_names
 from torchcover.simulation.bodies import Vehicle, VehicleShape, get_mount_regions
-from torchcover.simulation.mount_regions import SEEN_FROM, MountRegion, Skin
+from torchcover.simulation.mount_regions import SIDE_VIEWS, MountRegion, Skin
 from torchcover.simulation.shapes import Box, Mesh
 
 ROBOT = Path(__file__).parents[2] / "examples" / "robot" / "robot.yaml"
@@ -50,7 +50,7 @@ def test_a_region_is_one_patch_that_looks_to_its_side(name):
     """No place beside another lies on another part, nor on a wall that only seems to be seen from there."""
     (vehicle, skin), shares = loaded(name), np.linspace(0.0, 1.0, 5)
     for region in vehicle.mount_regions.values():
-        axis, sign = SEEN_FROM[region.side]
+        axis, sign = SIDE_VIEWS[region.side][:2]
         points = [[region.find_mount_point(skin, u, v) for v in shares] for u in shares]
         places_m = np.array([[point.position_m for point in row] for row in points])
         assert min(sign * point.normal[axis] for row in points for point in row) > 0.5
@@ -83,11 +83,11 @@ def test_regions_are_nothing_to_a_simulation():
     assert suv.collect_content() == suv.model_copy(update={"mount_regions": {}}).collect_content()
 
 
-@pytest.mark.parametrize("side", SEEN_FROM)
+@pytest.mark.parametrize("side", SIDE_VIEWS)
 def test_outwards_is_where_one_looks_from_whichever_way_faces_turn(side):
     turned = Skin(Mesh(BOX.mesh.vertices_m, BOX.mesh.faces[:, ::-1]))
     across_m = (0.1, 0.2)
-    axis, sign = SEEN_FROM[side]
+    axis, sign = SIDE_VIEWS[side][:2]
     for skin in (BOX, turned):
         point = skin.find_surface_point(side, across_m)
         assert point.normal == pytest.approx(sign * np.eye(3)[axis])
@@ -102,7 +102,7 @@ def test_a_line_through_an_edge_that_two_faces_share_meets_one_of_them():
 
 @pytest.mark.parametrize(("side", "facing_deg"), [("above", 0), ("front", 0), ("rear", 180), ("left", 90)])
 def test_a_sensor_faces_outwards_unless_the_region_says_where_to(side, facing_deg):
-    axis = SEEN_FROM[side][0]
+    axis = SIDE_VIEWS[side].axis
     window = {f"{other}_m": (0.1, 0.5) for other in "xyz" if other != "xyz"[axis]}
     assert MountRegion(side=side, **window).heading_deg == facing_deg
     assert MountRegion(side=side, facing_deg=45.0, **window).heading_deg == 45.0
@@ -125,5 +125,5 @@ def test_a_region_that_is_none_is_refused(keys, message):
 
 def test_a_place_beside_the_body_is_refused():
     beyond = MountRegion(side="above", x_m=(1.0, 3.0), y_m=(-0.5, 0.5))
-    with pytest.raises(ValueError, match=r"x = 3\.000 m, y = 0\.000 m \(u = 1, v = 0\.5\) nothing of the body"):
+    with pytest.raises(ValueError, match=r"x = 3\.000 m, y = 0\.000 m \(u = 1, v = 0\.5\) the body has no surface"):
         beyond.find_mount_point(BOX, 1.0, 0.5)

@@ -1,4 +1,4 @@
-"""Write what a simulated rig saw as a recording, for any tool that reads its layout."""
+"""Recordings of simulated rigs, for any tool that reads their layout."""
 
 import hashlib
 import json
@@ -12,10 +12,6 @@ from torchcover.recordings.recording import read_recording_manifest
 from torchcover.simulation.lidar import Lidar
 from torchcover.simulation.simulated_frames import SimulatedFrames
 
-# Between the last step of a city and the first of the next, or of the same world again: no reference of a recording is
-# accumulated over so long a time.
-APART_S = 1000.0
-
 
 def write_recording(
     frames: SimulatedFrames,
@@ -25,30 +21,31 @@ def write_recording(
     resume: bool = False,
     progress: Callable[[range], Iterable[int]] = iter,
 ) -> None:
-    """Write what a simulated rig saw: clouds, the reference, boxes where the frames have them, mounts and poses.
+    """Write the clouds of a simulated rig, the reference, boxes if the frames have them, mounts and poses.
 
-    `recording.json` lists its files; until all of them are there, it says so, and the part is not read.
+    `recording.json` lists the files. Until all of them are written, it marks the recording as incomplete, and
+    incomplete recordings are not read.
 
     Args:
-        frames: A simulation of one rig.
-        folder: Where to; made if it does not exist.
-        layout: A name in `RECORDERS`: "folder" (`FolderRecording` reads it, with the numbers of the simulation), or
-            "kitti" (KITTI's object layout, of one LiDAR).
-        resume: Whether to go on after the last step that is there, whatever ended the process that wrote it.
-        progress: Is given the numbers of the steps and passes them on, as `tqdm.tqdm` does.
+        frames: Simulation of one rig.
+        folder: Output folder; created if it does not exist.
+        layout: A name in `RECORDERS`: "folder" (`FolderRecording` reads it, with the same numbers as the simulation),
+            or "kitti" (KITTI's object layout, of one LiDAR).
+        resume: Whether to continue after the last frame that was written before the process ended.
+        progress: Iterates over the indices of the frames, as `tqdm.tqdm` does.
 
     Raises:
-        ValueError: An unknown layout, a folder that is not empty, several rigs, or sensors that the layout cannot hold;
-            a part of another recording.
+        ValueError: An unknown layout, a folder that is not empty, several rigs, sensors that the layout cannot hold,
+            or a part of another recording.
 
     Example:
         >>> import tempfile
-        >>> from torchcover.data import RecordedFrames, SimulatedFrames
+        >>> from torchcover.data import RecordedFrames
         >>> frames = SimulatedFrames("courtyard", "front_roof_32", num_frames=1)
         >>> with tempfile.TemporaryDirectory() as folder:
         ...     write_recording(frames, folder)
-        ...     again = RecordedFrames(folder)[0]
-        >>> len(again.sensor) == len(frames[0].sensor), again.reference_weights is None
+        ...     recorded = RecordedFrames(folder)[0]
+        >>> len(recorded.sensor) == len(frames[0].sensor), recorded.reference_weights is None
         (True, False)
     """
     folder = Path(folder)
@@ -58,48 +55,69 @@ def write_recording(
         raise ValueError(f"a recording is of one rig; got {', '.join(frames.rigs)}")
     manifest = read_recording_manifest(folder / RECORDING) if (folder / RECORDING).exists() else {}
     files = AtomicOutput(folder, RECORDING, manifest.get("files"))
-    recorder = RECORDERS[layout](files.add, _setup(frames))
-    content = {"layout": layout, **_hashes(frames.content)}
-    names = [_name(index) for index in range(len(frames))]
-    if resume and manifest and not manifest.get(WRITING):
-        _check_same(folder, manifest["content"], content, manifest["frames"], names)
+    recorder = RECORDERS[layout](files.add, build_recording_setup(frames))
+    content = {"layout": layout, **hash_values(frames.content)}
+    names = [format_frame_name(index) for index in range(len(frames))]
+    is_incomplete = bool(manifest.get(WRITING))
+    if resume and manifest and not is_incomplete:
+        check_same_recording(folder, manifest["content"], content, manifest["frames"], names)
         return
-    if manifest.get(WRITING) and not resume:
+    if is_incomplete and not resume:
         raise ValueError(
-            f"{folder}: holds a part of a recording, {len(manifest['steps']):,} frames; go on with it (--resume), or "
+            f"{folder}: holds a part of a recording, {len(manifest['steps']):,} frames; continue it (--resume), or "
             "choose another folder"
         )
-    if not manifest.get(WRITING) and folder.exists() and (not folder.is_dir() or any(folder.glob("[!.]*"))):
+    if not is_incomplete and folder.exists() and (not folder.is_dir() or any(folder.glob("[!.]*"))):
         raise ValueError(f"{folder}: {'not empty' if folder.is_dir() else 'a file'}; a new or empty folder is needed")
-    steps = list(manifest.get("steps", ()))
-    _check_same(folder, manifest.get("content") or content, content, steps, names[: len(steps)])
+    records = list(manifest.get("steps", ()))
+    check_same_recording(folder, manifest.get("content") or content, content, records, names[: len(records)])
     with files:
-        files.publish({WRITING: True, "content": content, "steps": steps})
-        for index in progress(range(len(steps), len(frames))):
-            steps.append(recorder.write(_step(frames, index)))
-            files.publish({WRITING: True, "content": content, "steps": steps})
-        recorder.finish(steps)
+        files.publish({WRITING: True, "content": content, "steps": records})
+        for index in progress(range(len(records), len(frames))):
+            records.append(recorder.write(build_frame_record(frames, index)))
+            files.publish({WRITING: True, "content": content, "steps": records})
+        recorder.finish(records)
         files.publish({"content": content, "frames": names})
 
 
-def _check_same(
-    folder: Path, there: Mapping[str, str], here: Mapping[str, str], frames: Sequence[object], wanted: Sequence[str]
+def check_same_recording(
+    folder: Path,
+    written_content: Mapping[str, str],
+    content: Mapping[str, str],
+    written_frames: Sequence[object],
+    frame_names: Sequence[str],
 ) -> None:
-    """Find out whether what is there is a part, or the whole, of what is to be written."""
-    if other := [name for name in here if there.get(name) != here[name]]:
-        raise ValueError(f"{folder}: of another recording, with another {', '.join(other)}; choose another folder")
-    if len(frames) != len(wanted):
+    """Check that an existing recording is the one to be written, or a part of it.
+
+    Args:
+        folder: Folder of the recording.
+        written_content: Hashes of the settings of the existing recording.
+        content: Hashes of the settings of the recording to be written.
+        written_frames: Existing frames.
+        frame_names: Expected frames.
+
+    Raises:
+        ValueError: They differ.
+    """
+    if changed := [name for name in content if written_content.get(name) != content[name]]:
+        raise ValueError(f"{folder}: of another recording, with another {', '.join(changed)}; choose another folder")
+    if len(written_frames) != len(frame_names):
         raise ValueError(
-            f"{folder}: {len(frames):,} frames are there; got {len(wanted):,} steps; choose another folder"
+            f"{folder}: {len(written_frames):,} frames are there; got {len(frame_names):,}; choose another folder"
         )
 
 
-def _hashes(content: Mapping[str, object]) -> dict[str, str]:
-    texts = {name: json.dumps(value, sort_keys=True, default=repr) for name, value in content.items()}
-    return {name: hashlib.sha256(text.encode()).hexdigest() for name, text in texts.items()}
+def hash_values(content: Mapping[str, object]) -> dict[str, str]:
+    """Hash each value of a mapping, as its JSON text."""
+    hashes = {}
+    for name, value in content.items():
+        text = json.dumps(value, sort_keys=True, default=repr)
+        hashes[name] = hashlib.sha256(text.encode()).hexdigest()
+    return hashes
 
 
-def _setup(frames: SimulatedFrames) -> RecordingSetup:
+def build_recording_setup(frames: SimulatedFrames) -> RecordingSetup:
+    """Build the description of a recording from the rig and the scenario of simulated frames."""
     (rig,) = frames.rigs.values()
     return RecordingSetup(
         rig.name,
@@ -111,25 +129,37 @@ def _setup(frames: SimulatedFrames) -> RecordingSetup:
     )
 
 
-def _step(frames: SimulatedFrames, index: int) -> FrameRecord:
+def build_frame_record(frames: SimulatedFrames, index: int) -> FrameRecord:
+    """Simulate one frame for a recording.
+
+    Args:
+        frames: Simulation of one rig.
+        index: Index of the frame.
+
+    Returns:
+        Clouds with measured points, pose, time and reference.
+    """
     ((name, rig),) = frames.rigs.items()
-    seen = frames.simulator.simulate_frame(index)
-    landed = [scan.points if scan.measured_points is None else scan.measured_points for scan in seen.scans[name]]
-    scene, step = frames.simulator.get_scene_geometry(index)
-    world = scene.scene
-    played = (
-        round(index * frames.frame_interval_s / world.time_step_s) // world.num_time_steps
-        if world.num_time_steps > 1
-        else 0
-    )
+    simulated = frames.simulator.simulate_frame(index)
+    clouds = {}
+    for sensor, scan in zip(rig.sensors, simulated.scans[name], strict=True):
+        clouds[sensor.name] = scan.points if scan.measured_points is None else scan.measured_points
+    geometry, step = frames.simulator.get_scene_geometry(index)
+    scene = geometry.scene
+    scene_index = 0
+    if scene.num_time_steps > 1:
+        scene_index = round(index * frames.frame_interval_s / scene.time_step_s) // scene.num_time_steps
+    # Scenes, and repetitions of a scene, are far apart in time, so that no reference accumulates scans of two of them.
+    scene_gap_s = 1000.0
     return FrameRecord(
-        _name(index),
-        index * frames.frame_interval_s + played * APART_S,
-        world.ego.trajectory.interpolate(step * world.time_step_s),
-        {sensor.name: cloud for sensor, cloud in zip(rig.sensors, landed, strict=True)},
-        frames.build_frame(seen, index),
+        format_frame_name(index),
+        index * frames.frame_interval_s + scene_index * scene_gap_s,
+        scene.ego.trajectory.interpolate(step * scene.time_step_s),
+        clouds,
+        frames.build_frame(simulated, index),
     )
 
 
-def _name(index: int) -> str:
+def format_frame_name(index: int) -> str:
+    """Format the name of a frame, which sorts like its index."""
     return f"{index:06d}"

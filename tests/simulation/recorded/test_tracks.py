@@ -281,7 +281,7 @@ def test_who_is_where_the_ego_is_is_left_out_and_named(tmp_path):
     above = Somebody("sign", "sign", (4.0, 1.8, 0.5), (20.0, 0.0), 0.0)
     folder = write_csv(tmp_path, (*OTHERS, inside, above))
     rewrite(folder / "boxes.csv", lambda row: raised(row, 5.0, "sign"))
-    with pytest.warns(UserWarning, match=r"boxes.csv: 1 of 11 tracks are where the ego is at some time \('inside'\)"):
+    with pytest.warns(UserWarning, match=r"boxes.csv: 1 of 11 tracks overlap the ego vehicle at some time \('inside'\)"):
         names = [actor.name for actor in drive_of(folder).build_scene().actors]
     assert "inside" not in names
     assert "sign" in names
@@ -379,7 +379,7 @@ def test_what_was_not_recorded_is_drawn_if_asked_for_and_stands_where_nobody_was
     for actor in (drawn.ego, *drawn.actors):
         for place_m in actor.trajectory.positions_m[:, :2]:
             assert np.linalg.norm(houses_m - place_m, axis=1).min() > 2.0
-    said = "Drawn, not recorded: what stands beside the tracks, with houses on 100% of the sides."
+    said = "Sampled, not recorded: scenery along the tracks, with houses on 100% of the sides."
     for traffic, notes in ((scenario(path), []), (scenario(path, built_share=1.0), [said])):
         record = SimulatedFrames(traffic, RIG, num_frames=1, reference_sensor=FEW).reference_record
         assert [note for note in record["notes"] if "own vehicle" not in note] == notes

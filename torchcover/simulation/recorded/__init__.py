@@ -1,1 +1,1 @@
-"""Recorded tracks as scenarios."""
+"""Scenarios of recorded tracks."""
