@@ -1,6 +1,8 @@
-"""A town drawn for SUMO: its plan with lanes, bays, curves and hills of our own, and traffic without destination."""
+"""Sampled town for SUMO: a plan with lanes, parking bays, bends and hills, and traffic without destinations."""
 
 from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
 from xml.etree import ElementTree
@@ -20,33 +22,60 @@ from torchcover.simulation.traffic.hills import Hills
 from torchcover.simulation.traffic.kind import PeoplePerKm, VehiclesPerKm
 
 NetworkLayout = Literal["rand", "grid", "spider"]
+StreetEnds = tuple[str, str]  # names of the nodes at both ends of a street, in alphabetical order
 
-LANE_M, BICYCLE_LANE_M, BAY_M = 3.25, 1.8, 2.3
-SIDEWALK_M = (2.4, 3.4)
-MEDIAN_M = (0.8, 1.8)
-# Shares of the streets that have them.
-WITH_BAYS, WITH_BICYCLE_LANES, WITH_MEDIAN = 0.7, 0.5, 0.3
-# Two streets that do not meet keep so far apart, middle to middle: the plan knows no widths.
-APART_M = 40.0
-BEND_PIECES = 10
-# Of kerbs at corners; nobody turns there with more than so much to the side, by much. Curves are judged over a length
-# within which drivers round them.
-CORNER_M, TURN_MPS2, CURVE_M = 6.0, 2.0, 5.0
+
+@dataclass(frozen=True)
+class TownParams:
+    """Dimensions of streets.
+
+    Args:
+        lane_m: Width of lanes.
+        bicycle_lane_m: Width of bicycle lanes.
+        bay_m: Width of parking bays.
+        sidewalk_m: Smallest and largest width of sidewalks.
+        median_m: Smallest and largest width of half of a median.
+        bay_share: Share of the street sides with parking bays.
+        bicycle_lane_share: Share of the street sides with bicycle lanes.
+        median_share: Share of the street sides with a median.
+        min_clearance_m: Smallest distance between the centerlines of two streets that do not meet.
+        num_segments: Number of straight segments of a bend.
+        corner_radius_m: Radius of curbs at corners.
+        turning_mps2: Lateral acceleration of vehicles in turns.
+        curve_m: Length over which the curvature of a turn is measured; drivers round curves within it.
+    """
+
+    lane_m: float = 3.25
+    bicycle_lane_m: float = 1.8
+    bay_m: float = 2.3
+    sidewalk_m: tuple[float, float] = (2.4, 3.4)
+    median_m: tuple[float, float] = (0.8, 1.8)
+    bay_share: float = 0.7
+    bicycle_lane_share: float = 0.5
+    median_share: float = 0.3
+    min_clearance_m: float = 40.0
+    num_segments: int = 10
+    corner_radius_m: float = 6.0
+    turning_mps2: float = 2.0
+    curve_m: float = 5.0
+
+
+TOWN = TownParams()
 
 
 class RandomStreets(Document):
-    """Streets and traffic that are drawn from a seed.
+    """Streets and traffic that are sampled from a seed.
 
     Args:
-        layout: Their plan; one of the three is drawn if not given.
-        max_lanes_per_direction: The most of a street, each way.
-        speed_limit_mps: What is allowed.
-        max_bend_ratio: How far the middle of a street may lie aside of the straight line, as a share of its length.
-        hill_height_std_m: Height of the hills, as a standard deviation; 0 is a plain.
-        traffic_per_km: Vehicles to a kilometre of lane.
-        buses_per_km: Buses among them.
-        cyclists_per_km: Likewise, beside them.
-        people_per_km: To a kilometre of sidewalk.
+        layout: Plan of the streets; sampled if None.
+        max_lanes_per_direction: Largest number of lanes in each direction.
+        speed_limit_mps: Speed limit.
+        max_bend_ratio: Largest offset of the middle of a street from the straight line, as a share of its length.
+        hill_height_std_m: Standard deviation of the ground height; 0 is a plane.
+        traffic_per_km: Vehicles per kilometer of lane.
+        buses_per_km: Buses per kilometer of lane, in addition.
+        cyclists_per_km: Cyclists per kilometer of lane that they may use.
+        people_per_km: Pedestrians per kilometer of sidewalk.
     """
 
     layout: NetworkLayout | None = None
@@ -60,144 +89,179 @@ class RandomStreets(Document):
     people_per_km: PeoplePerKm = 16.0
 
     def build_network(self, folder: Path, generator: np.random.Generator) -> Path:
-        """Draw a network, and write it into a folder."""
-        plan = self.layout or str(generator.choice(["rand", "grid", "spider"]))
+        """Sample a network.
+
+        Args:
+            folder: Folder of the network file.
+            generator: Random generator.
+
+        Returns:
+            The network file.
+        """
+        layout = self.layout or str(generator.choice(["rand", "grid", "spider"]))
         prefix = folder / "plan"
         seed = str(generator.integers(1 << 31))
-        run_program("netgenerate", *_options(plan, generator), "--seed", seed, "--plain-output-prefix", prefix)
-        nodes = {
-            node.get("id", ""): (float(node.get("x", "")), float(node.get("y", "")))
-            for node in parse_xml(prefix.with_suffix(".nod.xml")).iter("node")
-        }
+        options = _sample_layout_options(layout, generator)
+        run_program("netgenerate", *options, "--seed", seed, "--plain-output-prefix", prefix)
+        nodes_m = {}
+        for node in parse_xml(prefix.with_suffix(".nod.xml")).iter("node"):
+            nodes_m[node.get("id", "")] = (float(node.get("x", "")), float(node.get("y", "")))
         edges = list(parse_xml(prefix.with_suffix(".edg.xml")).iter("edge"))
         hills = Hills(self.hill_height_std_m, generator)
-        node_file, edge_file, network = folder / "nodes.xml", folder / "edges.xml", folder / "drawn.net.xml"
-        edge_file.write_text(self._edges(nodes, edges, hills, generator), encoding="utf-8")
-        rows = [
-            f'<node id={quoteattr(name)} x="{x:.3f}" y="{y:.3f}" z="{z:.3f}"/>'
-            for (name, (x, y)), z in zip(
-                nodes.items(), hills.compute_heights_m(np.array(list(nodes.values()))), strict=True
-            )
-        ]
-        node_file.write_text(f"<nodes>{''.join(rows)}</nodes>", encoding="utf-8")
+        node_file, edge_file, network_file = folder / "nodes.xml", folder / "edges.xml", folder / "drawn.net.xml"
+        edge_file.write_text(self._format_edges(nodes_m, edges, hills, generator), encoding="utf-8")
+        node_file.write_text(_format_nodes(nodes_m, hills), encoding="utf-8")
         run_program(
-            "netconvert", "--node-files", node_file, "--edge-files", edge_file, "--output-file", network,
+            "netconvert", "--node-files", node_file, "--edge-files", edge_file, "--output-file", network_file,
             "--precision", "3", "--tls.guess", "--walkingareas", "--crossings.guess",
             "--no-turnarounds.except-deadend",
-            "--default.junctions.radius", str(CORNER_M), "--junctions.internal-link-detail", "12",
+            "--default.junctions.radius", str(TOWN.corner_radius_m), "--junctions.internal-link-detail", "12",
         )  # fmt: skip
-        drawn = parse_xml(network)
-        for lane in drawn.iterfind("edge[@function='internal']/lane"):
-            line_m = np.array([place.split(",")[:2] for place in lane.get("shape", "").split()], dtype=np.float64)
+        network = parse_xml(network_file)
+        for lane in network.iterfind("edge[@function='internal']/lane"):
+            line_m = np.array([text.split(",")[:2] for text in lane.get("shape", "").split()], dtype=np.float64)
             lane.set("speed", f"{min(self.speed_limit_mps, compute_turning_speed_mps(line_m)):.2f}")
-        ElementTree.ElementTree(drawn).write(network)
-        return network
+        ElementTree.ElementTree(network).write(network_file)
+        return network_file
 
-    def _edges(
+    def _format_edges(
         self,
-        nodes: dict[str, tuple[float, float]],
-        edges: list[ElementTree.Element],
+        nodes_m: Mapping[str, tuple[float, float]],
+        edges: Sequence[ElementTree.Element],
         hills: Hills,
         generator: np.random.Generator,
     ) -> str:
-        streets: dict[tuple[str, str], list[tuple[str, str, str]]] = {}
+        """Format the edges of bent streets for netconvert."""
+        edges_by_street: dict[StreetEnds, list[tuple[str, str, str]]] = {}
         for edge in edges:
-            name, start, end = (edge.get(key, "") for key in ("id", "from", "to"))
-            streets.setdefault((min(start, end), max(start, end)), []).append((name, start, end))
-        ways: dict[tuple[str, str], shapely.LineString] = {}
-        for ends in streets:
-            start_m, end_m = (np.array(nodes[end]) for end in ends)
-            way = shapely.LineString(self._bent(start_m, end_m, generator))
-            if all(set(ends) & set(others) or way.distance(other) >= APART_M for others, other in ways.items()):
-                ways[ends] = way
+            name, start, end = edge.get("id", ""), edge.get("from", ""), edge.get("to", "")
+            edges_by_street.setdefault((min(start, end), max(start, end)), []).append((name, start, end))
+        lines: dict[StreetEnds, shapely.LineString] = {}
+        for ends in edges_by_street:
+            start_m, end_m = np.array(nodes_m[ends[0]]), np.array(nodes_m[ends[1]])
+            line = shapely.LineString(self._sample_bend(start_m, end_m, generator))
+            is_clear = True
+            for other_ends, other_line in lines.items():
+                meets = set(ends) & set(other_ends)
+                is_clear &= bool(meets or line.distance(other_line) >= TOWN.min_clearance_m)
+            if is_clear:
+                lines[ends] = line
+        # Junctions are level: all streets are level at their ends.
+        shares = np.linspace(0.0, 1.0, TOWN.num_segments + 1)
         rows = []
-        for ends in _without_dead_ends(list(ways)):
-            way_m, lanes = shapely.get_coordinates(ways[ends]), self._lanes(generator)
-            # Junctions are level: so are the ends of all that meet there.
-            share = np.linspace(0.0, 1.0, BEND_PIECES + 1)
-            from_m, to_m = hills.compute_heights_m(way_m[[0, -1]])
-            climb_m = from_m + (to_m - from_m) * share**2 * (3 - 2 * share)
-            places = [f"{x:.3f},{y:.3f},{z:.3f}" for (x, y), z in zip(way_m, climb_m, strict=True)]
-            for name, start, end in streets[ends]:
-                shape = " ".join(places if start == ends[0] else places[::-1])
+        for ends in remove_dead_ends(list(lines)):
+            line_m, lanes = shapely.get_coordinates(lines[ends]), self._sample_lanes(generator)
+            start_height_m, end_height_m = hills.compute_heights_m(line_m[[0, -1]])
+            heights_m = start_height_m + (end_height_m - start_height_m) * shares**2 * (3 - 2 * shares)
+            positions = [f"{x:.3f},{y:.3f},{z:.3f}" for (x, y), z in zip(line_m, heights_m, strict=True)]
+            for name, start, end in edges_by_street[ends]:
+                shape = " ".join(positions if start == ends[0] else positions[::-1])
                 rows.append(
                     f"<edge id={quoteattr(name)} from={quoteattr(start)} to={quoteattr(end)} "
-                    f'numLanes="{lanes.count("<lane")}" speed="{self.speed_limit_mps:.2f}" shape="{shape}">{lanes}</edge>'
+                    f'numLanes="{lanes.count("<lane")}" speed="{self.speed_limit_mps:.2f}" shape="{shape}">{lanes}'
+                    "</edge>"
                 )
         return f"<edges>{''.join(rows)}</edges>"
 
-    def _bent(self, start_m: Float64, end_m: Float64, generator: np.random.Generator) -> Float64:
-        """(K, 2) a way that leaves both ends straight."""
-        share = np.linspace(0.0, 1.0, BEND_PIECES + 1)[:, None]
-        along = end_m - start_m
-        aside = generator.uniform(-self.max_bend_ratio, self.max_bend_ratio) * np.sin(np.pi * share) ** 2
-        return np.asarray(start_m + share * along + aside * np.array([-along[1], along[0]]))
+    def _sample_bend(self, start_m: Float64, end_m: Float64, generator: np.random.Generator) -> Float64:
+        """Sample a line (K, 2) that leaves both ends straight."""
+        shares = np.linspace(0.0, 1.0, TOWN.num_segments + 1)[:, None]
+        along_m = end_m - start_m
+        bend_ratio = generator.uniform(-self.max_bend_ratio, self.max_bend_ratio)
+        offsets = bend_ratio * np.sin(np.pi * shares) ** 2
+        return np.asarray(start_m + shares * along_m + offsets * np.array([-along_m[1], along_m[0]]))
 
-    def _lanes(self, generator: np.random.Generator) -> str:
-        """One side of a street, from the houses inwards."""
-        lanes = [('allow="pedestrian"', generator.uniform(*SIDEWALK_M))]
-        if generator.random() < WITH_BAYS:
-            lanes.append(('type="parking" disallow="all"', BAY_M))
-        if self.cyclists_per_km > 0 and generator.random() < WITH_BICYCLE_LANES:
-            lanes.append(('allow="bicycle"', BICYCLE_LANE_M))
-        lanes += [('disallow="pedestrian"', LANE_M)] * int(generator.integers(1, self.max_lanes_per_direction + 1))
-        if generator.random() < WITH_MEDIAN:
-            lanes.append(('type="median" disallow="all"', generator.uniform(*MEDIAN_M)))
-        return "".join(f'<lane index="{k}" {who} width="{width:.2f}"/>' for k, (who, width) in enumerate(lanes))
+    def _sample_lanes(self, generator: np.random.Generator) -> str:
+        """Sample the lanes of one side of a street, from the houses inwards."""
+        lanes = [('allow="pedestrian"', generator.uniform(*TOWN.sidewalk_m))]
+        if generator.random() < TOWN.bay_share:
+            lanes.append(('type="parking" disallow="all"', TOWN.bay_m))
+        if self.cyclists_per_km > 0 and generator.random() < TOWN.bicycle_lane_share:
+            lanes.append(('allow="bicycle"', TOWN.bicycle_lane_m))
+        num_lanes = int(generator.integers(1, self.max_lanes_per_direction + 1))
+        lanes += [('disallow="pedestrian"', TOWN.lane_m)] * num_lanes
+        if generator.random() < TOWN.median_share:
+            lanes.append(('type="median" disallow="all"', generator.uniform(*TOWN.median_m)))
+        rows = []
+        for index, (attributes, width_m) in enumerate(lanes):
+            rows.append(f'<lane index="{index}" {attributes} width="{width_m:.2f}"/>')
+        return "".join(rows)
+
+
+def _format_nodes(nodes_m: Mapping[str, tuple[float, float]], hills: Hills) -> str:
+    heights_m = hills.compute_heights_m(np.array(list(nodes_m.values())))
+    rows = []
+    for (name, (x, y)), z in zip(nodes_m.items(), heights_m, strict=True):
+        rows.append(f'<node id={quoteattr(name)} x="{x:.3f}" y="{y:.3f}" z="{z:.3f}"/>')
+    return f"<nodes>{''.join(rows)}</nodes>"
 
 
 def compute_turning_speed_mps(line_m: Float64) -> float:
-    """How fast a turn, (K, 2) places of its lane, may be driven: where it is tightest, not on its average."""
+    """Compute the speed at which a turn can be driven, from its tightest part.
+
+    Args:
+        line_m: (K, 2) centerline.
+    """
     steps_m = np.diff(line_m, axis=0)
     lengths_m = np.hypot(*steps_m.T)
-    turned = np.unwrap(np.arctan2(steps_m[:, 1], steps_m[:, 0]))
+    headings_rad = np.unwrap(np.arctan2(steps_m[:, 1], steps_m[:, 0]))
     middles_m = np.cumsum(lengths_m) - lengths_m / 2
-    further = np.abs(np.interp(middles_m + CURVE_M, middles_m, turned) - turned)
-    return float(np.sqrt(TURN_MPS2 * CURVE_M / max(further.max(), 1e-6)))
+    turns_rad = np.abs(np.interp(middles_m + TOWN.curve_m, middles_m, headings_rad) - headings_rad)
+    return float(np.sqrt(TOWN.turning_mps2 * TOWN.curve_m / max(turns_rad.max(), 1e-6)))
 
 
-def _without_dead_ends(streets: list[tuple[str, str]]) -> list[tuple[str, str]]:
-    """Those that go on at both ends; all, if none does."""
-    kept = streets
+def remove_dead_ends(streets: list[StreetEnds]) -> list[StreetEnds]:
+    """Remove streets that do not continue at both ends, repeatedly; all streets are kept if none would remain."""
+    remaining = streets
     while True:
-        met = Counter(end for ends in kept for end in ends)
-        fewer = [ends for ends in kept if all(met[end] > 1 for end in ends)]
-        if len(fewer) == len(kept):
-            return kept or streets
-        kept = fewer
+        counts: Counter[str] = Counter()
+        for ends in remaining:
+            counts.update(ends)
+        continuing = [ends for ends in remaining if counts[ends[0]] > 1 and counts[ends[1]] > 1]
+        if len(continuing) == len(remaining):
+            return remaining or streets
+        remaining = continuing
 
 
-def _options(plan: str, generator: np.random.Generator) -> list[str]:
-    def drawn(low: float, high: float) -> str:
-        return f"{generator.uniform(low, high):.1f}"
-
-    if plan == "rand":
-        options = ["--rand", "--rand.iterations", "45", "--rand.min-distance", "90", "--rand.max-distance", "200"]
-    elif plan == "grid":
-        options = ["--grid", "--grid.number", "5", "--grid.x-length", drawn(90, 150), "--grid.y-length", drawn(90, 150)]
-    else:
-        arms = str(generator.integers(5, 8))
-        options = ["--spider", "--spider.arm-number", arms, "--spider.circle-number", "3"]
-        options += ["--spider.space-radius", drawn(100, 140), "--spider.omit-center"]
-    return options
+def _sample_layout_options(layout: str, generator: np.random.Generator) -> list[str]:
+    """Sample the options of netgenerate for a layout."""
+    if layout == "rand":
+        return ["--rand", "--rand.iterations", "45", "--rand.min-distance", "90", "--rand.max-distance", "200"]
+    if layout == "grid":
+        x_m, y_m = generator.uniform(90, 150), generator.uniform(90, 150)
+        return ["--grid", "--grid.number", "5", "--grid.x-length", f"{x_m:.1f}", "--grid.y-length", f"{y_m:.1f}"]
+    num_arms, radius_m = generator.integers(5, 8), generator.uniform(100, 140)
+    options = ["--spider", "--spider.arm-number", str(num_arms), "--spider.circle-number", "3"]
+    return [*options, "--spider.space-radius", f"{radius_m:.1f}", "--spider.omit-center"]
 
 
-# Nobody is so much faster than what is allowed, nor walks faster.
-FASTER = 1.1
-WALKING_MPS = 2.2
-SLOWEST_MPS = 1.0
-# They brake as drivers do who are not in an emergency.
-DRIVERS = f'decel="3.5" speedFactor="normc(1,0.1,0.8,{FASTER})"'
-# The ego is one of those who have its length; which one, is found out when they have driven.
-EGO_TYPE, EGOS = "ego", 8
-MAX_AGENTS = 20_000
+@dataclass(frozen=True)
+class RandomTrafficParams:
+    """Sampled traffic of a town.
+
+    Args:
+        max_speed_factor: Largest desired speed, as a factor on the speed limit.
+        min_speed_mps: Smallest speed limit that counts for the length of routes.
+        walking_mps: Largest speed of pedestrians.
+        num_ego_candidates: Number of vehicles from which the ego vehicle is chosen after the simulation.
+        max_agents: Largest number of vehicles and people.
+    """
+
+    max_speed_factor: float = 1.1
+    min_speed_mps: float = 1.0
+    walking_mps: float = 2.2
+    num_ego_candidates: int = 8
+    max_agents: int = 20_000
 
 
-# Weight by our kinds of bodies.
-TRAFFIC = {"sedan": 4.0, "hatchback": 4.0, "suv": 3.0, "pickup": 0.5, "van": 1.5, "lorry": 1.0, "truck": 0.2}
-TRAFFIC |= {"motorcycle": 0.6}
-PEOPLE = {"adult": 5.0, "child": 1.0}
-CLASSES = {"truck": "truck", "bus": "bus", "motorcycle": "motorcycle", "cyclist": "bicycle"}
+TRAFFIC = RandomTrafficParams()
+EGO_TYPE = "ego"  # type of the candidates, which have the length of the ego vehicle
+# Weights of the kinds of vehicles and pedestrians.
+VEHICLE_WEIGHTS = {
+    "sedan": 4.0, "hatchback": 4.0, "suv": 3.0, "pickup": 0.5, "van": 1.5, "lorry": 1.0, "truck": 0.2,
+    "motorcycle": 0.6,
+}  # fmt: skip
+PEDESTRIAN_WEIGHTS = {"adult": 5.0, "child": 1.0}
 
 
 def write_routes(
@@ -208,87 +272,123 @@ def write_routes(
     duration_s: float,
     generator: np.random.Generator,
 ) -> None:
-    """Write vehicles and people, all of whom set off at 0.
+    """Write routes of vehicles and pedestrians that all start at time 0.
 
-    ValueError: no street that cars may use leads anywhere, or there would be more than 20,000.
+    Args:
+        path: File of the routes.
+        network: Network.
+        random_streets: Densities of the traffic.
+        fleet: Bodies.
+        duration_s: Duration for which the routes must suffice.
+        generator: Random generator.
+
+    Raises:
+        ValueError: No street for cars leads to another one, or there would be too many vehicles and people.
     """
-    rows = [
-        f'<vType id="{kind}" vClass="pedestrian"/>'
-        if category == "pedestrian"
-        else f'<vType id="{kind}" vClass="{CLASSES.get(category, "passenger")}" length="{fleet.get_length_m(kind):.2f}" '
-        f'width="{fleet.get_width_m(kind):.2f}" {DRIVERS}/>'
-        for kind, category in {**CATEGORIES, EGO_TYPE: "car"}.items()
-    ]
-    roads = _Ways(network, "passenger", "road")
-    if not roads.length_m.any():
+    roads = RouteSampler(network, "passenger", "road")
+    if not roads.start_lengths_m.any():
         raise ValueError(
             "the network has no street that cars may use and that leads on to another one: give routes instead of "
             "random, or a larger network"
         )
-    cycling, walking = _Ways(network, "bicycle", "road"), _Ways(network, "passenger", "sidewalk")
-    groups = [
-        ({EGO_TYPE: 1.0}, roads, float(EGOS)),
-        (TRAFFIC, roads, random_streets.traffic_per_km * roads.lanes_km - EGOS),
-        ({"bus": 1.0}, _Ways(network, "bus", "road"), random_streets.buses_per_km * roads.lanes_km),
+    cycling, walking = RouteSampler(network, "bicycle", "road"), RouteSampler(network, "passenger", "sidewalk")
+    num_vehicles = random_streets.traffic_per_km * roads.lanes_km - TRAFFIC.num_ego_candidates
+    groups: list[tuple[dict[str, float], RouteSampler, float]] = [
+        ({EGO_TYPE: 1.0}, roads, float(TRAFFIC.num_ego_candidates)),
+        (VEHICLE_WEIGHTS, roads, num_vehicles),
+        ({"bus": 1.0}, RouteSampler(network, "bus", "road"), random_streets.buses_per_km * roads.lanes_km),
         ({"cyclist": 1.0}, cycling, random_streets.cyclists_per_km * cycling.lanes_km),
-        (PEOPLE, walking, random_streets.people_per_km * walking.lanes_km),
+        (PEDESTRIAN_WEIGHTS, walking, random_streets.people_per_km * walking.lanes_km),
     ]
-    if (everybody := sum(number for _, _, number in groups)) > MAX_AGENTS:
+    num_agents = sum(count for _, _, count in groups)
+    if num_agents > TRAFFIC.max_agents:
         raise ValueError(
-            f"traffic of about {everybody:,.0f} vehicles and people; at most {MAX_AGENTS:,} are drawn: lower the "
-            "numbers to a kilometre, or take a piece of the network"
+            f"traffic of about {num_agents:,.0f} vehicles and people; at most {TRAFFIC.max_agents:,} are sampled: lower "
+            "the numbers per kilometer, or take a piece of the network"
         )
-    for mix, ways, number in groups:
-        on_foot = mix is PEOPLE
-        speed_mps = WALKING_MPS if on_foot else FASTER * max(ways.speed_mps, SLOWEST_MPS)
-        for k in range(round(number) if ways.length_m.any() else 0):
-            kind = EGO_TYPE if EGO_TYPE in mix else fleet.sample_kind(mix)
-            way = ways.draw(speed_mps * duration_s, generator)
-            if on_foot and generator.random() < 0.5:
-                way = way[::-1]
-            who, edges = f'id="{kind}.{k}" type="{kind}" depart="0"', quoteattr(" ".join(way))
-            rows.append(
-                f'<person {who} departPos="random"><walk edges={edges}/></person>'
-                if on_foot
-                else f'<vehicle {who} departPos="random_free" departLane="best"><route edges={edges}/></vehicle>'
-            )
+    rows = [_format_vehicle_type(kind, category, fleet) for kind, category in {**CATEGORIES, EGO_TYPE: "car"}.items()]
+    for weights, sampler, count in groups:
+        is_walking = weights is PEDESTRIAN_WEIGHTS
+        max_speed_mps = TRAFFIC.max_speed_factor * max(sampler.max_speed_mps, TRAFFIC.min_speed_mps)
+        length_m = (TRAFFIC.walking_mps if is_walking else max_speed_mps) * duration_s
+        for index in range(round(count) if sampler.start_lengths_m.any() else 0):
+            kind = EGO_TYPE if EGO_TYPE in weights else fleet.sample_kind(weights)
+            edges = sampler.sample_route(length_m, generator)
+            if is_walking and generator.random() < 0.5:
+                edges = edges[::-1]
+            attributes, route = f'id="{kind}.{index}" type="{kind}" depart="0"', quoteattr(" ".join(edges))
+            if is_walking:
+                rows.append(f'<person {attributes} departPos="random"><walk edges={route}/></person>')
+            else:
+                attributes += ' departPos="random_free" departLane="best"'
+                rows.append(f"<vehicle {attributes}><route edges={route}/></vehicle>")
     path.write_text(f"<routes>{''.join(rows)}</routes>", encoding="utf-8")
 
 
-class _Ways:
-    """Draws ways of vehicles of a class, or of those who walk beside them."""
+def _format_vehicle_type(kind: str, category: str, fleet: Fleet) -> str:
+    """Format the type of a body for SUMO; drivers brake as they do when it is not an emergency."""
+    if category == "pedestrian":
+        return f'<vType id="{kind}" vClass="pedestrian"/>'
+    classes = {"truck": "truck", "bus": "bus", "motorcycle": "motorcycle", "cyclist": "bicycle"}
+    vehicle_class = classes.get(category, "passenger")
+    return (
+        f'<vType id="{kind}" vClass="{vehicle_class}" length="{fleet.get_length_m(kind):.2f}" '
+        f'width="{fleet.get_width_m(kind):.2f}" decel="3.5" speedFactor="normc(1,0.1,0.8,{TRAFFIC.max_speed_factor})"/>'
+    )
 
-    def __init__(self, network: Network, vehicle_class: str, use: str) -> None:
-        follow = network.find_successors(vehicle_class)
+
+class RouteSampler:
+    """Sampler of routes of vehicles, or of pedestrians along the streets of vehicles.
+
+    Args:
+        network: Network.
+        vehicle_class: Vehicle class.
+        use: "road", or "sidewalk" for pedestrians.
+
+    Attributes:
+        start_lengths_m: (E,) length of the lanes of each edge on which a route may start.
+        lanes_km: Their total length.
+        max_speed_mps: Largest speed limit.
+    """
+
+    def __init__(self, network: Network, vehicle_class: str, use: Literal["road", "sidewalk"]) -> None:
+        successors = network.find_successors(vehicle_class)
         if use == "sidewalk":
-            walked = {lane.edge_id for lane in network.lanes if lane.use == use}
-            follow = {edge: tuple(walked & set(after)) for edge, after in follow.items() if edge in walked}
-        self._follow = {edge: tuple(sorted(after)) for edge, after in follow.items()}
-        lanes = [
-            lane
-            for lane in network.lanes
-            if lane.use == use
-            and lane.edge_id in self._follow
-            and (use == "sidewalk" or lane.is_allowed(vehicle_class))
-        ]
-        self._edges = list(self._follow)
-        number = {edge: k for k, edge in enumerate(self._edges)}
-        self._long_m = np.zeros(len(self._edges))  # of each edge, once
-        self.length_m = np.zeros(len(self._edges))  # of its lanes together, if one may begin there
-        for lane in lanes:
-            long_m = float(np.linalg.norm(np.diff(lane.line_m, axis=0), axis=1).sum())
-            self._long_m[number[lane.edge_id]] = long_m
-            self.length_m[number[lane.edge_id]] += long_m * bool(self._follow[lane.edge_id])
-        self._number = number
-        self.lanes_km = float(self.length_m.sum()) / 1000
-        self.speed_mps = max((lane.speed_mps for lane in lanes), default=0.0)
+            walkable = {lane.edge_id for lane in network.lanes if lane.use == use}
+            successors = {
+                edge: tuple(sorted(walkable & set(following)))
+                for edge, following in successors.items()
+                if edge in walkable
+            }
+        self._successors = successors
+        self._edges = list(successors)
+        self._indices = {edge: index for index, edge in enumerate(self._edges)}
+        self._lengths_m = np.zeros(len(self._edges))
+        self.start_lengths_m = np.zeros(len(self._edges))
+        self.max_speed_mps = 0.0
+        for lane in network.lanes:
+            is_usable = use == "sidewalk" or lane.is_allowed(vehicle_class)
+            if lane.use != use or lane.edge_id not in successors or not is_usable:
+                continue
+            length_m = float(np.linalg.norm(np.diff(lane.line_m, axis=0), axis=1).sum())
+            index = self._indices[lane.edge_id]
+            self._lengths_m[index] = length_m
+            self.start_lengths_m[index] += length_m * bool(successors[lane.edge_id])
+            self.max_speed_mps = max(self.max_speed_mps, lane.speed_mps)
+        self.lanes_km = float(self.start_lengths_m.sum()) / 1000
 
-    def draw(self, length_m: float, generator: np.random.Generator) -> list[str]:
-        """Edges that follow each other, of a length together, or to where nothing follows."""
-        way = [self._edges[int(generator.choice(len(self._edges), p=self.length_m / self.length_m.sum()))]]
-        gone_m = 0.0
-        while gone_m < length_m and (follow := self._follow[way[-1]]):
-            way.append(follow[int(generator.integers(len(follow)))])
-            # A way is never so long as the number of its edges could get where they have no length.
-            gone_m += max(float(self._long_m[self._number[way[-1]]]), 1.0)
-        return way
+    def sample_route(self, length_m: float, generator: np.random.Generator) -> list[str]:
+        """Sample successive edges.
+
+        Args:
+            length_m: Length of the route, if it does not end before.
+            generator: Random generator.
+        """
+        shares = self.start_lengths_m / self.start_lengths_m.sum()
+        route = [self._edges[int(generator.choice(len(self._edges), p=shares))]]
+        driven_m = 0.0
+        while driven_m < length_m and (successors := self._successors[route[-1]]):
+            route.append(successors[int(generator.integers(len(successors)))])
+            # Edges without length count 1 m, so that a route ends.
+            driven_m += max(float(self._lengths_m[self._indices[route[-1]]]), 1.0)
+        return route
