@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from torchcover.contrib import SMig
-from torchcover.contrib.s_mig import build_occupancy, build_occupancy_rows
+from torchcover.contrib.occupancy import build_occupancy, build_occupancy_rows
 from torchcover.contrib.voxels import VoxelGrid
 from torchcover.detection import Boxes
 from torchcover.geometry import BoundingBox
@@ -54,7 +54,7 @@ def test_a_rig_without_rays_in_the_region_has_the_highest_value_of_all():
     above = value(s_mig([beam(z_m=5.0)], half))
     assert above.value == 0.0 > value(s_mig([beam(z_m=1.0)], half)).value
     assert (above.parameters["voxels_crossed"], above.parameters["rays"]) == (0, 1)
-    assert "is 0 without any ray" in above.warning
+    assert "is 0 without rays" in above.warning
 
 
 def test_rays_end_with_the_range_of_their_sensor():

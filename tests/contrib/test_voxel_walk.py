@@ -102,7 +102,7 @@ def test_order_and_division_and_length_of_directions_do_not_matter(monkeypatch):
     parts = find_crossed_voxels(MIDDLE, origins[:100], directions[:100], ends[:100])
     assert parts is find_crossed_voxels(MIDDLE, origins[100:], directions[100:], ends[100:], output=parts)
     assert np.array_equal(whole, parts)
-    monkeypatch.setattr("torchcover.contrib.voxels.RAYS_AT_ONCE", 7)
+    monkeypatch.setattr("torchcover.contrib.voxels.RAYS_PER_CHUNK", 7)
     assert np.array_equal(whole, find_crossed_voxels(MIDDLE, origins, directions, ends))
 
 

@@ -289,7 +289,7 @@ KITTI_LABEL = b"Car 0.00 0 1.5 100 100 200 200 1.5 1.6 3.9 1.0 1.6 20.0 1.5\n" *
 def checkpoint(folder):
     """A checkpoint of one observer."""
     path = Path(folder) / "checkpoint.npz"
-    run = {"steps": 3, "counts": {"sensor_rays": 9}, "skipped": [], "seconds": 1.5}
+    run = {"num_frames": 3, "counts": {"sensor_rays": 9}, "skipped_frames": [], "duration_s": 1.5}
     state = {"dense": torch.arange(1, 40), "sparse": torch.eye(20, dtype=torch.float64), "looks": [1, None, "two"]}
     write_checkpoint(path, {"identity": {"seed": "0"}, "run": run}, {"one": state})
     return path.read_bytes()

@@ -66,7 +66,7 @@ def seen_once(search):
     for _ in range(45):
         once.merge_state(metric)
     found = once.compute()
-    right = found.probed_steps.flatten().tolist() == [4096, 1]
+    right = found.observed_frames.flatten().tolist() == [4096, 1]
     return most(found.radius.flatten().cpu().numpy() - [0.25, 0.75]) if right else np.inf
 
 
@@ -110,7 +110,7 @@ def on_borders(dtype, search):
     reference = torch.stack([x, torch.full_like(x, 0.05), torch.zeros_like(x)], dim=1)
     metric.update(search.cloud([0.0, 0.0, 0.0]), reference.to(search.device))
     found = metric.compute()
-    return wrong(found.points.flatten().tolist(), cells) + abs(found.counts["outside_points"] - cells.count(-1))
+    return wrong(found.point_counts.flatten().tolist(), cells) + abs(found.counts["outside_points"] - cells.count(-1))
 
 
 def wrong(points, cells):
@@ -138,7 +138,7 @@ def coarse_points(dtype, search):
     metric = search.metric(row_of_cells(CELLS, cell=0.1))
     reference = torch.stack([x, torch.full_like(x, 0.05), torch.zeros_like(x)], dim=1)
     metric.update(search.cloud([0.0, 0.0, 0.0], dtype=dtype), reference.to(search.device))
-    return wrong(metric.compute().points.flatten().tolist(), cells)
+    return wrong(metric.compute().point_counts.flatten().tolist(), cells)
 
 
 def coarse_points_by_quotients(dtype):
@@ -163,7 +163,7 @@ def bands(search):
     metric = search.metric(BevGrid(x_m=(0.0, 10.0), y_m=(0.0, 1.0), cell_m=1.0, heights=HEIGHTS))
     reference = np.stack([np.arange(10) + 0.5, np.full(10, 0.5), z], axis=1)
     metric.update(search.cloud([0.0, 0.0, 0.0]), search.cloud(reference, torch.float64))
-    points = metric.compute().points[:, 0].T.tolist()
+    points = metric.compute().point_counts[:, 0].T.tolist()
     return sum(counts != [int(band == k) for k in range(3)] for counts, band in zip(points, expected, strict=True))
 
 
@@ -184,7 +184,7 @@ def region_cells(search):
     for first in range(CELLS - 2):
         low, high = (2 * first + 1) / 20, (2 * first + 5) / 20
         rows = found.summary([Region("part", x_m=(low, high), y_m=(0.0, 0.1))])
-        wrong_cells += abs(rows[0].cells - 2)
+        wrong_cells += abs(rows[0].num_cells - 2)
     return wrong_cells
 
 
@@ -208,7 +208,7 @@ def far_grid(origin_m, search):
         search.cloud(reference + np.array([0.0, 0.0, 0.5]), torch.float64), search.cloud(reference, torch.float64)
     )
     found = metric.compute()
-    return wrong(found.points.flatten().tolist(), range(CELLS)) + int((found.radius != 0.5).sum())
+    return wrong(found.point_counts.flatten().tolist(), range(CELLS)) + int((found.radius != 0.5).sum())
 
 
 def far_grid_in_float32(origin_m):
@@ -237,7 +237,7 @@ def at_thresholds():
 def detections(search):
     reference, sensor = at_thresholds()
     grid = BevGrid(x_m=(0.0, 16.0 * CELLS), y_m=(0.0, 16.0), cell_m=16.0, heights={"all": (-1.0, 9.0)})
-    metric = search.metric(grid, thresholds=THRESHOLDS_M)
+    metric = search.metric(grid, thresholds_m=THRESHOLDS_M)
     metric.update(search.cloud(sensor), search.cloud(reference))
     found = metric.compute().detection[:, 0, 0].diagonal()
     return int((found != 0.5).sum())

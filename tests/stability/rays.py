@@ -202,13 +202,13 @@ def between_slabs(held):
 
 
 def by_its_faces(caster, place_m):
-    return caster.inside(place_m).tolist() == [1]
+    return caster.find_enclosing_bodies(place_m).tolist() == [1]
 
 
 def by_a_ray(caster, place_m):
     """Whether a ray first meets the middle one."""
     towards = np.array([[0.6], [0.0], [0.8]], dtype=np.float32)
-    return caster.cast(place_m, towards, np.array([np.inf], dtype=np.float32)).body[0] == 1
+    return caster.cast(place_m, towards, np.array([np.inf], dtype=np.float32)).body_indices[0] == 1
 
 
 # Cones
@@ -245,7 +245,7 @@ def spared(met_by):
 
 def met_by_cosine(balls, tile, vehicle_T_sensor):
     """By the cosine of the angle to the middle of a ball, in float32."""
-    way_m = ((balls.centres_m[0] - vehicle_T_sensor[:3, 3]) @ vehicle_T_sensor[:3, :3]).astype(np.float32)
+    way_m = ((balls.centers_m[0] - vehicle_T_sensor[:3, 3]) @ vehicle_T_sensor[:3, :3]).astype(np.float32)
     distance_m = np.linalg.norm(way_m)
     with np.errstate(all="ignore"):
         least = np.sqrt(1 - (np.float32(balls.radius_m) / distance_m) ** 2)

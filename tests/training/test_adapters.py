@@ -160,7 +160,7 @@ def test_mmengine_needs_the_square_metres_that_the_metric_wants():
         MMEngineCoverage({"grid": GRID, "has_area_weights": True}, get_frames=lambda batch, _: batch) for _ in range(2)
     )
     without.process([frame], [{}])
-    with pytest.raises(ValueError, match="of each reference point are needed"):
+    with pytest.raises(ValueError, match="area of each reference point in m2 is needed"):
         without.evaluate(1)
     metric.process([replace(frame, reference_weights=torch.ones(9))], [{}])
     metric.evaluate(1)

@@ -21,8 +21,10 @@ TAU_TITLE = "Kendall's tau-b with the coverage numbers, 95 % over scenes"
 NOT_VALIDATED = "None of these metrics is validated; docs/metrics.md lists their limitations."
 TOO_FEW = "Kendall's tau needs at least three rigs, since two have only two orders; got {}"
 # Columns of a table with a row for each rig and number.
-COLUMNS = ("rig", "metric", "name", "value", "error", "low", "high", "unit", "lower_is_better", "count", "counted_items",
-           "parameters", "warning", "rank")  # fmt: skip
+COLUMNS = (
+    *("rig", "metric", "name", "value", "error", "low", "high", "unit", "lower_is_better"),
+    *("count", "counted_items", "parameters", "warning", "rank"),
+)
 
 
 class KendallTau(NamedTuple):

@@ -386,7 +386,12 @@ class FrameMetric(MergeableSums):
 
 
 def describe_number(
-    key: str, unit: str, counted_items: str, *, lower_is_better: bool = False, **parameters: Any
+    key: str,
+    unit: str,
+    counted_items: str,
+    *,
+    lower_is_better: bool = False,
+    **parameters: Any,  # noqa: ANN401  (any parameter of a metric)
 ) -> Number:
     """Describe a number of a metric that has no value yet.
 

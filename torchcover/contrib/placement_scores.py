@@ -1,7 +1,7 @@
-"""What metrics say of several sensor placements, on the same frames, and what they would have said in other worlds."""
+"""Scores of several sensor placements by all metrics in the same frames, with bootstrap values over scenes."""
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -18,32 +18,31 @@ from torchcover.evaluation.evaluating import evaluate
 from torchcover.evaluation.task import AnyRig, load_rig
 from torchcover.simulation import RegionsOfInterest, Scenario
 
-THRESHOLD_M = 0.4
-CELL_M = 1.0
-RADIUS_M = 50.0
-MEASURES: Mapping[Average, str] = {"area": "visible surface", "cells": "observed cells"}
-# Counts what any metric has to beat: how many points there are.
-COUNTS_POINTS, POINTS = "point_density", "points"
-# Of the parts of a number, those about what detectors are judged on.
-CATEGORIES = ("car", "pedestrian", "cyclist")
+DETECTION_THRESHOLD_M = 0.4
 
 
-def build_circle_region(radius_m: float = RADIUS_M) -> Region:
-    """The region around the vehicle, as a polygon with a corner for each degree."""
-    angles = map(math.radians, range(360))
-    corners_m = [(radius_m * math.cos(angle), radius_m * math.sin(angle)) for angle in angles]
+def build_circle_region(radius_m: float = 50.0) -> Region:
+    """Build a circle around the vehicle as a polygon with one corner per degree.
+
+    Args:
+        radius_m: Radius in meters.
+    """
+    corners_m = []
+    for degree in range(360):
+        angle_rad = math.radians(degree)
+        corners_m.append((radius_m * math.cos(angle_rad), radius_m * math.sin(angle_rad)))
     return Region.from_corners(f"{radius_m:g}m_around", corners_m)
 
 
 @dataclass(frozen=True, eq=False)
 class PlacementScores:
-    """What each metric says of each placement.
+    """Scores of placements by several metrics.
 
     Args:
         rigs: Names of the placements.
-        rankings: A row for each metric, with numbers in the order of `rigs`.
-        num_frames: Steps that they were measured in.
-        sensor_models: Name of each placement -> what its sensors made of their hits, `ideal` or `real`.
+        rankings: One ranking per number, with values in the order of `rigs`.
+        num_frames: Number of frames.
+        sensor_models: Sensor model of each placement, `ideal` or `real`.
     """
 
     rigs: tuple[str, ...]
@@ -52,9 +51,13 @@ class PlacementScores:
     sensor_models: Mapping[str, str]
 
     def select(self, rigs: Sequence[str]) -> tuple[Ranking, ...]:
-        """The rows of some of the placements, in another order."""
-        places = [self.rigs.index(rig) for rig in rigs]
-        return tuple(one.select(places) for one in self.rankings)
+        """Select the rankings of some placements.
+
+        Args:
+            rigs: Names of placements in the desired order.
+        """
+        rig_indices = [self.rigs.index(rig) for rig in rigs]
+        return tuple(ranking.select(rig_indices) for ranking in self.rankings)
 
 
 def score_placements(
@@ -66,27 +69,27 @@ def score_placements(
     num_frames: int = 64,
     seed: int = 0,
     sensor_model: Literal["ideal", "real"] | None = None,
-    **settings: Any,  # noqa: ANN401  (those of `evaluate`)
+    **settings: Any,  # noqa: ANN401  (settings of `evaluate`)
 ) -> PlacementScores:
-    """Measure placements in the same frames.
+    """Score placements by all metrics in the same frames.
 
-    torchcover's own numbers are detection at 0.4 m on the ground, on obstacles and the mean of the two, over the
-    visible surface and over the known cells of 1 m.
+    The numbers of torchcover are the detection rate at 0.4 m on the ground, on obstacles and the mean of both, over the
+    visible surface and over the observed cells of 1 m.
 
     Args:
-        rigs: Three or more, by name.
-        scenario: The world.
-        region: Where; a circle of 50 m around the vehicle if not given.
-        metrics: Those of others, of `torchcover.contrib.PUBLISHED`; all if not given. The number of points is always
-            there.
-        num_frames: Steps.
+        rigs: Three or more rigs by name.
+        scenario: Scenario.
+        region: Region; by default a circle of 50 m around the vehicle.
+        metrics: Names of published metrics in `torchcover.contrib.PUBLISHED`; by default all. The number of points is
+            always included as a baseline.
+        num_frames: Number of frames.
         seed: Seed of the traffic.
-        sensor_model: What sensors make of their hits; as for `evaluate`.
-        settings: Others of `evaluate`: `frame_interval_s`, `workers`, `progress`.
+        sensor_model: Sensor model as in `evaluate`.
+        settings: Further settings of `evaluate`: `frame_interval_s`, `workers`, `progress`.
 
     Raises:
-        ValueError: Fewer rigs, an unknown metric, or as `evaluate`.
-        FileNotFoundError: An unknown rig or scenario.
+        ValueError: There are fewer rigs, a metric does not exist, or as in `evaluate`.
+        FileNotFoundError: A rig or the scenario does not exist.
 
     Example:
         >>> rigs = {name: f"place3d2024_{name}" for name in ("center", "line", "pyramid")}
@@ -96,71 +99,81 @@ def score_placements(
     """
     if len(rigs) < LEAST:
         raise ValueError(f"rigs: three or more are needed to speak of ranks; got {', '.join(rigs) or 'none'}")
-    carried = {
-        name: load_rig(rig).apply_sensor_model(sensor_model).model_copy(update={"name": name})
-        for name, rig in rigs.items()
-    }
+    named_rigs = {}
+    for name, rig in rigs.items():
+        named_rigs[name] = load_rig(rig).apply_sensor_model(sensor_model).model_copy(update={"name": name})
     region = build_circle_region() if region is None else region
+    requested_metrics = PUBLISHED if metrics is None else metrics
     result = evaluate(
-        list(carried.values()),
+        list(named_rigs.values()),
         scenario,
-        regions=_around(region),
-        thresholds_m=THRESHOLD_M,
-        metrics=tuple(dict.fromkeys([*(PUBLISHED if metrics is None else metrics), COUNTS_POINTS])),
+        regions=_build_regions_of_interest(region),
+        thresholds_m=DETECTION_THRESHOLD_M,
+        metrics=tuple(dict.fromkeys([*requested_metrics, "point_density"])),
         num_frames=num_frames,
         seed=seed,
         **settings,
     )
     if result.run is not None:
-        result.run.raise_failure()  # ranks of a part of what was asked for would look like the whole
-    assert isinstance(result.metrics, MetricComparison)  # some were requested
-    heights_m = [sum(sensor.mount.z_m for sensor in rig.sensors) / len(rig.sensors) for rig in carried.values()]
+        result.run.raise_failure()  # ranks of an incomplete run would look complete
+    assert isinstance(result.metrics, MetricComparison)  # metrics were requested
+    heights_m, ray_counts = [], []
+    for rig in named_rigs.values():
+        heights_m.append(round(sum(sensor.mount.z_m for sensor in rig.sensors) / len(rig.sensors), 6))
+        ray_counts.append(float(sum(sensor.num_rays for sensor in rig.sensors)))
+    height = Quantity("mean mounting height", "mean mounting height", "m", lower_is_better=False)
+    num_rays = Quantity("rays", "rays", "rays", lower_is_better=False)
     return PlacementScores(
         rigs=tuple(rigs),
         rankings=(
-            *_own([result.coverages[rig] for rig in rigs], region, seed),
-            *_of_others(result.metrics.rankings),
-            _of_rigs("mean mounting height", "m", [round(height_m, 6) for height_m in heights_m]),
-            _of_rigs(
-                "rays", "rays", [float(sum(sensor.num_rays for sensor in rig.sensors)) for rig in carried.values()]
-            ),
+            *_rank_by_coverage([result.coverages[rig] for rig in rigs], region, seed),
+            *_select_published(result.metrics.rankings),
+            Ranking.from_values(height, heights_m),
+            Ranking.from_values(num_rays, ray_counts),
         ),
         num_frames=num_frames,
-        sensor_models={name: rig.sensor_model for name, rig in carried.items()},
+        sensor_models={name: rig.sensor_model for name, rig in named_rigs.items()},
     )
 
 
-def _around(region: Region) -> RegionsOfInterest:
-    """What is asked about: one region, and a grid that just holds it."""
-    x, y = ((math.floor(low), math.ceil(high)) for low, high in (region.x_m, region.y_m))
-    where = {"polygon_m": region.corners_m} if region.corners_m else {"x_m": region.x_m, "y_m": region.y_m}
-    grid = {"x_m": x, "y_m": y, "cell_m": CELL_M}
-    return RegionsOfInterest.model_validate({"regions": {region.name: where}, "grid": grid})
+def _build_regions_of_interest(region: Region) -> RegionsOfInterest:
+    """Build regions of interest with one region and the smallest grid that contains it."""
+    bounds: dict[str, object] = {"x_m": region.x_m, "y_m": region.y_m}
+    if region.corners_m:
+        bounds = {"polygon_m": region.corners_m}
+    grid = {
+        "x_m": (math.floor(region.x_m[0]), math.ceil(region.x_m[1])),
+        "y_m": (math.floor(region.y_m[0]), math.ceil(region.y_m[1])),
+        "cell_m": 1.0,
+    }
+    return RegionsOfInterest.model_validate({"regions": {region.name: bounds}, "grid": grid})
 
 
-def _own(coverages: Sequence[Coverage], region: Region, seed: int) -> Iterator[Ranking]:
-    """Our own: detection over the visible surface and over the known cells, for each band and both."""
-    for measure, words in MEASURES.items():
-        name, bands = f"detection {THRESHOLD_M:g} m, {{}}, {region.name}, {words}", []
+def _rank_by_coverage(coverages: Sequence[Coverage], region: Region, seed: int) -> Iterator[Ranking]:
+    """Rank by the detection rate over visible surface and observed cells, in each band and as mean of both bands."""
+    averages: tuple[tuple[Average, str], ...] = (("area", "visible surface"), ("cells", "observed cells"))
+    for average, description in averages:
+        name = f"detection {DETECTION_THRESHOLD_M:g} m, {{}}, {region.name}, {description}"
+        band_rankings = []
         for band in coverages[0].grid.heights:
-            estimates = [coverage.estimate(region, band, measure)[1:] for coverage in coverages]
+            estimates = [coverage.estimate(region, band, average)[1:] for coverage in coverages]
             numbers = [list(estimate.to_numbers().values()) for estimate in estimates]
-            (one,) = build_rankings(OWN, numbers, estimates, seed)
-            bands.append(one._replace(name=name.format(band)))
-        yield from bands
-        both = np.mean([one.scores for one in bands], axis=0)
-        draws = [one.samples for one in bands if one.samples is not None]
-        again = np.asarray(np.mean(draws, axis=0)) if len(draws) == len(bands) else None
-        yield Ranking.from_values(bands[0].quantity, both, OWN, again)._replace(name=name.format("both bands"))
+            (ranking,) = build_rankings(OWN, numbers, estimates, seed)
+            band_rankings.append(ranking._replace(name=name.format(band)))
+        yield from band_rankings
+        mean_scores = np.mean([ranking.scores for ranking in band_rankings], axis=0)
+        samples = [ranking.samples for ranking in band_rankings if ranking.samples is not None]
+        mean_samples = np.asarray(np.mean(samples, axis=0)) if len(samples) == len(band_rankings) else None
+        mean_ranking = Ranking.from_values(band_rankings[0].quantity, mean_scores, OWN, mean_samples)
+        yield mean_ranking._replace(name=name.format("both bands"))
 
 
-def _of_others(published: Sequence[Ranking]) -> Iterator[Ranking]:
-    for one in published:
-        if one.is_part and one.name.split(":")[1] not in CATEGORIES:
+def _select_published(rankings: Sequence[Ranking]) -> Iterator[Ranking]:
+    """Select rankings by published metrics; the number of points is the baseline that any metric has to beat."""
+    # Of the numbers of parts, those of the categories on which detectors are evaluated.
+    categories = ("car", "pedestrian", "cyclist")
+    for ranking in rankings:
+        if ranking.is_part and ranking.name.split(":")[1] not in categories:
             continue
-        name = f"{one.name} (less is better)" if one.quantity.lower_is_better else one.name
-        yield one._replace(name=name, metric=BASELINE if one.name == POINTS else one.metric)
-
-
-def _of_rigs(words: str, unit: str, values: Iterable[float]) -> Ranking:
-    return Ranking.from_values(Quantity(words, words, unit, lower_is_better=False), list(values))
+        name = f"{ranking.name} (less is better)" if ranking.quantity.lower_is_better else ranking.name
+        yield ranking._replace(name=name, metric=BASELINE if ranking.name == "points" else ranking.metric)

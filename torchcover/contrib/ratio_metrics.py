@@ -31,7 +31,8 @@ class ObjectCoverage(SceneRatios):
     """Mean detected share of objects, and share of objects with at least n sensor points.
 
     The share of an object is that of `torchcover.detection.measure_box_visibility`, weighted by area if frames
-    have area weights; objects without reference points are unknown and excluded from the mean. The shares of objects with n points refer to all objects, including hidden ones.
+    have area weights; objects without reference points are unknown and excluded from the mean. The shares of objects
+    with n points refer to all objects, including hidden ones.
 
     Args:
         threshold_m: Detection threshold.
@@ -318,8 +319,9 @@ class PointDensity(SceneRatios):
 
     The density refers to the area of the grid, whether visible or not. The uniformity is (sum n)^2 / (C sum n^2)
     over the points n in C square cells: 1 for equal counts, 1 / C if one cell has all points. Cai et al. (2023)
-    use density and uniformity; their formula of uniformity was not accessible. The uniformity does not depend on the number of points:
-    missing points may raise it, by 0.0004 within 3 m ahead of `kitti` in fog of 100 m.
+    use density and uniformity; their formula of uniformity was not accessible. The uniformity does not depend on the
+    number of
+    points: missing points may raise it, by 0.0004 within 3 m ahead of `kitti` in fog of 100 m.
 
     Args:
         grid: Extent, height bands and cells. The ground below a point is that below the nearest reference point in

@@ -1,4 +1,4 @@
-"""Metrics of the rays of a rig: M-SOG (Place3D, Li et al. 2024), and blind cells that the field of view promised."""
+"""Metrics of the rays of a rig: M-SOG (Place3D, Li et al. 2024), and blind cells inside the field of view."""
 
 import hashlib
 import math
@@ -31,49 +31,43 @@ from torchcover.simulation import Sensor
 from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.shapes import Mesh
 
-# Numbers that are kept of each voxel and block: frames in which it is labelled as the category, and as anything else.
-LABELS = 2
-# Numbers that are worked out together: voxels, of each draw.
-AT_ONCE = 1 << 20
-RANKS_ONLY = (
-    "only for ranks of rigs at voxels of one size: printed values are a million times smaller than a mean entropy, and "
-    "the size is not printed"
-)
+# Labels with a count for each voxel and block: the category, and any other content.
+NUM_LABELS = 2
 
 
 class MSog(BlockedSums, FrameMetric):
-    """Mean entropy in nats of what the voxels on the way of a rig's rays hold, as a loss: M-SOG (Place3D, 2024).
+    """Negative mean entropy in nats of the labels of the voxels that the rays of a rig cross: M-SOG (Place3D, 2024).
 
-        H(v)  = - sum over c of p_c(v) ln p_c(v)         c: the category, anything else, empty
-        M-SOG = - mean over the distinct voxels v on the way of any ray of H(v)
+        H(v)  = - sum over c of p_c(v) ln p_c(v)         c: the category, other content, empty
+        M-SOG = - mean over the distinct voxels v that any ray crosses of H(v)
 
     where p_c is the share of frames in which the voxel has the label c. Higher is better. This is the paper's variant
-    for detection. A frame's label of a voxel comes from the reference points in it: the category if at least half of
-    them are in its boxes (`find_points_in_boxes`), else anything else; empty if there is none, whether the reference saw
-    that it is empty or did not see it.
+    for detection. The label of a voxel in a frame comes from its reference points: the category if at least half of
+    them are in boxes of the category (`find_points_in_boxes`), else other content; empty without points, whether the
+    reference sensor observed that it is empty or did not observe it.
 
-    Nothing hides anything from the rays, which go to the wall of the region or the end of the sensor's range; and a
-    voxel that is crossed once counts as much as one that is crossed often. At 1 m nearly every voxel is crossed by any
-    rig: the size of a voxel is part of the name. The error is the jackknife's over 16 blocks of worlds.
+    Rays are not occluded and end at the border of the region or at the maximum range of the sensor; each voxel counts
+    once, however many rays cross it. At 1 m nearly every voxel is crossed by any rig: the voxel size is part of the
+    name. The standard error is that of the jackknife over 16 blocks of scenes.
 
     Args:
-        sensors: Those of the rig, with mounts and rays.
-        voxel_m: Side of a voxel; the paper does not print its own.
-        region: What the voxels fill, 60 x 40 x 4 m as of S-MIG if not given.
-        category: Of the boxes that have a label of their own.
+        sensors: Sensors of the rig, with mounts and rays.
+        voxel_m: Side length of a voxel in meters; the paper does not report it.
+        region: Region of the voxels; by default 60 x 40 x 4 m as for S-MIG.
+        category: Category of boxes with a label of its own.
         kwargs: `rig_name` and `query_cache` of `FrameMetric`.
 
     Raises:
-        ValueError: No sensor, voxels that do not divide the region or do not fit into the memory. From `update`: a
-            frame without boxes.
+        ValueError: There is no sensor, or voxels do not divide the region or do not fit into memory. From `update`: a
+            frame has no boxes.
 
     Example:
         >>> from torchcover.detection import Boxes
         >>> from torchcover.simulation import Rig
         >>> car = Boxes.from_rows(torch.tensor([[10.0, 0.0, 0.8, 4.0, 2.0, 1.6, 0.0]]), categories=("car",))
         >>> metric = MSog(Rig.load("hu2022_center").sensors)
-        >>> seen = torch.tensor([[8.1, 0.1, 0.6]])  # its rear, in one of two frames
-        >>> for index, points in enumerate((seen, seen[:0])):
+        >>> rear = torch.tensor([[8.1, 0.1, 0.6]])  # observed in one of two frames
+        >>> for index, points in enumerate((rear, rear[:0])):
         ...     metric.update(Frame({"rig": torch.zeros(0, 3)}, points, index, str(index), boxes=car))
         >>> number = metric.compute()[0]
         >>> number.quantity.key, round(number.value * number.count / math.log(2), 9)
@@ -91,38 +85,41 @@ class MSog(BlockedSums, FrameMetric):
         **kwargs: Any,  # noqa: ANN401  (arguments of `FrameMetric`)
     ) -> None:
         check_sensors(sensors)
-        grid = create_voxel_grid(region, voxel_m, BLOCKS * LABELS * 8)
-        meaning = {"sensors": tuple(sensors), "voxel_m": float(voxel_m), "region": region, "category": category}
-        super().__init__(BLOCKS, meaning, **kwargs)
+        grid = create_voxel_grid(region, voxel_m, BLOCKS * NUM_LABELS * 8)
+        definition = {"sensors": tuple(sensors), "voxel_m": float(voxel_m), "region": region, "category": category}
+        super().__init__(BLOCKS, definition, **kwargs)
         self.sensors = tuple(sensors)
         self.grid = grid
         self.category = category
-        self.define_block_sum("label_counts", (LABELS, grid.num_voxels), torch.int64)
+        self.define_block_sum("label_counts", (NUM_LABELS, grid.num_voxels), torch.int64)
 
     def _add_frame(self, frame: Frame) -> None:
         check_cloud(frame.reference, "reference")
-        labels = self.query_cache.get_or_compute(
-            frame, ("labels", self.category, self.grid), lambda: self._labels(frame)
-        )
+        key = ("labels", self.category, self.grid)
+        label_voxels = self.query_cache.get_or_compute(frame, key, partial(self._label_voxels, frame))
         block = self._assign_block(frame.block_index)
-        for label, voxels in enumerate(labels):
+        for label, voxels in enumerate(label_voxels):
             self.label_counts[block, label, voxels.to(self.label_counts.device)] += 1
 
-    def _labels(self, frame: Frame) -> tuple[Tensor, Tensor]:
-        """The voxels that have the label of the category in a frame, and those that hold anything else."""
+    def _label_voxels(self, frame: Frame) -> tuple[Tensor, Tensor]:
+        """Find the voxels with the label of the category in a frame, and those with other content."""
         boxes = self.query_cache.get_boxes(frame)
-        of_category = torch.tensor([each == self.category for each in boxes.categories], dtype=torch.bool, device="cpu")
-        inside = self.query_cache.find_reference_in_boxes(frame)
-        votes = np.zeros(len(frame.reference), dtype=bool)
-        votes[inside.point_indices.cpu()[of_category[inside.box_indices.cpu()]].numpy()] = True
-        voxel = self.grid.find_voxels(frame.reference.cpu().numpy())
-        occupied, which, points = np.unique(voxel[voxel >= 0], return_inverse=True, return_counts=True)
-        chosen = 2 * np.bincount(which, weights=votes[voxel >= 0], minlength=len(occupied)) >= points
-        return torch.from_numpy(occupied[chosen]), torch.from_numpy(occupied[~chosen])
+        is_category = [category == self.category for category in boxes.categories]
+        box_mask = torch.tensor(is_category, dtype=torch.bool, device="cpu")
+        points_in_boxes = self.query_cache.find_reference_in_boxes(frame)
+        is_in_category = np.zeros(len(frame.reference), dtype=bool)
+        is_pair_of_category = box_mask[points_in_boxes.box_indices.cpu()]
+        is_in_category[points_in_boxes.point_indices.cpu()[is_pair_of_category].numpy()] = True
+        point_voxels = self.grid.find_voxels(frame.reference.cpu().numpy())
+        is_inside = point_voxels >= 0
+        voxels, positions, point_counts = np.unique(point_voxels[is_inside], return_inverse=True, return_counts=True)
+        category_counts = np.bincount(positions, weights=is_in_category[is_inside], minlength=len(voxels))
+        has_category = 2 * category_counts >= point_counts
+        return torch.from_numpy(voxels[has_category]), torch.from_numpy(voxels[~has_category])
 
     def _compute_numbers(self) -> tuple[Estimate, Sequence[Number]]:
         crossed = torch.from_numpy(mark_crossed_by_rays(self.sensors, self.grid).reshape(-1).nonzero()[0])
-        about = describe_number(
+        number = describe_number(
             f"m_sog_{self.category}_{self.grid.voxel_m:g}m",
             "nats",
             "voxels",
@@ -132,55 +129,64 @@ class MSog(BlockedSums, FrameMetric):
             rays=count_rays(self.sensors),
             crossed_share=len(crossed) / self.grid.num_voxels,
         )
-        used = self.block_frame_counts.cpu() > 0
-        # Unknown if the category was never seen.
-        on_the_way = crossed.to(self.label_counts.device) if self.label_counts[:, 0].any() else crossed[:0]
-        labelled, steps = self.label_counts[:, :, on_the_way].cpu()[used], self.block_frame_counts.cpu()[used]
-        estimate = Estimate.from_blocks([about.quantity], partial(_again, labelled, steps), steps)
-        return estimate, [about._replace(count=0 if estimate.value[0].isnan() else len(crossed), warning=RANKS_ONLY)]
+        used_blocks = self.block_frame_counts.cpu() > 0
+        # The number is unknown if the category was never observed.
+        voxels = crossed.to(self.label_counts.device) if self.label_counts[:, 0].any() else crossed[:0]
+        label_counts = self.label_counts[:, :, voxels].cpu()[used_blocks]
+        frame_counts = self.block_frame_counts.cpu()[used_blocks]
+        recompute = partial(_recompute_m_sog, label_counts, frame_counts)
+        estimate = Estimate.from_blocks([number.quantity], recompute, frame_counts)
+        warning = (
+            "only for ranks of rigs at voxels of one size: printed values are a million times smaller than a mean "
+            "entropy, and the size is not printed"
+        )
+        return estimate, [number._replace(count=0 if estimate.value[0].isnan() else len(crossed), warning=warning)]
 
 
-def _again(labelled: Tensor, steps: Tensor, weights: Tensor) -> Tensor:
-    """(R, 1) the number of voxels labelled (g, 2, K) times in blocks of steps (g,), if these weigh (R, g)."""
-    of_all, voxels = weights @ steps.double(), labelled.shape[2]
-    total, part = torch.zeros(len(weights), dtype=torch.float64, device="cpu"), max(AT_ONCE // len(weights), 1)
-    for start in range(0, voxels, part):
-        some = labelled[:, :, start : start + part].double()
-        share = torch.tensordot(weights, some, dims=1) / of_all[:, None, None]
-        empty = (1.0 - share.sum(dim=1)).clamp(min=0.0)
-        total += torch.special.entr(share).sum(dim=(1, 2)) + torch.special.entr(empty).sum(dim=1)
-    known = (of_all > 0) & (voxels > 0)
-    return torch.where(known, -total / max(voxels, 1), math.nan)[:, None]
+def _recompute_m_sog(label_counts: Tensor, frame_counts: Tensor, weights: Tensor) -> Tensor:
+    """Recompute the (R, 1) number for (R, g) block weights.
 
-
-# Of rays that meet neither the ground nor the vehicle: beyond any grid.
-FARTHEST_M = 1000.0
+    Args:
+        label_counts: (g, 2, K) frames in which each crossed voxel has each label.
+        frame_counts: (g,) frames of each block.
+        weights: (R, g) weights of the blocks.
+    """
+    total_frames, num_voxels = weights @ frame_counts.double(), label_counts.shape[2]
+    total = torch.zeros(len(weights), dtype=torch.float64, device="cpu")
+    chunk_size = max((1 << 20) // len(weights), 1)  # limits the memory of one chunk to megabytes
+    for start in range(0, num_voxels, chunk_size):
+        chunk = label_counts[:, :, start : start + chunk_size].double()
+        label_shares = torch.tensordot(weights, chunk, dims=1) / total_frames[:, None, None]
+        empty_shares = (1.0 - label_shares.sum(dim=1)).clamp(min=0.0)
+        total += torch.special.entr(label_shares).sum(dim=(1, 2)) + torch.special.entr(empty_shares).sum(dim=1)
+    is_known = (total_frames > 0) & (num_voxels > 0)
+    return torch.where(is_known, -total / max(num_voxels, 1), math.nan)[:, None]
 
 
 class FalseVisible(SceneRatios):
-    """Of the cells that the rig does not see, the share that its field of view says it does: FVR = FV / (FV + TI).
+    """Share of the blind cells that lie inside the field of view: FVR = FV / (FV + TI), after Börger et al. 2022.
 
-    A cell is predicted visible if a ray crosses it in an empty world; see `compute_field_of_view`. In a frame it is truly
-    visible if the rig has a point within the threshold of a reference point there (detection > 0), and invisible if
-    of none; a cell without reference points is unknown and does not count. FV is predicted visible and invisible, TI
-    invisible either way predicted and found (after Börger et al. 2022).
+    A cell is predicted visible if a ray crosses it in an empty scene; see `compute_field_of_view`. In a frame it is
+    visible if the rig has a point within the threshold of a reference point in the cell, and invisible (blind)
+    otherwise; cells without reference points do not count. FV are the blind cells that are predicted visible, TI those
+    that are predicted invisible.
 
     Args:
-        sensors: The rig's sensors.
-        ego: The vehicle's body; None if it is unknown: then it hides nothing from the prediction.
-        grid: Extent and height bands; its cells are made `cell_m` long.
-        threshold_m: Distance within which a point counts as seen.
-        cell_m: Side of the cells.
+        sensors: Sensors of the rig, with mounts and rays.
+        ego_mesh: Mesh of the ego vehicle in the vehicle frame, which occludes the field of view; None if unknown.
+        grid: Extent and height bands; its cells are replaced by cells of `cell_m`.
+        threshold_m: Largest distance in meters at which a point counts as detected.
+        cell_m: Side length of the cells in meters.
         kwargs: `rig_name` and `query_cache` of `FrameMetric`.
 
     Raises:
-        ValueError: No sensors: of a recording, name the rig or give its file; a threshold that is negative.
+        ValueError: There are no sensors (for a recording, name the rig or give its file), or the threshold is negative.
 
     Example:
         >>> from torchcover.simulation import Rig
         >>> metric = FalseVisible(Rig.load("front_roof_32").sensors, None, BevGrid(x_m=(0.0, 40.0), y_m=(-5.0, 5.0)))
-        >>> hidden = torch.tensor([[30.5, 0.5, 0.0], [0.5, 0.5, 0.0]])
-        >>> metric.update(Frame({"rig": torch.zeros(0, 3)}, hidden, 0, "a"))
+        >>> reference = torch.tensor([[30.5, 0.5, 0.0], [0.5, 0.5, 0.0]])
+        >>> metric.update(Frame({"rig": torch.zeros(0, 3)}, reference, 0, "a"))
         >>> [(number.quantity.key, number.value) for number in metric.compute()]
         [('false_visible_ground_0.4m_1m', 0.5), ('false_visible_obstacle_0.4m_1m', nan)]
     """
@@ -200,64 +206,60 @@ class FalseVisible(SceneRatios):
                 "YAML file (or the name of a built-in one)"
             )
         if not 0 <= threshold_m < float("inf"):
-            raise ValueError(f"threshold_m: a finite distance >= 0 in metres is needed; got {threshold_m}")
-        coarse = build_coarse_grid(grid, cell_m)
-        predicted = compute_field_of_view(sensors, coarse, ego_mesh)
-        given = {"threshold_m": float(threshold_m), "cell_m": float(cell_m)}
-        ratios = [
-            describe_number(
-                f"false_visible_{band}_{threshold_m:g}m_{cell_m:g}m",
-                "share",
-                "invisible cells",
-                lower_is_better=True,
-                **given,
-            )
-            for band in coarse.heights
-        ]
+            raise ValueError(f"threshold_m: a finite distance >= 0 in meters is needed; got {threshold_m}")
+        coarse_grid = build_coarse_grid(grid, cell_m)
+        predicted = compute_field_of_view(sensors, coarse_grid, ego_mesh)
+        parameters = {"threshold_m": float(threshold_m), "cell_m": float(cell_m)}
+        ratios = []
+        for band in coarse_grid.heights:
+            key = f"false_visible_{band}_{threshold_m:g}m_{cell_m:g}m"
+            ratios.append(describe_number(key, "share", "invisible cells", lower_is_better=True, **parameters))
         fingerprint = hashlib.sha256(predicted.numpy().tobytes()).hexdigest()
-        super().__init__(ratios, {**given, "grid": coarse, "predicted": fingerprint}, **kwargs)
-        self.grid = coarse
+        super().__init__(ratios, {**parameters, "grid": coarse_grid, "predicted": fingerprint}, **kwargs)
+        self.grid = coarse_grid
         self.predicted_mask = predicted.flatten()
         self.threshold_m = float(threshold_m)
 
     def _sum_frame(self, frame: Frame) -> tuple[Tensor, Tensor, Tensor]:
-        seen = (
-            self.query_cache.find_distances_m(frame, get_rig_name(frame, self.rig_name), self.threshold_m)
-            <= self.threshold_m
-        )
-        inside, of, cell = self.query_cache.assign_cells(frame, self.grid)
-        known = torch.zeros(self.grid.num_cells, dtype=torch.bool, device=cell.device)
-        visible = known.clone()
-        known[cell] = True
-        visible[cell[seen[inside[of]]]] = True
-        invisible = (known & ~visible).view(len(self.ratios), -1)
-        false_visible = invisible & self.predicted_mask.to(cell.device).view(invisible.shape)
-        base = invisible.sum(dim=1)
-        return base.double(), false_visible.sum(dim=1).double(), base
+        rig = get_rig_name(frame, self.rig_name)
+        is_detected = self.query_cache.find_distances_m(frame, rig, self.threshold_m) <= self.threshold_m
+        point_indices, point_positions, cells = self.query_cache.assign_cells(frame, self.grid)
+        is_observed = torch.zeros(self.grid.num_cells, dtype=torch.bool, device=cells.device)
+        is_visible = is_observed.clone()
+        is_observed[cells] = True
+        is_visible[cells[is_detected[point_indices[point_positions]]]] = True
+        is_invisible = (is_observed & ~is_visible).view(len(self.ratios), -1)
+        is_false_visible = is_invisible & self.predicted_mask.to(cells.device).view(is_invisible.shape)
+        invisible_counts = is_invisible.sum(dim=1)
+        return invisible_counts.double(), is_false_visible.sum(dim=1).double(), invisible_counts
 
 
 def build_coarse_grid(grid: BevGrid, cell_m: float) -> BevGrid:
-    """A grid of other cells, as large as the given one, or by a part of a cell larger.
+    """Build a grid with other cells whose extent contains that of a grid, and exceeds it by less than a cell.
+
+    Args:
+        grid: Extent and height bands.
+        cell_m: Side length of the new cells in meters.
 
     Example:
         >>> build_coarse_grid(BevGrid(x_m=(-0.5, 2.0), y_m=(0.0, 1.0), cell_m=0.25), 1.0).x_m
         (-1.0, 2.0)
     """
-    x, y = (
+    x_m, y_m = (
         (math.floor(low / cell_m) * cell_m, math.ceil(high / cell_m) * cell_m) for low, high in (grid.x_m, grid.y_m)
     )
-    return BevGrid(x, y, cell_m, grid.heights, grid.band_frame)
+    return BevGrid(x_m, y_m, cell_m, grid.heights, grid.band_frame)
 
 
 def compute_field_of_view(sensors: Sequence[Sensor], grid: BevGrid, ego_mesh: Mesh | None = None) -> Tensor:
-    """Which cells the rays of a rig cross, down to the plane z = 0, up to their range or the vehicle's own body.
+    """Compute the cells that the rays of a rig cross, up to the plane z = 0, their range or the ego vehicle.
 
-    Exactly: a cell is crossed in a height band if a piece of a ray lies in both; see `find_crossed_voxels`.
+    A cell is crossed in a height band if it contains a piece of a ray within the band; see `find_crossed_voxels`.
 
     Args:
-        sensors: With mounts, rays and ranges.
+        sensors: Sensors with mounts, rays and ranges.
         grid: Cells and height bands.
-        ego_mesh: The vehicle's body in the vehicle frame; None if it hides nothing.
+        ego_mesh: Mesh of the ego vehicle in the vehicle frame; None for no occlusion.
 
     Returns:
         (H, Y, X) bool.
@@ -266,48 +268,55 @@ def compute_field_of_view(sensors: Sequence[Sensor], grid: BevGrid, ego_mesh: Me
         >>> from torchcover.simulation import Rig
         >>> grid = BevGrid(x_m=(-5.0, 40.0), y_m=(-5.0, 5.0), cell_m=1.0)
         >>> in_view = compute_field_of_view(Rig.load("front_roof_32").sensors, grid)
-        >>> [bool(in_view[0, 5, x]) for x in (0, 6, 30)]        # behind, too close, ahead
+        >>> [bool(in_view[0, 5, x]) for x in (0, 6, 30)]  # behind, too close, ahead
         [False, False, True]
     """
-    # Each band is one layer of cubes: rays are cut off at its ends and seen from above. Level ground is at z = 0.
-    flat = VoxelGrid(BoundingBox((grid.x_m[0], grid.y_m[0], 0.0), (grid.x_m[1], grid.y_m[1], grid.cell_m)), grid.cell_m)
-    seen = np.zeros((len(grid.heights), *flat.shape), dtype=bool)
+    # Each band is one layer of cubes: rays are cut at the bounds of the band and projected to bird's-eye view.
+    region = BoundingBox((grid.x_m[0], grid.y_m[0], 0.0), (grid.x_m[1], grid.y_m[1], grid.cell_m))
+    layer = VoxelGrid(region, grid.cell_m)
+    crossed = np.zeros((len(grid.heights), *layer.shape), dtype=bool)
     caster = None if ego_mesh is None else RayCaster([ego_mesh])
     for sensor in sensors:
         vehicle_T_sensor = sensor.mount.to_matrix()
         directions = sensor.compute_directions().reshape(3, -1)
         directions = vehicle_T_sensor[:3, :3] @ directions[:, ~np.isnan(directions[0])]
         origin_m = vehicle_T_sensor[:3, 3]
-        ends_m = _ends_m(origin_m, directions, min(sensor.max_range_m, FARTHEST_M), caster)
-        for band, crossed in zip(grid.heights.values(), seen, strict=True):
-            begin_m, end_m = _within(band, origin_m[2], directions[2], sensor.min_range_m, ends_m)
-            there = (begin_m < end_m) & directions[:2].any(axis=0)
-            level = directions[:, there].T * [1.0, 1.0, 0.0]
-            starts_m = origin_m * [1.0, 1.0, 0.0] + level * begin_m[there, None] + [0.0, 0.0, grid.cell_m / 2]
-            find_crossed_voxels(flat, starts_m, level, (end_m - begin_m)[there], output=crossed)
-    return torch.from_numpy(np.ascontiguousarray(seen[..., 0].transpose(0, 2, 1)))
+        max_range_m = min(sensor.max_range_m, 1000.0)  # finite, and beyond any grid
+        ends_m = _compute_ray_ends_m(origin_m, directions, max_range_m, caster)
+        for band, band_crossed in zip(grid.heights.values(), crossed, strict=True):
+            begin_m, end_m = _clip_to_band(band, origin_m[2], directions[2], sensor.min_range_m, ends_m)
+            is_in_band = (begin_m < end_m) & directions[:2].any(axis=0)
+            flat_directions = directions[:, is_in_band].T * [1.0, 1.0, 0.0]
+            starts_m = origin_m * [1.0, 1.0, 0.0] + flat_directions * begin_m[is_in_band, None]
+            starts_m += np.array([0.0, 0.0, grid.cell_m / 2])
+            lengths_m = (end_m - begin_m)[is_in_band]
+            find_crossed_voxels(layer, starts_m, flat_directions, lengths_m, output=band_crossed)
+    return torch.from_numpy(np.ascontiguousarray(crossed[..., 0].transpose(0, 2, 1)))
 
 
-def _within(
-    band: tuple[float, float], height_m: float, up: Float64, begin_m: float, ends_m: Float64
+def _clip_to_band(
+    band: tuple[float, float], height_m: float, directions_z: Float64, begin_m: float, ends_m: Float64
 ) -> tuple[Float64, Float64]:
-    """(n,) where rays enter a height band, and (n,) leave it; the end first where they do not."""
-    rises = np.where(up == 0, 1.0, up)
-    low, high = ((edge - height_m) / rises for edge in band)
-    inside = (up != 0) | (band[0] <= height_m < band[1])
-    first = np.where(up == 0, np.where(inside, -np.inf, np.inf), np.minimum(low, high))
-    last = np.where(up == 0, np.inf, np.maximum(low, high))
-    return np.maximum(first, begin_m), np.minimum(last, ends_m)
+    """Compute (n,) begin and end of rays in a height band; the end is not above the begin for rays outside."""
+    is_level = directions_z == 0
+    slopes = np.where(is_level, 1.0, directions_z)
+    low_m, high_m = (band[0] - height_m) / slopes, (band[1] - height_m) / slopes
+    is_inside = ~is_level | (band[0] <= height_m < band[1])
+    entry_m = np.where(is_level, np.where(is_inside, -np.inf, np.inf), np.minimum(low_m, high_m))
+    exit_m = np.where(is_level, np.inf, np.maximum(low_m, high_m))
+    return np.maximum(entry_m, begin_m), np.minimum(exit_m, ends_m)
 
 
-def _ends_m(origin_m: Float64, directions: Float64, range_m: float, ego: RayCaster | None) -> Float64:
-    """(n,) where the rays end."""
-    down = directions[2] < 0
-    to_ground = np.full(directions.shape[1], np.inf)
-    to_ground[down] = origin_m[2] / -directions[2, down]
-    ends_m: Float64 = np.minimum(to_ground, range_m)
-    if ego is None:
+def _compute_ray_ends_m(
+    origin_m: Float64, directions: Float64, max_range_m: float, ego_caster: RayCaster | None
+) -> Float64:
+    """Compute (n,) ranges at which rays reach the ground plane or their maximum range; 0 for rays onto the vehicle."""
+    is_downward = directions[2] < 0
+    ground_m = np.full(directions.shape[1], np.inf)
+    ground_m[is_downward] = origin_m[2] / -directions[2, is_downward]
+    ends_m: Float64 = np.minimum(ground_m, max_range_m)
+    if ego_caster is None:
         return ends_m
-    hits = ego.cast(origin_m, directions.astype(np.float32), ends_m.astype(np.float32))
-    ends_m[hits.body_indices >= 0] = 0.0  # what points at the vehicle sees the vehicle
+    hits = ego_caster.cast(origin_m, directions.astype(np.float32), ends_m.astype(np.float32))
+    ends_m[hits.body_indices >= 0] = 0.0
     return ends_m

@@ -1,13 +1,11 @@
-"""S-MIG (Hu et al. 2022): the entropy of a probabilistic occupancy grid (POG) along the rays of a rig, with minus.
+"""S-MIG (Hu et al. 2022): negative entropy of a probabilistic occupancy grid (POG) along the rays of a rig.
 
-The grid says how often each voxel is inside an object. Its state is the boxes of the objects, a row for each: some
-megabytes for thousands of frames, whatever the size of a voxel.
+The state of the metric is a table with one row per object, which takes some megabytes for thousands of frames, whatever
+the voxel size.
 """
 
 import hashlib
-import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -17,230 +15,54 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchcover.contrib.frame_metric import BLOCKS, FrameMetric, describe_number
+from torchcover.contrib.occupancy import NUM_COLUMNS, Occupancy, build_occupancy, build_occupancy_rows
 from torchcover.contrib.voxels import (
     REGION,
-    VoxelGrid,
     check_sensors,
     count_rays,
     create_voxel_grid,
     mark_crossed_before_hits,
     mark_crossed_by_rays,
 )
-from torchcover.detection import Boxes
 from torchcover.estimation import Estimate, Number
 from torchcover.frames import Frame
 from torchcover.geometry import BoundingBox
-from torchcover.geometry.arrays import Bools, Float64, Int32, Int64
 from torchcover.metrics import insert_rows
 from torchcover.neighbors import check_cloud
 from torchcover.simulation import Sensor
 
-# Columns of the table: the place in time of the frame, what stands for its content, the number of the category (of the
-# frame itself: -1), and the box as in `Boxes.rows`.
-COLUMNS = 10
-PLACE, CONTENT, CATEGORY, BOX = 0, 1, 2, 3
-FRAME = -1.0
-# What float32 makes of a box's coordinates must not decide: its bottom on the ground may be level with centres.
-ROUNDING_M = 1e-5
-
-
-def build_occupancy_rows(boxes: Boxes, block_index: int, categories: Sequence[str], region: BoundingBox) -> Tensor:
-    """(1 + K, 10) rows of a table for a frame: its own, and those of its boxes near the region."""
-    boxes = boxes.select_categories(*categories)
-    rows = boxes.rows.double().cpu()
-    half = rows[:, 3:6] / 2
-    half[:, :2] = torch.linalg.vector_norm(half[:, :2], dim=1, keepdim=True)
-    low, high = (torch.tensor(corner, dtype=torch.float64, device="cpu") for corner in (region.lower_m, region.upper_m))
-    near = ((rows[:, :3] + half >= low) & (rows[:, :3] - half <= high)).all(dim=1)
-    number = torch.tensor([categories.index(name) for name in boxes.categories], dtype=torch.float64, device="cpu")
-    listed = torch.zeros(1 + int(near.sum()), COLUMNS, dtype=torch.float64, device="cpu")
-    listed[0, CATEGORY] = FRAME
-    listed[1:, CATEGORY] = number[near]
-    listed[1:, BOX:] = rows[near]
-    table: Tensor = torch.unique(listed, dim=0)
-    # Frames of the same place and content are the same frame, seen again; 48 bits are exact in float64.
-    table[:, CONTENT] = int.from_bytes(hashlib.sha256(table.numpy().tobytes()).digest()[:6], "big")
-    table[:, PLACE] = block_index
-    return table
-
-
-@dataclass(frozen=True, eq=False)
-class Occupancy:
-    """In how many frames each voxel was inside a box of one category, in blocks of contiguous worlds.
-
-    `voxels` (K,) are those that were in any, ascending; `pattern_indices` (K,) is which row of `counts` (P, B), frames of each
-    block, is theirs: many have the same. `frame_counts` (B,) are all frames, `box_count` how many held the centre of a voxel.
-    """
-
-    voxels: Int64
-    pattern_indices: Int64
-    counts: Int64
-    frame_counts: Int64
-    box_count: int
-
-    def compute_entropy_nats(
-        self, voxel_multiplicities: NDArray[np.float64 | np.bool_], block_weights: Float64
-    ) -> Float64:
-        """(R,) sum over the voxels of Hb(p) = -p ln p - (1 - p) ln(1 - p); NaN where no frame counts.
-
-        `voxel_multiplicities` (voxels of the grid,) is how often each voxel counts, `block_weights` (R, B) how often each block of worlds
-        does.
-        """
-        of_pattern = np.bincount(
-            self.pattern_indices, weights=voxel_multiplicities[self.voxels], minlength=len(self.counts)
-        )
-        steps = block_weights @ self.frame_counts
-        with np.errstate(invalid="ignore", divide="ignore"):
-            total = [
-                compute_binary_entropy_nats(self.counts @ one / all_steps) @ of_pattern
-                for one, all_steps in zip(block_weights, steps, strict=True)
-            ]
-        return np.where(steps > 0, total, np.nan)
-
-
-def compute_binary_entropy_nats(probability: Float64) -> Float64:
-    """-p ln p - (1 - p) ln(1 - p) in nats; 0 at 0 and 1."""
-    inside = (probability > 0) & (probability < 1)
-    probability = np.where(inside, probability, 0.5)
-    return np.where(inside, -probability * np.log(probability) - (1 - probability) * np.log1p(-probability), 0.0)
-
-
-def build_occupancy(table: Float64, category_index: int, grid: VoxelGrid, num_blocks: int) -> Occupancy:
-    """The occupancy by the boxes of one category, from (N, 10) rows of `build_occupancy_rows` in ascending order.
-
-    A voxel is inside a box if its centre is; of a box that leaves the region, the voxels in the region count. Boxes of
-    one frame that overlap count once. The number of blocks is even.
-    """
-    own, centres_m = table[:, CATEGORY] == FRAME, grid.compute_centers_m()
-    block_of = (table[:, PLACE] // compute_frames_per_block(table[own, PLACE], num_blocks)).astype(np.int64)
-    in_frame, counted = np.zeros(grid.num_voxels, dtype=bool), np.zeros(grid.num_voxels, dtype=np.int32)
-    found: list[tuple[Int64, Int32]] = []
-    boxes = 0
-    for block in range(num_blocks):
-        touched = [np.empty(0, dtype=np.int64)]
-        for frame in _frames(table[block_of == block]):
-            seen_again = int((frame[:, CATEGORY] == FRAME).sum())
-            rows = frame[frame[:, CATEGORY] == category_index, BOX:]
-            inside = [find_voxels_in_box(centres_m, box) for box in rows[::seen_again]]
-            boxes += seen_again * sum(len(voxels) > 0 for voxels in inside)
-            for voxels in inside:
-                first = voxels[~in_frame[voxels]]
-                touched.append(first[counted[first] == 0])
-                counted[first] += seen_again
-                in_frame[first] = True
-            for voxels in inside:
-                in_frame[voxels] = False
-        voxels = np.sort(np.concatenate(touched))
-        found.append((voxels, counted[voxels]))
-        counted[voxels] = 0
-    for voxels, _ in found:
-        in_frame[voxels] = True
-    every = np.flatnonzero(in_frame)
-    in_frame[every] = False
-    pattern, counts = _patterns(every, found, in_frame)
-    return Occupancy(every, pattern, counts, np.bincount(block_of[own], minlength=num_blocks), boxes)
-
-
-def _patterns(
-    every: Int64,
-    found: Sequence[tuple[Int64, Int32]],
-    marks: Bools,
-) -> tuple[Int64, Int64]:
-    """(K,) pattern of each voxel and (P, B) what the patterns are, from the voxels and their counts in each block."""
-    pattern, counts = np.zeros(len(every), dtype=np.int64), np.zeros((1, 0), dtype=np.int64)
-    for voxels, count in found:
-        column = np.zeros(len(every), dtype=np.int64)
-        marks[voxels] = True
-        column[marks[every]] = count  # both are in ascending order
-        marks[voxels] = False
-        most = int(column.max(initial=0)) + 1
-        pairs = pattern * most + column
-        there = np.zeros(len(counts) * most, dtype=bool)
-        there[pairs] = True
-        pattern = (there.cumsum() - 1)[pairs]
-        before, now = np.divmod(np.flatnonzero(there), most)
-        counts = np.column_stack([counts[before], now])
-    return pattern, counts
-
-
-def compute_frames_per_block(block_indices: Float64, num_blocks: int) -> int:
-    """How many places in time are in a block, as `CoverageMetric` doubles it."""
-    length = 1
-    while len(block_indices) and block_indices.max() >= num_blocks * length:
-        length *= 2
-    return length
-
-
-def find_voxels_in_box(centers_m: Sequence[Float64], box_row: Float64) -> Int64:
-    """Numbers of the voxels whose centre, as of `VoxelGrid.centres_m`, is in a box, a row of `Boxes.rows`.
-
-    Half-open: boxes side by side share none.
-
-    Example:
-        >>> grid = VoxelGrid(BoundingBox((0.0, 0.0, 0.0), (4.0, 4.0, 1.0)), 1.0)
-        >>> find_voxels_in_box(grid.compute_centers_m(), np.array([2.0, 0.5, 0.5, 2.0, 0.2, 1.0, 0.0]))
-        array([4, 8])
-    """
-    (x_m, y_m, z_m), reach_m = centers_m, math.hypot(box_row[3], box_row[4]) / 2 + ROUNDING_M
-    x0, x1 = np.searchsorted(x_m, (box_row[0] - reach_m, box_row[0] + reach_m))
-    y0, y1 = np.searchsorted(y_m, (box_row[1] - reach_m, box_row[1] + reach_m))
-    off_x, off_y = x_m[x0:x1, None] - box_row[0], y_m[y0:y1] - box_row[1]
-    cosine, sine = math.cos(box_row[6]), math.sin(box_row[6])
-    ahead, left = off_x * cosine + off_y * sine, off_y * cosine - off_x * sine
-    x, y = (_within(ahead, box_row[3]) & _within(left, box_row[4])).nonzero()
-    z = np.flatnonzero(_within(z_m - box_row[2], box_row[5]))
-    column = (x + x0) * len(y_m) + y + y0
-    return np.asarray((column[:, None] * len(z_m) + z).reshape(-1))
-
-
-def _within(offset_m: Float64, extent_m: float) -> Bools:
-    offset_m = offset_m + ROUNDING_M
-    return np.asarray((offset_m >= -extent_m / 2) & (offset_m < extent_m / 2))
-
-
-def _frames(table: Float64) -> list[Float64]:
-    """The rows of each frame, from those of several in ascending order."""
-    borders = np.flatnonzero((np.diff(table[:, : CONTENT + 1], axis=0) != 0).any(axis=1)) + 1
-    return np.split(table, borders) if len(table) else []
-
-
-CATEGORIES = ("car", "pedestrian", "cyclist")
-FALLS = "S-MIG falls as more is covered, and is 0 without any ray: compare it among rigs with as many rays only"
-# While it is computed: how often it is crossed, in a box of a frame, of a block. With occlusion the state, too.
-BYTES_A_VOXEL, BYTES_A_VOXEL_OCCLUDED = 6, 21
-
 
 class SMig(FrameMetric):
-    """Entropy in nats of what is in the voxels that the rays of a rig cross, as a loss: S-MIG (Hu et al. 2022).
+    """Negative entropy in nats of the occupancy of the voxels that the rays of a rig cross: S-MIG (Hu et al. 2022).
 
         p(v)  = share of frames in which voxel v is in a box of the category
-        S-MIG = - sum over the distinct voxels v on the way of any ray of  -p ln p - (1 - p) ln(1 - p)
+        S-MIG = - sum over the distinct voxels v that any ray crosses of  -p ln p - (1 - p) ln(1 - p)
 
-    with independent voxels. Higher is better, say its authors; yet it falls as more voxels are crossed, and a rig
-    without rays has the highest value, 0. Its negative, which is in its `parameters["entropy_captured_nats"]`, is
-    what roadside placement maximises (EGVS, Jiang 2025, as far as its text could be read). Compare rigs of the same
-    number of rays (`describe_unequal_rays`).
+    with independent voxels. According to its authors, higher is better; yet it decreases with the number of crossed
+    voxels, and a rig without rays has the highest value, 0. The entropy itself, in
+    `parameters["entropy_captured_nats"]`, is maximized in roadside placement (EGVS, Jiang 2025, as far as its text was
+    available). Compare only rigs with equal numbers of rays (`describe_unequal_rays`).
 
-    A voxel is in a box if its centre is; of a box that leaves the region, the part within counts. Rays go through
-    everything, to the wall of the region or the end of the sensor's range. With `ends_at_hits` they end at the points that
-    the rig measured, and the number is the mean over frames of the entropy on their way; rays that gave no point are
-    left out, for a frame does not know them. So it rises by its sign with what a rig misses: from -28,544 to -19,985
-    for `kitti` in `urban` when fog of 100 m comes; `entropy_captured_nats` falls.
+    A voxel is in a box if its center is; of a box that leaves the region, the part inside counts. Rays are not occluded
+    and end at the border of the region or at the maximum range of the sensor. With `ends_at_hits` they end at the
+    measured points, and the number is the mean over frames of the entropy along the rays; rays without a point are not
+    recorded in frames and do not count. This number increases with missing returns: from -28,544 to -19,985 for `kitti`
+    in `urban` with fog of 100 m visibility; `entropy_captured_nats` decreases.
 
-    The error is the jackknife's over 16 blocks of worlds, as they change p; with occlusion there is none: that would
-    need the voxels crossed in each block.
+    The standard error is that of the jackknife over 16 blocks of scenes, which change p. With `ends_at_hits` there is
+    none, since it would need the crossed voxels of each block.
 
     Args:
-        sensors: Those of the rig, with mounts and rays.
-        voxel_m: Side of a voxel; the published one is 0.05.
-        region: What the voxels fill, the published 60 x 40 x 4 m if not given.
-        categories: Each has its own occupancy and number. The number of all is their sum.
-        ends_at_hits: Whether rays end at what they hit.
+        sensors: Sensors of the rig, with mounts and rays.
+        voxel_m: Side length of a voxel in meters; 0.05 in the publication.
+        region: Region of the voxels; by default that of the publication, 60 x 40 x 4 m.
+        categories: Categories with separate occupancy and numbers; the first number is the sum of all.
+        ends_at_hits: Rays end at their hits.
         kwargs: `rig_name` and `query_cache` of `FrameMetric`.
 
     Raises:
-        ValueError: No sensor, no category or one twice, voxels that do not divide the region or do not fit into the
-            memory. From `update`: a frame without boxes; with occlusion, points of unknown sensors.
+        ValueError: There is no sensor, no category or a repeated one, or voxels do not divide the region or do not fit
+            into memory. From `update`: a frame has no boxes, or, with `ends_at_hits`, points of unknown sensors.
 
     Example:
         >>> from torchcover.detection import Boxes
@@ -262,7 +84,7 @@ class SMig(FrameMetric):
         sensors: Sequence[Sensor],
         voxel_m: float = 0.2,
         region: BoundingBox = REGION,
-        categories: Sequence[str] = CATEGORIES,
+        categories: Sequence[str] = ("car", "pedestrian", "cyclist"),
         *,
         ends_at_hits: bool = False,
         **kwargs: Any,  # noqa: ANN401  (arguments of `FrameMetric`)
@@ -270,20 +92,22 @@ class SMig(FrameMetric):
         check_sensors(sensors)
         if not categories or len(set(categories)) < len(categories):
             raise ValueError(f"categories: one or more different ones are needed; got {tuple(categories)}")
-        grid = create_voxel_grid(region, voxel_m, BYTES_A_VOXEL_OCCLUDED if ends_at_hits else BYTES_A_VOXEL)
-        meaning = {
+        # Work arrays of the computation take 6 bytes per voxel: crossing count (1), mark of a frame (1), count of a
+        # block (4). With `ends_at_hits`, the state and its mean add 15.
+        grid = create_voxel_grid(region, voxel_m, 21 if ends_at_hits else 6)
+        definition = {
             "sensors": tuple(sensors),
             "voxel_m": float(voxel_m),
             "region": region,
             "categories": tuple(categories),
             "ends_at_hits": ends_at_hits,
         }
-        super().__init__(meaning, **kwargs)
+        super().__init__(definition, **kwargs)
         self.sensors = tuple(sensors)
         self.grid = grid
         self.categories = tuple(categories)
         self.ends_at_hits = ends_at_hits
-        self.define_table("boxes", COLUMNS)
+        self.define_table("boxes", NUM_COLUMNS)
         if ends_at_hits:
             self.define_sum("crossings", (grid.num_voxels,), torch.int64)
 
@@ -293,7 +117,7 @@ class SMig(FrameMetric):
         rows = self.query_cache.get_or_compute(
             frame,
             ("occupancy", self.categories, self.grid.region),
-            lambda: build_occupancy_rows(boxes, frame.block_index, self.categories, self.grid.region),
+            partial(build_occupancy_rows, boxes, frame.block_index, self.categories, self.grid.region),
         )
         if self.ends_at_hits:
             crossed = mark_crossed_before_hits(self.sensors, frame, self.rig_name, self.grid)
@@ -301,63 +125,74 @@ class SMig(FrameMetric):
         self.boxes = insert_rows(self.boxes, rows)
 
     def _compute_numbers(self) -> tuple[Estimate, Sequence[Number]]:
-        of_each, times, rays = self._occupancies(), self._crossings(), count_rays(self.sensors)
-        about = [
-            describe_number(
-                f"s_mig{'_occluded' if self.ends_at_hits else ''}_{self.grid.voxel_m:g}m{name}",
-                "nats",
-                "boxes",
-                voxel_m=self.grid.voxel_m,
-                region_m=(self.grid.region.lower_m, self.grid.region.upper_m),
-                rays=rays,
-                voxels_crossed=int((times > 0).sum()),
-            )
-            for name in ("", *(f":{category}" for category in self.categories))
-        ]
-        quantities, steps = [one.quantity for one in about], torch.from_numpy(of_each[0].frame_counts)
-        estimate = Estimate.from_blocks(quantities, partial(_again, of_each, times), steps[steps > 0])
-        if self.ends_at_hits:  # what was crossed in each block is unknown
+        occupancies, multiplicities = self._get_occupancies(), self._compute_multiplicities()
+        prefix = "s_mig_occluded" if self.ends_at_hits else "s_mig"
+        parameters = {
+            "voxel_m": self.grid.voxel_m,
+            "region_m": (self.grid.region.lower_m, self.grid.region.upper_m),
+            "rays": count_rays(self.sensors),
+            "voxels_crossed": int((multiplicities > 0).sum()),
+        }
+        numbers = []
+        for suffix in ("", *(f":{category}" for category in self.categories)):
+            key = f"{prefix}_{self.grid.voxel_m:g}m{suffix}"
+            numbers.append(describe_number(key, "nats", "boxes", **parameters))
+        quantities = [number.quantity for number in numbers]
+        frame_counts = torch.from_numpy(occupancies[0].frame_counts)
+        recompute = partial(_recompute_s_mig, occupancies, multiplicities)
+        estimate = Estimate.from_blocks(quantities, recompute, frame_counts[frame_counts > 0])
+        if self.ends_at_hits:  # the crossed voxels of each block are unknown
             estimate = Estimate.from_values(quantities, estimate.value)
-        boxes = [one.box_count for one in of_each]
-        return estimate, [
-            one._replace(count=count, parameters={**one.parameters, "entropy_captured_nats": -value}, warning=FALLS)
-            for one, count, value in zip(about, [sum(boxes), *boxes], estimate.value.tolist(), strict=True)
-        ]
+        box_counts = [occupancy.box_count for occupancy in occupancies]
+        warning = "S-MIG falls as more is covered, and is 0 without rays: compare only rigs with equal numbers of rays"
+        described = []
+        for number, count, value in zip(numbers, [sum(box_counts), *box_counts], estimate.value.tolist(), strict=True):
+            parameters = {**number.parameters, "entropy_captured_nats": -value}
+            described.append(number._replace(count=count, parameters=parameters, warning=warning))
+        return estimate, described
 
-    def _crossings(self) -> NDArray[np.float64 | np.bool_]:
-        """(voxels,) how often each voxel is crossed in a frame, on average."""
+    def _compute_multiplicities(self) -> NDArray[np.float64 | np.bool_]:
+        """Compute (voxels,) how often each voxel is crossed per frame."""
         if self.ends_at_hits:
             return self.crossings.cpu().numpy() / max(int(self.num_frames), 1)
         return mark_crossed_by_rays(self.sensors, self.grid).reshape(-1)
 
-    def _occupancies(self) -> list[Occupancy]:
-        """That of each category; rigs that saw the same frames share them."""
+    def _get_occupancies(self) -> list[Occupancy]:
+        """Return the occupancy of each category, which rigs with the same frames share."""
         table = self.boxes.cpu().numpy()
-        what = ("occupancy", hashlib.sha256(table.tobytes()).digest(), self.grid, self.categories)
-        return self.query_cache.get_or_compute_total(
-            what, lambda: [build_occupancy(table, number, self.grid, BLOCKS) for number in range(len(self.categories))]
-        )
+        key = ("occupancy", hashlib.sha256(table.tobytes()).digest(), self.grid, self.categories)
+
+        def build_all() -> list[Occupancy]:
+            return [build_occupancy(table, index, self.grid, BLOCKS) for index in range(len(self.categories))]
+
+        return self.query_cache.get_or_compute_total(key, build_all)
 
 
-def _again(of_each: Sequence[Occupancy], times: NDArray[np.float64 | np.bool_], weights: Tensor) -> Tensor:
-    """(R, 1 + C) the sum over the categories, and each; NaN where there was no box."""
-    of_blocks = np.zeros((len(weights), BLOCKS))
-    of_blocks[:, of_each[0].frame_counts > 0] = weights.cpu().numpy()
-    values = np.full((len(weights), 1 + len(of_each)), np.nan)
-    for column, one in enumerate(of_each, 1):
-        if one.box_count:
-            values[:, column] = -one.compute_entropy_nats(times, of_blocks)
-    known = [column for column, one in enumerate(of_each, 1) if one.box_count]
-    if known:
-        values[:, 0] = values[:, known].sum(axis=1)
+def _recompute_s_mig(
+    occupancies: Sequence[Occupancy], multiplicities: NDArray[np.float64 | np.bool_], weights: Tensor
+) -> Tensor:
+    """Recompute (R, 1 + C) numbers, the sum over categories first, for (R, g) weights of the used blocks."""
+    block_weights = np.zeros((len(weights), BLOCKS))
+    block_weights[:, occupancies[0].frame_counts > 0] = weights.cpu().numpy()
+    values = np.full((len(weights), 1 + len(occupancies)), np.nan)
+    known_columns = []
+    for column, occupancy in enumerate(occupancies, 1):
+        if occupancy.box_count:
+            values[:, column] = -occupancy.compute_entropy_nats(multiplicities, block_weights)
+            known_columns.append(column)
+    if known_columns:
+        values[:, 0] = values[:, known_columns].sum(axis=1)
     return torch.from_numpy(values)
 
 
 def describe_unequal_rays(numbers: Mapping[str, Number]) -> str | None:
-    """What is to be said of the numbers of several rigs: that one has more rays than another; None if none has.
+    """Describe that rigs have different numbers of rays, which makes their numbers incomparable.
 
     Args:
-        numbers: Name of the rig -> its number, of one `SMig` each.
+        numbers: Number of an `SMig` by the name of the rig.
+
+    Returns:
+        Sentence; None if all numbers of rays are equal.
 
     Example:
         >>> dense = describe_number("s_mig_0.2m", "nats", "boxes", rays=4000)
@@ -370,5 +205,5 @@ def describe_unequal_rays(numbers: Mapping[str, Number]) -> str | None:
     if len(set(rays.values())) < 2:
         return None
     name = next(iter(numbers.values())).quantity.key
-    each = ", ".join(f"{rig} {count:,}" for rig, count in rays.items())
-    return f"{name}: the rigs have different numbers of rays ({each}), and fewer rays score higher"
+    counts = ", ".join(f"{rig} {count:,}" for rig, count in rays.items())
+    return f"{name}: the rigs have different numbers of rays ({counts}), and fewer rays score higher"
