@@ -50,16 +50,16 @@ def test_what_record_refuses(torchcover, worlds, tmp_path):
 
 
 def test_a_recording_that_was_ended_is_not_evaluated_and_gone_on_with(torchcover, worlds, monkeypatch):
-    out, step = worlds / "drive", writing._step
+    out, step = worlds / "drive", writing.build_frame_record
     command = ("record", worlds / "low.yaml", "--scenario", worlds / "yard.yaml", "--num-frames", 3, "--num-rays", 64)
-    monkeypatch.setattr(writing, "_step", lambda *given: (given[1] == 1 and signal.raise_signal(2)) or step(*given))
+    monkeypatch.setattr(writing, "build_frame_record", lambda *given: (given[1] == 1 and signal.raise_signal(2)) or step(*given))
     code, _, said = torchcover(*command, "--out", out)
     assert code == 130
     assert said.endswith("torchcover: 1 of 3 frames are kept; continue with --resume\ntorchcover: interrupted\n")
     code, _, said = torchcover("evaluate", "--frames", out, "--set", "cell_m=8", "--out", worlds / "out")
     assert code == 2
     assert f"{out}: an incomplete recording with 1 frames; continue it with `torchcover record" in said
-    monkeypatch.setattr(writing, "_step", step)
+    monkeypatch.setattr(writing, "build_frame_record", step)
     code, printed, _ = torchcover(*command, "--out", out, "--resume")
     assert (code, printed.startswith("Wrote 3 frames to ")) == (0, True)
     assert torchcover("evaluate", "--frames", out, "--set", "cell_m=8", "--out", worlds / "out")[0] == 0

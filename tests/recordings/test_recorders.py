@@ -90,7 +90,7 @@ def test_poses_are_of_the_ego_and_cities_separate(both, tmp_path):
     apart_s, cities = np.diff(recording.times_s), np.diff(recording.block_indices)
     assert set(cities) == {0, 1}
     np.testing.assert_allclose(apart_s, 45.0 + 1000.0 * cities)
-    body, ego = recording.ego_box, both.scenario.ego_box()
+    body, ego = recording.ego_box, both.scenario.compute_ego_box()
     assert (body.upper_m, body.lower_m[:2]) == (ego.upper_m, ego.lower_m[:2])
 
 
@@ -185,8 +185,8 @@ def test_unsupported_recordings_are_refused_before_the_first_frame(both, tmp_pat
 @pytest.fixture
 def simulated_once(both, monkeypatch):
     """The steps of `both`, which are not simulated again; which of them were asked for."""
-    made, asked = [writing._step(both, index) for index in range(len(both))], []
-    monkeypatch.setattr(writing, "_step", lambda _, index: (asked.append(index), made[index])[1])
+    made, asked = [writing.build_frame_record(both, index) for index in range(len(both))], []
+    monkeypatch.setattr(writing, "build_frame_record", lambda _, index: (asked.append(index), made[index])[1])
     return asked
 
 
@@ -273,8 +273,8 @@ def test_recordings_are_checked_against_their_manifest(tmp_path):
 
 def test_kill_at_any_file_operation_costs_one_frame(tmp_path, monkeypatch):
     frames = simulated(FRONT, scenario="courtyard", steps=2, frame_interval_s=0.1, boxes=False)
-    made, content = [writing._step(frames, index) for index in range(2)], frames.content
-    monkeypatch.setattr(writing, "_step", lambda _, index: made[index])
+    made, content = [writing.build_frame_record(frames, index) for index in range(2)], frames.content
+    monkeypatch.setattr(writing, "build_frame_record", lambda _, index: made[index])
     monkeypatch.setattr(SimulatedFrames, "content", content)
     whole, copies = tmp_path / "whole", tmp_path / "copies"
     count, code = operations_of(lambda: write_recording(frames, whole), copied=(whole, copies))
