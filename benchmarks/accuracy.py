@@ -50,7 +50,7 @@ EVERY_S = 10.0
 RAYS = (1024, 4096, 16_384, 65_536, 262_144, 1_048_576)
 BUDGET_CITIES = 3
 # Name of a row, estimator and band frame.
-ESTIMATORS = (("paper's pattern, mean over cells", "known", "vehicle"), ("surface points, by area", "area", "ground"))
+ESTIMATORS = (("paper's pattern, mean over cells", "cells", "vehicle"), ("surface points, by area", "area", "ground"))
 BUDGET_SCENARIOS = ("urban", "highway")
 FEW, MANY, DRAWS, INSTANTS = 4096, 262_144, 10, 6
 FAR_M = 180.0
@@ -134,7 +134,7 @@ def simulated(scenario, cities, seed):
 
 def _within(points, height, values, region, band):
     inside = torch.ones(len(points), dtype=torch.bool)
-    for along, (low, high) in ((points[:, 0], region.x), (points[:, 1], region.y), (height, band)):
+    for along, (low, high) in ((points[:, 0], region.x_m), (points[:, 1], region.y_m), (height, band)):
         inside &= (along >= low) & (along < high)
     return values[:, inside].sum(dim=1).tolist()
 
@@ -192,7 +192,7 @@ class Cities:
         for gain, many, every in (("", steps, 1), ("gain", 48, 2))[: 1 + (steps == LENGTHS[0])]:
             whole, found = self.over_all(every), self._rows(self.drawn(random, many, runs, every))
             truths = self._rows(whole)
-            tops = self._rows(replace(whole, left_out=whole.jackknife_values - whole.value), _share_of_one_city)
+            tops = self._rows(replace(whole, jackknife_values=whole.jackknife_values - whole.value), _share_of_one_city)
             for (kind, name), each in found.items():
                 if not gain or kind == "difference":
                     yield gain or kind, name, float(tops[kind, name][0]), *_covered(each, truths[kind, name][0, 0])
@@ -224,10 +224,10 @@ class Cities:
         return Estimate(
             tuple(quantities),
             estimate.value[at],
-            estimate.left_out[:, at],
-            estimate.steps,
+            estimate.jackknife_values[:, at],
+            estimate.frame_counts,
             None,
-            estimate.effective[at],
+            estimate.effective_blocks[at],
         )
 
     def stopped(self, random, runs=100, studies=50, studied=512):
@@ -256,7 +256,7 @@ class Replay:
     def __init__(self, pool, random, most):
         self.pool, self.grid = pool, SimpleNamespace(heights=("ground", "obstacle"))
         self.order = random.integers(len(pool.sums), size=-(-most // STEPS_OF_A_CITY))
-        self.most, self.counts, self.quantities = most, {"steps": 0}, (RADIUS, make_detection_quantity(THRESHOLD_M))
+        self.most, self.counts, self.quantities = most, {"num_frames": 0}, (RADIUS, make_detection_quantity(THRESHOLD_M))
 
     def stops(self):
         """After how many steps."""
@@ -286,20 +286,20 @@ class Replay:
         at = self.pool.places.index(f"{region.name} {height}")
         return Estimate(
             self.quantities,
-            *(one[..., [at, len(self.pool.places) + at]] for one in (self.found.value, self.found.left_out)),
-            self.found.steps,
+            *(one[..., [at, len(self.pool.places) + at]] for one in (self.found.value, self.found.jackknife_values)),
+            self.found.frame_counts,
         )
 
 
 def _ends_of(estimate, other):
     """(N, 3) values and ends of numbers, or of differences to others."""
-    found = estimate.numbers() if other is None else estimate.differences(other)
+    found = estimate.to_numbers() if other is None else estimate.compute_differences(other)
     return np.array([(one.value, one.low, one.high) for one in found.values()])
 
 
 def _share_of_one_city(estimate, other):
     """(N,) the largest share that a city has of the variance."""
-    parts = (estimate.left_out - (0.0 if other is None else other.left_out)).numpy()
+    parts = (estimate.jackknife_values - (0.0 if other is None else other.jackknife_values)).numpy()
     squares = np.square(parts - parts.mean(axis=0))
     return squares.max(axis=0) / np.maximum(squares.sum(axis=0), np.finfo(float).tiny)
 
@@ -333,18 +333,18 @@ def of_estimator(row):
     name, measure, band_frame = row
     frames = frames_of("urban", cities=BUDGET_CITIES)
     grid = BevGrid(
-        x_m=(0.0, 160.0), y_m=(-40.0, 40.0), cell_m=0.25 if measure == "known" else 1.0, band_frame=band_frame
+        x_m=(0.0, 160.0), y_m=(-40.0, 40.0), cell_m=0.25 if measure == "cells" else 1.0, band_frame=band_frame
     )
     looks, observers = {}, {}
     for rays in RAYS:
         of_paper = PaperReference(rows=int(rays**0.5), columns=int(rays**0.5))
         of_surface = SurfaceReference(AREAS, num_rays=rays, band_frame=band_frame)
-        looks[rays] = frames.replace_reference_sensor(of_paper if measure == "known" else of_surface)
-        metric = CoverageMetric(grid, max_radius=grid.diagonal_m, square_metres=measure == "area")
+        looks[rays] = frames.replace_reference_sensor(of_paper if measure == "cells" else of_surface)
+        metric = CoverageMetric(grid, max_radius_m=grid.diagonal_m, has_area_weights=measure == "area")
         observers[rays] = CoverageObserver(metric)
     for index, cloud in enumerate(rig_clouds(frames)):
         for rays, look in looks.items():
-            observers[rays].update(replace(look[index], clouds={RIG: cloud}, sensor_points={}))
+            observers[rays].update(replace(look[index], clouds={RIG: cloud}, sensor_point_counts={}))
     coverages = {rays: observer.compute() for rays, observer in observers.items()}
     places = [(region, height) for region in REGIONS for height in HEIGHTS]
     values = {
@@ -418,9 +418,9 @@ def frames_of(scenario, *, cities=BUDGET_CITIES, seed=0, vehicle=None, frame_int
 def rig_clouds(frames, rig=RIG):
     """The points of a rig, instant by instant."""
     torch.set_num_threads(1)
-    simulator = frames.simulator.with_rigs({rig: Rig.load(rig)})
+    simulator = frames.simulator.replace_rigs({rig: Rig.load(rig)})
     for index in range(len(frames)):
-        yield torch.cat([torch.from_numpy(scan.points) for scan in simulator.scans(index)[rig]])
+        yield torch.cat([torch.from_numpy(scan.points) for scan in simulator.simulate_scans(index)[rig]])
 
 
 def in_two_processes(function, rows):

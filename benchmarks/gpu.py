@@ -52,7 +52,7 @@ def main(arguments=()):
     table(("rays at what never moves", "Embree (ms)", "Warp (ms)", "Embree / Warp", "other bodies"), rays(device))
     print()
     table(("a whole step", "CPU (ms)", "device (ms)", "CPU / device", "detections differ by (points)"),
-          steps(device, options.steps))  # fmt: skip
+          steps(device, options.num_frames))  # fmt: skip
 
 
 def wall_ms(function, device):

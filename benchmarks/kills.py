@@ -17,7 +17,8 @@ import sys
 import tempfile
 import time
 from collections import Counter
-from functools import partial
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -44,10 +45,10 @@ scenario: yard.yaml
 candidates:
   small:
     sensor: {type: lidar, channels: 8, vertical_fov_deg: [-30, 0], horizontal_fov_deg: 180, columns: 9, max_range_m: 9}
-    places: {front: {x_m: 2.1, z_m: 1.0}, rear: {x_m: -2.1, z_m: 1.0, yaw_deg: 180}, roof: {z_m: 2.0}}
-choose: {max_sensors: 2}
-cost: {small: 1}
-objectives: {near: {detection: 1.0, band: ground, region: 20m}}
+    mounts: {front: {x_m: 2.1, z_m: 1.0}, rear: {x_m: -2.1, z_m: 1.0, yaw_deg: 180}, roof: {z_m: 2.0}}
+constraints: {max_sensors: 2}
+prices_eur: {small: 1}
+objectives: {near: {threshold_m: 1.0, band: ground, region: 20m}}
 """
 WORLD = ("--scenario", "yard.yaml")
 SMALL = (*WORLD, "--num-rays", "64", "--set", "cell_m=8", "--num-frames", "2")
@@ -117,6 +118,18 @@ def main():
     print(f"\nMixed: {sum(row[-1] for row in (*rows, *at_random))}")
 
 
+def make_surface(space, plan, seed, num_scenes):
+    """Make frames with known numbers instead of simulated ones."""
+    return Surface(seed, num_scenes, plan.frames_per_scene)
+
+
+@dataclass(frozen=True)
+class SurfacePlan(SearchPlan):
+    """Plan of a search that scores rigs by a known function."""
+
+    make_frames: Callable = make_surface
+
+
 def run(command, out, *options):
     """Run the command line in this process, which is to be a fork."""
     signal.signal(signal.SIGINT, signal.default_int_handler)  # which is ignored where this runs in the background
@@ -125,9 +138,7 @@ def run(command, out, *options):
     os.dup2(nowhere, 2)
     sys.argv = ["torchcover", *command, *options, "--out", str(out)]
     if "space.yaml" in command:  # frames are made up
-        makes = lambda space, plan, seed, num_scenes: Surface(seed, num_scenes, plan.frames_per_scene)  # noqa: E731
-        search_run.SearchPlan = partial(SearchPlan, make_frames=makes)
-        search_run.SearchPlan.num_scenes = SearchPlan.num_scenes
+        search_run.SearchPlan = SurfacePlan
     if command is not REAL:  # drawing takes most of the time
         result.plot_maps = lambda *_, **__: [("map1", Figure((1, 1)))]
     try:

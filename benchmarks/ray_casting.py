@@ -67,7 +67,7 @@ def bare_scene(world):
 
 def bare_rays(sensor, pose):
     """Origins and directions in the vehicle frame, row by row, one contiguous part a thread."""
-    directions = sensor.directions().reshape(3, -1).T @ pose[:3, :3].T
+    directions = sensor.compute_directions().reshape(3, -1).T @ pose[:3, :3].T
     origins = np.broadcast_to(pose[:3, 3], directions.shape)
     parts = zip(np.array_split(origins, THREADS), np.array_split(directions, THREADS), strict=True)
     return [(o.astype(np.float32), d.astype(np.float32)) for o, d in parts]
@@ -152,12 +152,12 @@ def scan_again(scene, sensor):
 
 def afresh(instant, sensor, tiles):
     """A scan that knows nothing of the steps before."""
-    return lambda: instant.scan(sensor.mount.matrix(), tiles, max_range_m=sensor.max_range_m)
+    return lambda: instant.scan(sensor.mount.to_matrix(), tiles, max_range_m=sensor.max_range_m)
 
 
 def world_again(scene, sensor):
     """The meshes are at hand; what is left out is to give them to the ray caster at every step."""
-    tiles, world = split_into_tiles(sensor.directions()), scene.world
+    tiles, world = split_into_tiles(sensor.compute_directions()), scene.world
 
     def step(built):
         return afresh(built.at(STEP, within_m=RANGE_M), sensor, tiles)()

@@ -57,7 +57,7 @@ MOVES_MPS, POINTS, WITHIN_MPS, LEAST_LENGTH_M = 0.5, 50, 0.5, 3.0
 # With the ground: noise, how near to it points lie on it, and how far up they are lifted, lest noise takes them below.
 NOISE_M, ON_GROUND_M, LIFT_M = 0.03, 0.1, 0.3
 RANGES_M = (0.0, 40.0, 80.0, 160.0)
-MOUNTS = {"judged": JUDGED.mount.matrix(), "other": OTHER.mount.to_matrix()}
+MOUNTS = {"judged": JUDGED.mount.to_matrix(), "other": OTHER.mount.to_matrix()}
 
 
 class Case(NamedTuple):
@@ -84,15 +84,15 @@ class SimulatedDrive:
     def __init__(self, sweeps, instant, window_s, *, labelled=True):
         reach = round((window_s / 2 + MARGIN_S) / EVERY_S)
         self._sweeps = [sweeps[number] for number in range(instant - reach, instant + reach + 1)]
-        scenes = [sweeps.simulator.scene_of(sweep.index) for sweep in self._sweeps]
-        self._poses = [scene.world.ego.trajectory.at(step * scene.world.time_step_s) for scene, step in scenes]
+        scenes = [sweeps.simulator.get_scene_geometry(sweep.index) for sweep in self._sweeps]
+        self._poses = [scene.scene.ego.trajectory.interpolate(step * scene.scene.time_step_s) for scene, step in scenes]
         self.sensors = tuple(sweeps.rigs)
         self.rigs = {"judged": ("judged",)}
         self.frame_names = [sweep.name for sweep in self._sweeps]
         self.key_frames = [reach]
         self.times_s = EVERY_S * np.arange(len(self.frame_names))
         self.labelled, self.imperfect = labelled, False
-        self.ego_box = sweeps.scenario.ego_box()
+        self.ego_box = sweeps.scenario.compute_ego_box()
 
     def read_scan(self, sensor, index):
         mount = MOUNTS[sensor]
@@ -148,7 +148,7 @@ def main():
 
 def measured(sweeps, cases, many, longest_s):
     """The true numbers of each rig; of each case those of its rigs, the processor time a frame, and `found_movers`."""
-    surface = sweeps.with_reference_sensor(
+    surface = sweeps.replace_reference_sensor(
         create_reference_sensor(
             num_rays=TRUTH_RAYS, query_plan=RegionsOfInterest().build_query_plan(sweeps.ego_outline_m)
         )
@@ -206,8 +206,8 @@ def found_movers(recording, reference, frame):
     """How far off in m/s is each vehicle that moves and has enough points; inf for one that is not found."""
     instant = recording.frames[0]
     time_s, loose_m, apart_s = recording.times_s[instant], [], []
-    vehicle_T_local = invert(reference.sweeps.local_T_vehicle(recording, instant))
-    for (_, index), (points_m, told) in reference.told_apart(recording, instant).items():
+    vehicle_T_local = invert(reference.sweeps.compute_local_T_vehicle(recording, instant))
+    for (_, index), (points_m, told) in reference.classify_points(recording, instant).items():
         own_m = transform_points(vehicle_T_local, points_m[told > 0])
         since_s = recording.times_s[index] - time_s
         if abs(since_s) <= MovingClusterParams().max_compared_s:
@@ -221,7 +221,7 @@ def found_movers(recording, reference, frame):
     count = torch.bincount(find_points_in_boxes(cloud, boxes).box_indices, minlength=len(boxes))
     inside, off_mps = find_points_in_boxes(places_m, boxes), []
     for number in np.flatnonzero(count >= POINTS):
-        velocity_mps, far_m = boxes.velocity_mps[number].numpy(), np.linalg.norm(boxes.centre_m[number, :2])
+        velocity_mps, far_m = boxes.velocity_mps[number].numpy(), np.linalg.norm(boxes.center_m[number, :2])
         moves = np.linalg.norm(velocity_mps) > MOVES_MPS and boxes.size_m[number, 0] > LEAST_LENGTH_M
         if moves and far_m < MovingClusterParams().max_range_m:
             own = whose[inside.point_indices[inside.box_indices == number].numpy()]
@@ -241,7 +241,7 @@ def distance(value, other):
 def added(to, frame, rig):
     """Add a frame to a metric."""
     heights_m, weights = frame.reference_heights_m, frame.reference_weights
-    to.update(frame.clouds[rig], frame.reference, weights=weights, height=heights_m)
+    to.update(frame.clouds[rig], frame.reference, weights=weights, heights_m=heights_m)
 
 
 def drive(options):
@@ -273,7 +273,7 @@ def heights(sweeps, options):
         round((number + 0.5) * sweeps.scenario.traffic.duration_s / EVERY_S) for number in range(options.instants)
     ]
     for name, (window_s, sensors, labelled) in references.items():
-        found, known = (CoverageMetric(grid, max_radius=grid.diagonal_m) for _ in range(2))
+        found, known = (CoverageMetric(grid, max_radius_m=grid.diagonal_m) for _ in range(2))
         seen = []
         for instant in instants:
             recording = SimulatedDrive(sweeps, instant, window_s, labelled=labelled)
@@ -285,7 +285,7 @@ def heights(sweeps, options):
             range_m = torch.linalg.vector_norm(frame.reference[:, :2], dim=1).numpy()
             seen.append(np.stack([range_m, frame.reference_heights_m.numpy(), true_m]))
         rows += [(name, *row) for row in by_range(*np.concatenate(seen, axis=1), grid)]
-        one, other = (numbers(of.compute(), "known") for of in (found, known))
+        one, other = (numbers(of.compute(), "cells") for of in (found, known))
         apart = np.stack([100 * (one[:, 1] - other[:, 1]), 100 * (one[:, 0] / other[:, 0] - 1)], axis=1)
         moves.append((name, *(f"{points:+.2f} / {share:+.1f}" for points, share in apart)))
     on, above = ("known on the ground (%)", "rms (cm)"), ("known above it (%)", "rms (cm)")
@@ -296,9 +296,9 @@ def heights(sweeps, options):
 
 def true_heights_m(sweeps, instant, points_m):
     """(N,) of points in the vehicle frame above the ground of the world."""
-    scene, step = sweeps.simulator.scene_of(instant)
-    placed_m = transform_points(scene.world.ego.trajectory.at(step * scene.world.time_step_s), points_m)
-    return scene.ground.heights_m(placed_m + np.array([0.0, 0.0, LIFT_M]), np.eye(4)) - np.float32(LIFT_M)
+    scene, step = sweeps.simulator.get_scene_geometry(instant)
+    placed_m = transform_points(scene.scene.ego.trajectory.interpolate(step * scene.scene.time_step_s), points_m)
+    return scene.ground.compute_heights_m(placed_m + np.array([0.0, 0.0, LIFT_M]), np.eye(4)) - np.float32(LIFT_M)
 
 
 def by_range(range_m, found_m, true_m, grid):
@@ -322,13 +322,13 @@ def named(sensor, name, **more):
 
 
 def metric():
-    return CoverageMetric(GRID, max_radius=GRID.diagonal_m, square_metres=True)
+    return CoverageMetric(GRID, max_radius_m=GRID.diagonal_m, has_area_weights=True)
 
 
 def numbers(coverage, measure):
     """(regions and bands, 2) radius and detection."""
     rows = coverage.summary(REGIONS)
-    found = [row.numbers if measure == "area" else row.known for row in rows]
+    found = [row.numbers if measure == "area" else row.cell_averages for row in rows]
     return np.array([[one["radius_m"].value, one["detection_0.4m"].value] for one in found])
 
 

@@ -25,14 +25,14 @@ EMBREE, BARE_SEARCH, TORCH = "bare Embree", "bare search", "`import torch`"
 PARTS = (START, WORLDS, RIG, REFERENCE, MOVING, SEARCH, SUMS, BODIES, MAPS, FILES)
 # Function -> what it is part of.
 WATCHED = {
-    "torchcover.simulation.stage:Stages.of_run": WORLDS,
-    "torchcover.simulation.simulator:Simulator._scans": RIG,
+    "torchcover.simulation.stage:MountedRigStore.get_mounted_rigs": WORLDS,
+    "torchcover.simulation.simulator:Simulator._scan": RIG,
     "torchcover.simulation.surface_reference:SurfaceReference.scan": REFERENCE,
-    "torchcover.simulation.scene:Scene.at": MOVING,
+    "torchcover.simulation.scene:SceneGeometry.get_snapshot": MOVING,
     "torchcover.neighbors.query:_search_nearest": SEARCH,
-    "torchcover.coverage.sums:CoverageSums.sums_of": SUMS,
-    "torchcover.coverage.sums:CoverageSums.add": SUMS,
-    "torchcover.targets.probing:Probes.sums_of": BODIES,
+    "torchcover.coverage.sums:CoverageSums.compute_sums": SUMS,
+    "torchcover.coverage.sums:CoverageSums.add_sums": SUMS,
+    "torchcover.targets.probing:NearFieldObserver.compute_sums": BODIES,
     "torchcover.report.maps:plot_side_by_side": MAPS,
     "torchcover.files.atomic:AtomicOutput.add_figure": MAPS,
     "torchcover.evaluation.result:Result.save": FILES,

@@ -74,7 +74,7 @@ def main():
         return
     torch.set_num_threads(1)
     times(1)  # what is imported and compiled at the first step is a part of the start
-    steps = STEPS_A_WORLD * options.worlds
+    steps = STEPS_A_WORLD * options.num_scenes
     table(("traffic", "bodies that move", "triangles", "a world (s)", "a step (s)"), list(by_traffic(steps)))
     of_rays = {rays: step_s(steps, rays=rays) for rays in RAYS}
     print()

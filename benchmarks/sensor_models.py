@@ -58,9 +58,9 @@ IMPERFECT = {
 
 def probabilities(rays, material, range_at_10_percent_m, spread):
     excess = compute_log_excess(
-        rays.range_m, rays.cos_incidence, material.share, material.incidence_exponent, range_at_10_percent_m
+        rays.range_m, rays.cos_incidence, material.numeric_reflectivity, material.incidence_exponent, range_at_10_percent_m
     )
-    return compute_return_probability(excess, spread, material.spread)
+    return compute_return_probability(excess, spread, material.log_reflectivity_std)
 
 
 def predicted(rays, road):
@@ -69,20 +69,20 @@ def predicted(rays, road):
     probability = np.empty(len(first))
     for half in (first, ~first):
         fit = fit_returns(rays.select(~half), road)
-        probability[half] = probabilities(rays.some(half), road, fit.range_at_10_percent_m, fit.log_range_std)
+        probability[half] = probabilities(rays.select(half), road, fit.range_at_10_percent_m, fit.log_range_std)
     return probability
 
 
 def by_range(rays, lidar, road):
     """A row for each bin: rays, and P(return) real, fitted to the other half, and of the rig's own numbers."""
     fitted = predicted(rays, road)
-    own = probabilities(rays, road, lidar.range_at_10_percent_m or np.inf, lidar.spread)
+    own = probabilities(rays, road, lidar.range_at_10_percent_m or np.inf, lidar.log_range_std)
     rows = []
     for low_m, high_m in pairwise(BINS_M):
         there = (rays.range_m >= low_m) & (rays.range_m < high_m)
-        count = rays.rays[there].sum()
+        count = rays.ray_counts[there].sum()
         if count >= 10:
-            shares = (rays.returned, fitted * rays.rays, own * rays.rays)
+            shares = (rays.return_counts, fitted * rays.ray_counts, own * rays.ray_counts)
             rows.append((low_m, high_m, count, *(one[there].sum() / count for one in shares)))
     return np.array(rows)
 
@@ -100,7 +100,7 @@ def as_cast(points_m, lidar):
     Moved along x by what the vehicle drove, in proportion to the azimuth and with a jump where the turn begins, rows
     are no more cones about the axis: that tells how far.
     """
-    in_sensor_m, rows_deg = transform_points(invert(lidar.mount.matrix()), points_m), np.sort(lidar.rows_deg())
+    in_sensor_m, rows_deg = transform_points(invert(lidar.mount.to_matrix()), points_m), np.sort(lidar.compute_elevations_deg())
     x, y, z = in_sensor_m.T
     flat_m, azimuth_deg = np.hypot(x, y), np.rad2deg(np.arctan2(y, x))
     gap_rad = np.deg2rad(np.interp(np.rad2deg(np.arctan2(z, flat_m)), rows_deg, np.gradient(rows_deg)))
@@ -126,7 +126,7 @@ def as_cast(points_m, lidar):
         shift_m = moved_m[0] + moved_m[1] * turn
     if abs(moved_m[1]) < LEAST_WAY_M:
         return points_m
-    return transform_points(lidar.mount.matrix(), in_sensor_m + np.outer(shift_m, [1.0, 0.0, 0.0]))
+    return transform_points(lidar.mount.to_matrix(), in_sensor_m + np.outer(shift_m, [1.0, 0.0, 0.0]))
 
 
 def nearest_road(points_m, place_m):
@@ -142,10 +142,10 @@ def nearest_road(points_m, place_m):
 
 def blocked(points_m, lidar, turns):
     """Azimuths in the frame of the LiDAR in which less than 60 % of the rays that look down return, in words."""
-    in_sensor_m = transform_points(invert(lidar.mount.matrix()), points_m)
-    down = np.sign(lidar.mount.matrix()[2, 2])
+    in_sensor_m = transform_points(invert(lidar.mount.to_matrix()), points_m)
+    down = np.sign(lidar.mount.to_matrix()[2, 2])
     elevation_deg = down * np.rad2deg(np.arcsin(in_sensor_m[:, 2] / np.linalg.norm(in_sensor_m, axis=1)))
-    rows_deg = down * lidar.rows_deg()
+    rows_deg = down * lidar.compute_elevations_deg()
     azimuth_deg = np.rad2deg(np.arctan2(in_sensor_m[:, 1], in_sensor_m[:, 0])) % 360.0
     looks = (elevation_deg > STEEP_DEG[0]) & (elevation_deg < STEEP_DEG[1])
     rows = np.count_nonzero((rows_deg > STEEP_DEG[0]) & (rows_deg < STEEP_DEG[1]))
@@ -159,8 +159,8 @@ def blocked(points_m, lidar, turns):
 def on_vehicles(sweeps, recording, lidar):
     """A row for each bin and part of a vehicle: rays at the side of a box with nothing before it, P(return)."""
     met = [
-        at_sides(points_m, recording.boxes(index), lidar)
-        for index, points_m in zip(recording.frames, sweeps, strict=True)
+        at_sides(points_m, recording.read_boxes(index), lidar)
+        for index, points_m in zip(recording.key_frames, sweeps, strict=True)
     ]
     rows = []
     for part, (_, _, name) in PARTS.items():
@@ -173,7 +173,7 @@ def on_vehicles(sweeps, recording, lidar):
             material.incidence_exponent,
             lidar.range_at_10_percent_m or np.inf,
         )
-        modelled = compute_return_probability(excess, lidar.spread, material.log_reflectivity_std)
+        modelled = compute_return_probability(excess, lidar.log_range_std, material.log_reflectivity_std)
         for low_m, high_m in pairwise(VEHICLE_BINS_M):
             there = (of_part[:, 0] >= low_m) & (of_part[:, 0] < high_m)
             if there.sum() >= 50:
@@ -185,9 +185,9 @@ def on_vehicles(sweeps, recording, lidar):
 def at_sides(points_m, boxes, lidar):
     """For each part (K, 3) of its rays: range and cosine at the side of a box, and whether that returned."""
     found = {part: [np.empty((0, 3))] for part in PARTS}
-    mount = lidar.mount.matrix()
+    mount = lidar.mount.to_matrix()
     cloud_m = transform_points(invert(mount), points_m)
-    rows_deg, columns = np.sort(lidar.rows_deg()), lidar.columns
+    rows_deg, columns = np.sort(lidar.compute_elevations_deg()), lidar.columns
     range_m = np.linalg.norm(cloud_m, axis=1)
     elevation_deg = np.rad2deg(np.arctan2(cloud_m[:, 2], np.hypot(cloud_m[:, 0], cloud_m[:, 1])))
     row = np.searchsorted((rows_deg[1:] + rows_deg[:-1]) / 2, elevation_deg)
@@ -201,7 +201,7 @@ def at_sides(points_m, boxes, lidar):
     flat = np.cos(elevation)
     towards = np.stack(np.broadcast_arrays(flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)), axis=-1)
     for centre_m, size_m, yaw, category in zip(
-        boxes.centre_m.numpy(), boxes.size_m.numpy(), boxes.yaw_rad.numpy(), boxes.categories, strict=True
+        boxes.center_m.numpy(), boxes.size_m.numpy(), boxes.yaw_rad.numpy(), boxes.categories, strict=True
     ):
         if not any(word in category for word in VEHICLES):
             continue
@@ -312,13 +312,13 @@ def show_imperfections():
     torch.set_num_threads(1)
     rigs = {f"{name}: {words(keys)}": imperfect(name, keys) for name, each in IMPERFECT.items() for keys in each}
     frames = SimulatedFrames("urban", rigs=rigs, num_frames=NUM_FRAMES, frame_interval_s=EVERY_S, seed=0)
-    metrics = {(rig, landed): CoverageMetric(GRID, square_metres=True) for rig in rigs for landed in (False, True)}
+    metrics = {(rig, landed): CoverageMetric(GRID, has_area_weights=True) for rig in rigs for landed in (False, True)}
     for frame in frames:
         for (rig, landed), metric in metrics.items():
             points, error = (
                 (frame.get_measured_points(rig), None) if landed else (frame.get_cloud(rig), frame.get_errors_m(rig))
             )
-            surface = {"weights": frame.reference_weights, "height": frame.reference_heights_m}
+            surface = {"weights": frame.reference_weights, "heights_m": frame.reference_heights_m}
             metric.update(points, frame.reference, errors_m=error, **surface)
     percent = {key: [f"{100 * value:.1f}" for value in detection(metric)] for key, metric in metrics.items()}
     rows = [(*rig.split(": ", 1), *percent[rig, False], *percent[rig, True]) for rig in rigs]
@@ -339,7 +339,7 @@ def imperfect(name, keys):
 
 def detection(metric):
     """Of the ground, and of obstacles."""
-    rows = {(row.region, row.height): row for row in metric.compute().summary()}
+    rows = {(row.region, row.band): row for row in metric.compute().summary()}
     return [rows["80m", height].numbers["detection_0.4m"].value for height in ("ground", "obstacle")]
 
 

@@ -142,7 +142,7 @@ def met(scene, deeper_m=0.05, within_m=80.0):
     """{(name, name): greatest depth} of pairs that overlap at some time, near the ego; bodies on bridges count too."""
     found = {}
     everybody = [scene.ego, *scene.others]
-    height_m = np.stack([body.trajectory.positions_at(scene.times_s)[:, 2] for body in everybody])
+    height_m = np.stack([body.trajectory.interpolate_positions_m(scene.times_s)[:, 2] for body in everybody])
     for column, time_s in enumerate(scene.times_s):
         outline_m = outlines(everybody, time_s)
         away_m = np.linalg.norm(outline_m.mean(axis=1) - outline_m[0].mean(axis=0), axis=1)
@@ -164,7 +164,7 @@ def accelerations(trajectory, frame_interval_s=0.2):
     times_s = np.arange(trajectory.times_s[0], trajectory.times_s[-1] + 1e-9, frame_interval_s)
     if len(times_s) < 3:
         return np.empty(0), np.empty(0), np.empty(0), np.empty(0)
-    places_m = trajectory.positions_at(np.minimum(times_s, trajectory.times_s[-1]))[:, :2]
+    places_m = trajectory.interpolate_positions_m(np.minimum(times_s, trajectory.times_s[-1]))[:, :2]
     ways_m = np.diff(places_m, axis=0)
     velocity, change = (
         (ways_m[:-1] + ways_m[1:]) / (2 * frame_interval_s),
@@ -205,14 +205,14 @@ def motion(scene, frame_interval_s=0.2):
         "ego to the side (m/s2)": float(np.abs(left).max(initial=0.0)),
         "ego brakes (m/s2)": float(-ahead.min(initial=0.0)),
         "wheels off the ground, or in a kerb (m)": np.nan if scene.world is None else wheels_m(scene.world),
-        "left out": 0 if scene.world is None else scene.world.left_out,
+        "left out": 0 if scene.world is None else scene.world.num_omitted_road_users,
     }
 
 
 def speeds_mps(body, times_s, over_s=0.5):
     """(T,) speeds, NaN where it is not there for so long."""
-    before, after = (body.trajectory.positions_at(times_s + shift)[:, :2] for shift in (-over_s / 2, over_s / 2))
-    if not body.trajectory.transient and len(body.trajectory.times_s) > 1:
+    before, after = (body.trajectory.interpolate_positions_m(times_s + shift)[:, :2] for shift in (-over_s / 2, over_s / 2))
+    if not body.trajectory.is_transient and len(body.trajectory.times_s) > 1:
         own_s = body.trajectory.times_s
         over_s = np.minimum(times_s + over_s / 2, own_s[-1]) - np.maximum(times_s - over_s / 2, own_s[0])
     return np.linalg.norm(after - before, axis=1) / over_s
@@ -220,10 +220,10 @@ def speeds_mps(body, times_s, over_s=0.5):
 
 def near(scene, within_m=75.0):
     """For each time the (body, distance, speed) of all that are within a distance of the ego."""
-    ego_m = scene.ego.trajectory.positions_at(scene.times_s)[:, :2]
+    ego_m = scene.ego.trajectory.interpolate_positions_m(scene.times_s)[:, :2]
     found = [[] for _ in scene.times_s]
     for body in scene.others:
-        away_m = np.linalg.norm(body.trajectory.positions_at(scene.times_s)[:, :2] - ego_m, axis=1)
+        away_m = np.linalg.norm(body.trajectory.interpolate_positions_m(scene.times_s)[:, :2] - ego_m, axis=1)
         speed = speeds_mps(body, scene.times_s) if body.ever_moves else np.zeros(len(away_m))
         for column in np.flatnonzero(away_m < within_m):
             found[column].append((body, float(away_m[column]), float(speed[column])))
@@ -292,11 +292,11 @@ def wheels_m(world, looks=12):
     """How far the lowest points of the wheels of what moves are from the ground, kerbs included, at the worst."""
     ground, tyre, worst_m = Scenery(world).ground, get_material_index("tyre"), 0.0
     for actor in (world.ego, *world.actors):
-        low_m = actor.mesh.vertices_m[np.unique(actor.mesh.faces[actor.mesh.materials == tyre])]
+        low_m = actor.mesh.vertices_m[np.unique(actor.mesh.faces[actor.mesh.filled_material_indices == tyre])]
         low_m = low_m[low_m[:, 2] < 0.02]
         own_s = actor.trajectory.times_s
         for time_s in np.linspace(own_s[0], own_s[-1], looks) if len(low_m) else ():
-            above_m = ground.compute_heights_m(transform_points(actor.trajectory.at(time_s), low_m) + UP_M) - UP_M[2]
+            above_m = ground.compute_heights_m(transform_points(actor.trajectory.interpolate(time_s), low_m) + UP_M) - UP_M[2]
             worst_m = max(worst_m, float(np.abs(above_m[np.isfinite(above_m)]).max(initial=0.0)))
     return worst_m
 
@@ -394,7 +394,7 @@ def objects(scenes):
 
 def drives(body, time_s):
     """Whether it gets anywhere around a time, in as long as a log takes: who waits for longer looks parked there."""
-    places_m = body.trajectory.positions_at(time_s + LOG_S * np.linspace(-0.5, 0.5, 16))[:, :2]
+    places_m = body.trajectory.interpolate_positions_m(time_s + LOG_S * np.linspace(-0.5, 0.5, 16))[:, :2]
     places_m = places_m[~np.isnan(places_m[:, 0])]
     return bool(len(places_m) and np.linalg.norm(np.ptp(places_m, axis=0)) > 1.0)
 
@@ -418,7 +418,7 @@ def main():
     views = []
     for rig in rigs:
         views += [(rig, Path(path).stem, recorded(path)) for name, path in pairs if name == rig]
-        views += [(rig, f"`{world}`", simulated(world, rig, options.runs)) for world in options.worlds]
+        views += [(rig, f"`{world}`", simulated(world, rig, options.runs)) for world in options.num_scenes]
     print("Azimuths (%) closed by something of a height (m) above the ground within a distance (m), and open beyond.\n")
     closed = [f"{name} within {far:.0f}" for name in BANDS_M for far in WITHIN_M]
     closed = [key for key in closed if key.startswith(THINGS) or key.endswith("within 40")]
@@ -432,7 +432,7 @@ def main():
     )
     print("\nObjects within 75 m of the ego at a time, by kind, and within distances (m).\n", flush=True)
     scenes = {Path(path).stem: [Scene.of_recording(read_objects(path))] for path in options.logs}
-    for world in options.worlds:
+    for world in options.num_scenes:
         scenario = Scenario.load(world)
         ego, runs = scenario.build_ego_mesh(), 1 if scenario.is_repeating else options.runs
         scenes[f"`{world}`"] = [Scene.of_world(scenario.build_scene(0, run, ego), 5.0) for run in range(runs)]
