@@ -1,4 +1,4 @@
-"""An extension of griffe, which reads docstrings for the site: `Example:` is code, as `Examples:` is to it."""
+"""Griffe extension: reads the section `Example:` of docstrings as `Examples:`, whose content is code."""
 
 import re
 
@@ -6,9 +6,9 @@ import griffe
 
 
 class Doctests(griffe.Extension):
-    """Its parser takes what stands under another title for Markdown, in which lists become links."""
+    """Renames the section; Griffe parses the content of other sections as Markdown, in which lists become links."""
 
     def on_instance(self, *, obj, **_):
-        """Rename the title where there is one."""
+        """Rename the section in the docstring of an object."""
         if obj.docstring:
             obj.docstring.value = re.sub(r"(?m)^Example:$", "Examples:", obj.docstring.value)
