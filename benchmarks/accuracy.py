@@ -256,7 +256,11 @@ class Replay:
     def __init__(self, pool, random, most):
         self.pool, self.grid = pool, SimpleNamespace(heights=("ground", "obstacle"))
         self.order = random.integers(len(pool.sums), size=-(-most // STEPS_OF_A_CITY))
-        self.most, self.counts, self.quantities = most, {"num_frames": 0}, (RADIUS, make_detection_quantity(THRESHOLD_M))
+        self.most, self.counts, self.quantities = (
+            most,
+            {"num_frames": 0},
+            (RADIUS, make_detection_quantity(THRESHOLD_M)),
+        )
 
     def stops(self):
         """After how many steps."""

@@ -58,7 +58,11 @@ IMPERFECT = {
 
 def probabilities(rays, material, range_at_10_percent_m, spread):
     excess = compute_log_excess(
-        rays.range_m, rays.cos_incidence, material.numeric_reflectivity, material.incidence_exponent, range_at_10_percent_m
+        rays.range_m,
+        rays.cos_incidence,
+        material.numeric_reflectivity,
+        material.incidence_exponent,
+        range_at_10_percent_m,
     )
     return compute_return_probability(excess, spread, material.log_reflectivity_std)
 
@@ -100,7 +104,10 @@ def as_cast(points_m, lidar):
     Moved along x by what the vehicle drove, in proportion to the azimuth and with a jump where the turn begins, rows
     are no more cones about the axis: that tells how far.
     """
-    in_sensor_m, rows_deg = transform_points(invert(lidar.mount.to_matrix()), points_m), np.sort(lidar.compute_elevations_deg())
+    in_sensor_m, rows_deg = (
+        transform_points(invert(lidar.mount.to_matrix()), points_m),
+        np.sort(lidar.compute_elevations_deg()),
+    )
     x, y, z = in_sensor_m.T
     flat_m, azimuth_deg = np.hypot(x, y), np.rad2deg(np.arctan2(y, x))
     gap_rad = np.deg2rad(np.interp(np.rad2deg(np.arctan2(z, flat_m)), rows_deg, np.gradient(rows_deg)))

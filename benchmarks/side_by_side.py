@@ -5,8 +5,8 @@ bytes of written recordings and scenarios, and every tensor of the first frames 
 equal to the last bit. Durations, versions and hashes of files are not compared.
 
 Renames between the checkouts are given by options, one per line in FILE: `--called=NEW=>OLD` replaces a text in the
-commands of OLD, `--renamed=OLD=NEW` renames parts of keys and texts. A rule with `/` renames the end of a key, with `#`
-for an index. `*` in both OLD and NEW stands for the same text; `*` in NEW alone stacks all arrays that match.
+commands of OLD, `--renamed=OLD=NEW` renames parts of keys and texts, or the end of a key if OLD has a `/`. `*` in OLD
+stands for any text and, in ends of keys, `#` for an index; `*` in NEW alone stacks all arrays that match.
 """
 
 import argparse
@@ -64,7 +64,17 @@ SOURCES = {
 # Exit codes of runs that end with a result: requirements that are not met or not decided have codes of their own.
 RESULT_CODES = (0, 1, 3)
 # Keys of summary.json that depend on time, versions or paths.
-IGNORED_KEYS = ("duration_s", "torchcover", "omissions", "complete", "frames", "files", "options", "journal", "space_sha256")
+IGNORED_KEYS = (
+    "duration_s",
+    "torchcover",
+    "omissions",
+    "complete",
+    "frames",
+    "files",
+    "options",
+    "journal",
+    "space_sha256",
+)
 PROGRAM = "from torchcover.cli.app import main; main()"
 FRAMES_PROGRAM = """
 import dataclasses, hashlib, json, sys
@@ -276,16 +286,18 @@ def compare(old, new, renamed, tolerances):
 
 
 def rename_key(key, renamed):
-    """Rename a key: its end by a rule with `/`, where `#` stands for an index, all other parts one by one.
+    """Rename a key: its end by the first matching rule with `/`, all other parts one by one.
 
     Returns:
         Parts of the new key.
     """
     for end, replacement in renamed.items():
-        pattern = re.escape(end).replace(r"\#", r"(?P<index>\d+)")
-        if "/" in end and (match := re.search(f"(^|/)(?P<end>{pattern})$", key)):
+        pattern = re.escape(end).replace(r"\#", r"(\d+)").replace(r"\*", r"([^/]*)")
+        if "/" in end and (match := re.search(f"(?:^|/)(?P<end>{pattern})$", key)):
             beginning = key[: match.start("end")].split("/")[:-1]
-            new_end = replacement.replace("#", match["index"]) if "#" in end else replacement
+            new_end = replacement
+            for text in match.groups()[1:]:
+                new_end = re.sub(r"[#*]", text, new_end, count=1)
             return [*(rename(part, renamed) for part in beginning), *new_end.split("/")]
     return [rename(part, renamed) for part in key.split("/")]
 

@@ -211,7 +211,9 @@ def motion(scene, frame_interval_s=0.2):
 
 def speeds_mps(body, times_s, over_s=0.5):
     """(T,) speeds, NaN where it is not there for so long."""
-    before, after = (body.trajectory.interpolate_positions_m(times_s + shift)[:, :2] for shift in (-over_s / 2, over_s / 2))
+    before, after = (
+        body.trajectory.interpolate_positions_m(times_s + shift)[:, :2] for shift in (-over_s / 2, over_s / 2)
+    )
     if not body.trajectory.is_transient and len(body.trajectory.times_s) > 1:
         own_s = body.trajectory.times_s
         over_s = np.minimum(times_s + over_s / 2, own_s[-1]) - np.maximum(times_s - over_s / 2, own_s[0])
@@ -296,7 +298,9 @@ def wheels_m(world, looks=12):
         low_m = low_m[low_m[:, 2] < 0.02]
         own_s = actor.trajectory.times_s
         for time_s in np.linspace(own_s[0], own_s[-1], looks) if len(low_m) else ():
-            above_m = ground.compute_heights_m(transform_points(actor.trajectory.interpolate(time_s), low_m) + UP_M) - UP_M[2]
+            above_m = (
+                ground.compute_heights_m(transform_points(actor.trajectory.interpolate(time_s), low_m) + UP_M) - UP_M[2]
+            )
             worst_m = max(worst_m, float(np.abs(above_m[np.isfinite(above_m)]).max(initial=0.0)))
     return worst_m
 
@@ -410,7 +414,7 @@ def main():
         "--sweeps", nargs="*", default=[], metavar="RIG=PATH", help="real sweeps of the LiDARs of a rig"
     )
     parser.add_argument("--logs", nargs="*", default=[], metavar="PATH", help="recorded objects with an ego")
-    parser.add_argument("--num-scenes", nargs="*", default=[*WORLDS, *TRACKS])
+    parser.add_argument("--scenarios", nargs="*", default=[*WORLDS, *TRACKS])
     parser.add_argument("--runs", type=int, default=RUNS)
     options = parser.parse_args()
     pairs = [pair.partition("=")[::2] for pair in options.sweeps]
@@ -418,7 +422,7 @@ def main():
     views = []
     for rig in rigs:
         views += [(rig, Path(path).stem, recorded(path)) for name, path in pairs if name == rig]
-        views += [(rig, f"`{world}`", simulated(world, rig, options.runs)) for world in options.num_scenes]
+        views += [(rig, f"`{world}`", simulated(world, rig, options.runs)) for world in options.scenarios]
     print("Azimuths (%) closed by something of a height (m) above the ground within a distance (m), and open beyond.\n")
     closed = [f"{name} within {far:.0f}" for name in BANDS_M for far in WITHIN_M]
     closed = [key for key in closed if key.startswith(THINGS) or key.endswith("within 40")]
@@ -432,7 +436,7 @@ def main():
     )
     print("\nObjects within 75 m of the ego at a time, by kind, and within distances (m).\n", flush=True)
     scenes = {Path(path).stem: [Scene.of_recording(read_objects(path))] for path in options.logs}
-    for world in options.num_scenes:
+    for world in options.scenarios:
         scenario = Scenario.load(world)
         ego, runs = scenario.build_ego_mesh(), 1 if scenario.is_repeating else options.runs
         scenes[f"`{world}`"] = [Scene.of_world(scenario.build_scene(0, run, ego), 5.0) for run in range(runs)]
