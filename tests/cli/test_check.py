@@ -18,7 +18,7 @@ INSIDE = "{target: dog, positions: {points_m: [[0, 0]]}, points: 5}"
         ([AHEAD, INSIDE, MUCH], 1, ["met", "not decided", "not met"]),
     ],
 )
-def test_the_exit_code_is_the_verdict_on_all(torchcover, worlds, requirements, code, states):
+def test_exit_code_states_the_verdict_on_all_requirements(torchcover, worlds, requirements, code, states):
     (worlds / "need.yaml").write_text(f"name: needs\nscenario: yard.yaml\nrequirements: [{', '.join(requirements)}]\n")
     ended, printed, error = torchcover("check", worlds / "low.yaml", "--requirements", worlds / "need.yaml")
     assert (ended, error) == (code, "")
@@ -52,7 +52,7 @@ def test_the_exit_code_is_the_verdict_on_all(torchcover, worlds, requirements, c
         (f"requirements: [{AHEAD}]", ["--requirements", "none.yaml"], "none.yaml: no such file"),
     ],
 )
-def test_a_mistake_is_one_line_and_exit_code_2(torchcover, worlds, text, arguments, message):
+def test_user_error_is_one_line_with_code_2(torchcover, worlds, text, arguments, message):
     (worlds / "need.yaml").write_text(text)
     ended, printed, error = torchcover("check", worlds / "low.yaml", "--requirements", worlds / "need.yaml", *arguments)
     assert (ended, printed) == (2, "")

@@ -35,7 +35,7 @@ def recording(tmp_path):
     return folder
 
 
-def test_a_recording_is_evaluated_and_the_files_agree(drawn_maps, torchcover, recording, tmp_path):
+def test_files_of_an_evaluated_recording_agree(drawn_maps, torchcover, recording, tmp_path):
     out = tmp_path / "out"
     code, printed, _ = torchcover(
         "evaluate", "--frames", recording, "--out", out, "--thresholds-m", 0.4, "--thresholds-m", 1
@@ -67,13 +67,13 @@ def test_a_recording_is_evaluated_and_the_files_agree(drawn_maps, torchcover, re
     ]
 
 
-def test_steps_limits_a_recording(torchcover, recording, tmp_path):
+def test_num_frames_limits_a_recording(torchcover, recording, tmp_path):
     assert torchcover("evaluate", "--frames", recording, "--out", tmp_path / "o", "--num-frames", 3)[0] == 0
     assert Coverage.load(tmp_path / "o" / "coverage.npz").counts["num_frames"] == 3
 
 
 @pytest.mark.parametrize("workers", [0, 2])
-def test_a_bad_frame_stops_the_run_by_name_and_what_was_done_is_written(torchcover, recording, tmp_path, workers):
+def test_bad_frame_stops_and_keeps_earlier_frames(torchcover, recording, tmp_path, workers):
     (recording / "reference" / "f10.npy").write_bytes(b"rubbish")
     out = tmp_path / "out"
     code, _, error = torchcover("evaluate", "--frames", recording, "--out", out, "--num-workers", workers)
@@ -85,7 +85,7 @@ def test_a_bad_frame_stops_the_run_by_name_and_what_was_done_is_written(torchcov
 
 
 @pytest.mark.parametrize("workers", [0, 2])
-def test_bad_frames_can_be_skipped_and_are_counted(torchcover, recording, tmp_path, workers):
+def test_skipped_bad_frames_are_counted(torchcover, recording, tmp_path, workers):
     (recording / "reference" / "f10.npy").write_bytes(b"rubbish")
     out = tmp_path / "out"
     code, printed, _ = torchcover("evaluate", "--frames", recording, "--out", out, *SKIPPING, "--num-workers", workers)
@@ -97,7 +97,7 @@ def test_bad_frames_can_be_skipped_and_are_counted(torchcover, recording, tmp_pa
     assert "f10" in summary["skipped_frames"][0]
 
 
-def test_a_recording_of_bad_frames_only_writes_nothing(torchcover, recording, tmp_path):
+def test_recording_without_good_frames_writes_nothing(torchcover, recording, tmp_path):
     for path in (recording / "sensor").iterdir():
         path.write_bytes(b"rubbish")
     code, _, error = torchcover("evaluate", "--frames", recording, "--out", tmp_path / "o", *SKIPPING)
@@ -106,7 +106,7 @@ def test_a_recording_of_bad_frames_only_writes_nothing(torchcover, recording, tm
     assert not (tmp_path / "o").exists()
 
 
-def test_a_simulation_is_evaluated_and_repeats_itself(torchcover, tmp_path):
+def test_simulation_is_reproducible(torchcover, tmp_path):
     (tmp_path / "rig.yaml").write_text(
         "name: tiny\nsensors:\n  - {name: top, mount: {z_m: 2.0}, channels: 8, vertical_fov_deg: [-30, 0],"
         " horizontal_fov_deg: 360, columns: 90, max_range_m: 60}\n"
@@ -144,7 +144,7 @@ def test_a_simulation_is_evaluated_and_repeats_itself(torchcover, tmp_path):
     }
 
 
-def test_the_weights_of_the_surface_reference_reach_the_metric(torchcover, worlds, monkeypatch):
+def test_metric_receives_area_weights_of_the_reference(torchcover, worlds, monkeypatch):
     given = []
 
     def noted(self, sensor, reference, **more):
@@ -175,7 +175,7 @@ def test_the_weights_of_the_surface_reference_reach_the_metric(torchcover, world
 
 
 @pytest.mark.parametrize("name", REFERENCE_SENSORS)
-def test_every_reference_sensor_has_its_measure_and_is_named_in_the_help(torchcover, worlds, name):
+def test_reference_sensors_have_averages_and_are_in_help(torchcover, worlds, name):
     options = [
         "--scenario",
         worlds / "yard.yaml",
@@ -196,7 +196,7 @@ def test_every_reference_sensor_has_its_measure_and_is_named_in_the_help(torchco
     assert name in torchcover("evaluate", "--help")[1]
 
 
-def test_the_mean_over_known_cells_is_the_same_whether_it_heads_the_result_or_not(torchcover, worlds):
+def test_cell_average_is_equal_in_both_averages(torchcover, worlds):
     options = ["--scenario", worlds / "yard.yaml", "--num-frames", 2, "--set", "cell_m=4", "--num-rays", 1024, "--out"]
     rows = {}
     for measure in ("area", "cells"):
@@ -213,7 +213,7 @@ def test_the_mean_over_known_cells_is_the_same_whether_it_heads_the_result_or_no
     assert any(area["radius_m"] != known["radius_m"] for area, known in zip(rows["area"], rows["cells"], strict=True))
 
 
-def test_frames_that_are_skipped_leave_their_place_in_time(torchcover, recording, tmp_path, monkeypatch):
+def test_skipped_frames_keep_their_block_index(torchcover, recording, tmp_path, monkeypatch):
     (recording / "reference" / "f2.npy").write_bytes(b"rubbish")
     sums_of, given = CoverageSums.compute_sums, []
     monkeypatch.setattr(
@@ -225,7 +225,7 @@ def test_frames_that_are_skipped_leave_their_place_in_time(torchcover, recording
     assert given == [0, 2, 3]
 
 
-def test_too_few_steps_for_errors_are_told_and_a_recording_has_no_reference_sensor(torchcover, recording, tmp_path):
+def test_too_few_frames_for_intervals_are_reported(torchcover, recording, tmp_path):
     _, printed, _ = torchcover("evaluate", "--frames", recording, "--out", tmp_path / "out")
     assert "Not enough frames for an answer: 4 frames form 4 blocks, 9 are needed" in printed
     assert "Brackets: 95" not in printed
@@ -317,7 +317,7 @@ def test_too_few_steps_for_errors_are_told_and_a_recording_has_no_reference_sens
         (["average"], "No such command 'average'"),
     ],
 )
-def test_a_mistake_ends_in_one_line_and_exit_code_2(torchcover, recording, monkeypatch, arguments, message):
+def test_user_error_is_one_line_with_code_2(torchcover, recording, monkeypatch, arguments, message):
     monkeypatch.chdir(recording.parent)
     code, _, error = torchcover(*arguments)
     assert code == 2
@@ -326,14 +326,14 @@ def test_a_mistake_ends_in_one_line_and_exit_code_2(torchcover, recording, monke
     assert error.count("\n") == 1
 
 
-def test_an_output_folder_that_cannot_be_made_is_a_mistake_too(torchcover, recording, tmp_path):
+def test_output_folder_below_a_file_is_rejected(torchcover, recording, tmp_path):
     (tmp_path / "file").write_text("")
     code, _, error = torchcover("evaluate", "--frames", recording, "--out", tmp_path / "file")
     assert code == 2
     assert "file" in error
 
 
-def test_an_impossible_output_folder_is_found_before_the_run(torchcover, recording, tmp_path, monkeypatch):
+def test_invalid_output_folder_is_rejected_before_the_run(torchcover, recording, tmp_path, monkeypatch):
     monkeypatch.setattr(
         "torchcover.evaluation.measurement.observe", lambda *_, **__: pytest.fail("it ran all the same")
     )
@@ -345,14 +345,14 @@ def test_an_impossible_output_folder_is_found_before_the_run(torchcover, recordi
         assert f"--out {out}: " in error
 
 
-def test_a_folder_may_be_called_what_rich_takes_for_markup(torchcover, recording, monkeypatch):
+def test_folder_names_are_not_markup(torchcover, recording, monkeypatch):
     monkeypatch.chdir(recording.parent)
     code, printed, _ = torchcover("evaluate", "--frames", recording, "--out", "[/x]")
     assert code == 0
     assert "summary.json to [/x]" in printed
 
 
-def test_an_output_without_the_signs_of_the_tables_gets_question_marks_not_an_error(torchcover, monkeypatch):
+def test_characters_outside_the_encoding_become_question_marks(torchcover, monkeypatch):
     buffer = io.BytesIO()
     monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(buffer, encoding="ascii"))
     monkeypatch.setattr("torchcover.cli.listing.print_builtin", lambda word: Console().print("0.3 – 0.1"))
@@ -360,7 +360,7 @@ def test_an_output_without_the_signs_of_the_tables_gets_question_marks_not_an_er
     assert buffer.getvalue() == b"0.3 ? 0.1\n"
 
 
-def test_list_names_everything_built_in_and_what_it_is_made_of(torchcover):
+def test_list_prints_all_built_in_names_and_properties(torchcover):
     code, printed, _ = torchcover("list")
     assert code == 0
     assert len(printed.splitlines()) < 60
@@ -379,7 +379,7 @@ def test_list_names_everything_built_in_and_what_it_is_made_of(torchcover):
     assert said["courtyard"].startswith("static")
 
 
-def test_list_with_a_word_prints_what_has_it_and_all_that_is_said_of_it(torchcover):
+def test_list_finds_text_and_prints_complete_descriptions(torchcover):
     code, printed, _ = torchcover("list", "PANDAR64")
     assert (code, "hesai_pandar64" in printed, "velodyne_vlp16" in printed) == (0, True, False)
     assert " ".join(load_builtin_documents("lidars")["hesai_pandar64"]["description"].split()) in printed
@@ -390,7 +390,7 @@ def test_list_with_a_word_prints_what_has_it_and_all_that_is_said_of_it(torchcov
     )
 
 
-def test_version_and_help(torchcover):
+def test_version_and_help_are_printed(torchcover):
     code, printed, _ = torchcover("--version")
     assert (code, printed.strip()) == (0, "0.1.0")
     code, printed, _ = torchcover("evaluate", "--help")
@@ -405,13 +405,13 @@ def test_help_of_evaluate_fits_on_one_screen(torchcover, monkeypatch):
     assert max(len(line) for line in lines) <= 120
 
 
-def test_it_is_a_module_too():
+def test_package_runs_as_a_module():
     command = [sys.executable, "-m", "torchcover", "--version"]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "0.1.0"
 
 
-def test_help_loads_none_of_the_heavy_libraries():
+def test_help_imports_no_heavy_library():
     program = (
         "import sys; sys.argv = ['torchcover', '--help']\n"
         "from torchcover.cli.app import main\n"
@@ -430,7 +430,7 @@ def test_help_loads_none_of_the_heavy_libraries():
         (torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 7.00 GiB.\nGPU 0 ..."), "7.00 GiB.); reduce"),
     ],
 )
-def test_out_of_memory_on_a_gpu_ends_in_one_line_and_keeps_what_was_measured(
+def test_out_of_memory_keeps_earlier_frames(
     torchcover, recording, tmp_path, monkeypatch, error, told
 ):
     def search(*arguments, **options):

@@ -70,7 +70,7 @@ def test_files_agree_with_each_other_and_with_evaluate(torchcover, worlds):
     np.testing.assert_array_equal(Coverage.load(alone / "coverage.npz").radius, coverages["both"].radius)
 
 
-def test_fog_never_makes_a_rig_better(torchcover, worlds):
+def test_fog_never_increases_coverage(torchcover, worlds):
     path = worlds / "both.yaml"
     path.write_text(path.read_text().replace("max_range_m: 60", "max_range_m: 60, range_at_10_percent_m: 30"))
     *_, out = compare(torchcover, worlds, "both", options=["--weather", "clear", "--weather", "fog_50m"])
@@ -85,7 +85,7 @@ def test_fog_never_makes_a_rig_better(torchcover, worlds):
     assert max(lost) > 0.05
 
 
-def test_one_more_sensor_never_makes_it_worse(torchcover, worlds):
+def test_one_more_sensor_never_reduces_coverage(torchcover, worlds):
     *_, out = compare(torchcover, worlds, "low", "both")
     rows = [row for row in json.loads((out / "summary.json").read_text())["rows"] if row["rig"] == "both"]
     known = [row for row in rows if row["observed_cells"]]
@@ -96,7 +96,7 @@ def test_one_more_sensor_never_makes_it_worse(torchcover, worlds):
     assert (both.radius < low.radius - 1.0).any()
 
 
-def test_rigs_with_one_name_get_columns_and_files_of_their_own(torchcover, worlds):
+def test_rigs_with_equal_names_get_separate_files(torchcover, worlds):
     code, printed, _, out = compare(torchcover, worlds, "low", "other/low", "low")
     assert code == 0
     assert sorted(path.name for path in (out / "coverage").iterdir()) == ["low.npz", "low_2.npz", "low_3.npz"]
@@ -111,7 +111,7 @@ def test_rigs_with_one_name_get_columns_and_files_of_their_own(torchcover, world
             assert row["radius_m_difference"] == 0.0
 
 
-def test_maps_are_side_by_side_and_as_differences(torchcover, worlds):
+def test_maps_and_their_differences_are_plotted(torchcover, worlds):
     *_, out = compare(torchcover, worlds, "low", "both")
     metrics = "radius_area_m", "detection_area_2m"
     of_bands = [
@@ -124,7 +124,7 @@ def test_maps_are_side_by_side_and_as_differences(torchcover, worlds):
     assert sorted(path.name for path in (out / "maps").iterdir()) == sorted([*of_bands, *near])
 
 
-def test_differences_come_with_their_errors(torchcover, worlds):
+def test_differences_have_standard_errors(torchcover, worlds):
     *_, out = compare(torchcover, worlds, "low", "both", num_frames=9)
     summary = json.loads((out / "summary.json").read_text())
     assert (summary["blocks"], summary["frames_per_block"]) == (9, 1)
@@ -138,7 +138,7 @@ def test_differences_come_with_their_errors(torchcover, worlds):
     assert [row["radius_m_difference_error"] for row in first] == [0.0, 0.0, 0.0]
 
 
-def test_the_reference_sensor_is_the_one_that_was_asked_for_and_is_named(torchcover, worlds):
+def test_reference_sensor_is_used_and_named(torchcover, worlds):
     _, printed, _, out = compare(torchcover, worlds, "low", "both", num_frames=2, options=["--reference", "paper"])
     summary = json.loads((out / "summary.json").read_text())
     (ground,) = summary["reference"].pop("notes")
@@ -167,7 +167,7 @@ def recording(tmp_path):
         (["kitti", "near"], {"kitti": 3.0, "near": 1.0}),
     ],
 )
-def test_the_rigs_of_a_recording_are_compared(torchcover, recording, tmp_path, rigs, radii):
+def test_rigs_of_a_recording_are_compared(torchcover, recording, tmp_path, rigs, radii):
     out = tmp_path / "out"
     arguments = ["--frames", recording, "--set", "recording.format=folder", "--set", "cell_m=4", "--out", out]
     code, _, complaints = torchcover("compare", *rigs, *arguments)
@@ -183,7 +183,7 @@ def test_the_rigs_of_a_recording_are_compared(torchcover, recording, tmp_path, r
     assert found == pytest.approx(radii)
 
 
-def test_what_is_not_in_a_recording_is_told_with_what_is(torchcover, recording, tmp_path):
+def test_error_lists_the_rigs_of_a_recording(torchcover, recording, tmp_path):
     arguments = ["--frames", recording, "--out", tmp_path / "out"]
     for command, rigs, message in (
         ("compare", ["near", "middle"], "no clouds of the rig middle; the frames have far, kitti, near"),
@@ -225,7 +225,7 @@ def test_what_is_not_in_a_recording_is_told_with_what_is(torchcover, recording, 
         ),
     ],
 )
-def test_a_mistake_ends_in_one_line_and_exit_code_2(torchcover, arguments, message, tmp_path):
+def test_user_error_is_one_line_with_code_2(torchcover, arguments, message, tmp_path):
     code, _, error = torchcover("compare", *arguments, "--out", tmp_path / "out")
     assert code == 2
     assert message in error
@@ -234,7 +234,7 @@ def test_a_mistake_ends_in_one_line_and_exit_code_2(torchcover, arguments, messa
     assert not (tmp_path / "out").exists()
 
 
-def test_pages_and_maps_of_many_rigs_are_announced_and_refused_where_they_do_not_fit(torchcover, worlds, monkeypatch):
+def test_pages_of_many_rigs_are_announced_or_rejected(torchcover, worlds, monkeypatch):
     code, _, error, out = compare(torchcover, worlds, "low", "both", out="few")
     assert (code, "page and maps" in error) == (0, False)
     few = compare_saved(sorted((out / "coverage").glob("*.npz")))

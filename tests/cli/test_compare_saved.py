@@ -30,7 +30,7 @@ def saved(worlds, measured):
     return run
 
 
-def test_two_evaluations_of_the_same_frames_are_a_comparison(torchcover, worlds, saved):
+def test_coverage_files_compare_like_a_joint_evaluation(torchcover, worlds, saved):
     """To the last bit: differences, their errors, marks."""
     code, printed, _ = torchcover("compare", saved("low"), saved("both"), "--explain", "--out", worlds / "out")
     assert code == 0
@@ -59,7 +59,7 @@ def test_two_evaluations_of_the_same_frames_are_a_comparison(torchcover, worlds,
         ({"band_frame": "vehicle"}, "differ in their band_frame"),
     ],
 )
-def test_results_that_are_not_paired_are_refused(torchcover, worlds, saved, change, message):
+def test_unpaired_coverage_files_are_rejected(torchcover, worlds, saved, change, message):
     code, _, complaint = torchcover("compare", saved("low"), saved("both", **change), "--out", worlds / "out")
     assert code == 2
     assert message in complaint
@@ -67,7 +67,7 @@ def test_results_that_are_not_paired_are_refused(torchcover, worlds, saved, chan
 
 
 @pytest.mark.parametrize("out", ["low", "low/.", "both"])
-def test_the_folder_of_what_is_compared_is_not_written_to(torchcover, worlds, saved, out):
+def test_folder_of_an_input_is_not_overwritten(torchcover, worlds, saved, out):
     """Its files would be those of an earlier run, and be deleted."""
     files = saved("low"), saved("both")
     code, _, complaint = torchcover("compare", *files, "--out", worlds / out)
@@ -76,7 +76,7 @@ def test_the_folder_of_what_is_compared_is_not_written_to(torchcover, worlds, sa
     assert all(file.is_file() for file in files)
 
 
-def test_what_is_no_pair_of_coverage_files_is_said(torchcover, worlds, saved):
+def test_invalid_coverage_files_are_one_line(torchcover, worlds, saved):
     file = saved("low")
     (worlds / "rubbish.npz").write_bytes(b"PK")
     for arguments, message in (
@@ -91,7 +91,7 @@ def test_what_is_no_pair_of_coverage_files_is_said(torchcover, worlds, saved):
         assert message in complaint
 
 
-def test_what_is_measured_is_not_measured_again(torchcover, saved):
+def test_evaluate_rejects_coverage_files(torchcover, saved):
     file = saved("low")
     code, _, complaint = torchcover("evaluate", file)
     assert (code, complaint.count("\n")) == (2, 1), complaint

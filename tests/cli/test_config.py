@@ -12,7 +12,7 @@ from torchcover.files import BadFileError, parse_yaml
 from torchcover.simulation.documents import KINDS, SETTINGS_KIND
 
 
-def test_the_written_defaults_are_all_settings_with_a_comment_each(tmp_path):
+def test_printed_defaults_have_a_comment_for_every_setting(tmp_path):
     text = format_defaults()
     (tmp_path / "run.yaml").write_text(text)
     assert load_config(tmp_path / "run.yaml").config == EvaluateConfig()
@@ -26,7 +26,7 @@ def test_the_written_defaults_are_all_settings_with_a_comment_each(tmp_path):
     assert list(parse_yaml(f"recording:{section}")["recording"]) == list(RecordingSettings.model_fields)
 
 
-def test_an_option_wins_over_set_which_wins_over_the_file_and_both_are_recorded(tmp_path):
+def test_options_precede_set_which_precedes_the_file(tmp_path):
     path = tmp_path / "run.yaml"
     path.write_text("num_rays: 1\ncell_m: 1.0\nseed: 1\nrecording: {units: mm, time_offset_s: 0.2}\n")
     config, record = load_config(path, ["num_rays=2", "cell_m=2", "recording.units=cm"], {"num_rays": 3})
@@ -61,7 +61,7 @@ def test_an_option_wins_over_set_which_wins_over_the_file_and_both_are_recorded(
         ("name: r\nsensors: []", "this is a rig; a file of settings is needed"),
     ],
 )
-def test_a_file_with_a_mistake_is_refused_with_key_and_value(tmp_path, text, message):
+def test_error_of_a_file_names_key_and_value(tmp_path, text, message):
     path = tmp_path / "run.yaml"
     path.write_text(text)
     with pytest.raises(BadFileError) as refused:
@@ -71,12 +71,12 @@ def test_a_file_with_a_mistake_is_refused_with_key_and_value(tmp_path, text, mes
 
 
 @pytest.mark.parametrize("text", ["rays", "=", "rayz=3", "recording=1", "recording.unit=mm", "num_rays=x", "cell_m=25cm"])
-def test_an_assignment_that_is_no_setting_is_refused(text):
+def test_invalid_assignment_is_rejected(text):
     with pytest.raises(ValueError, match=r"^--set "):
         load_config(None, [text])
 
 
-def test_a_run_reads_a_file_and_its_result_has_it(torchcover, worlds):
+def test_result_contains_the_file_of_settings(torchcover, worlds):
     path = worlds / "run.yaml"
     path.write_text(f"scenario: {worlds / 'yard.yaml'}\ncell_m: 4\nnum_rays: 64\nnum_frames: 3\ntest_targets: [none]\n")
     options = ("--config", path, "--num-frames", 2, "--files", "numbers", "--out", worlds / "out")
@@ -90,7 +90,7 @@ def test_a_run_reads_a_file_and_its_result_has_it(torchcover, worlds):
     assert (code, printed) == (0, format_defaults())
 
 
-def test_a_recording_says_how_to_read_it_and_settings_win(tmp_path):
+def test_settings_precede_recording_yaml(tmp_path):
     recording = tmp_path
     for source in ("sensor", "reference"):
         (tmp_path / source).mkdir()

@@ -12,7 +12,7 @@ encounters:
 """
 
 
-def test_rigs_side_by_side_in_words_and_files(torchcover, worlds, monkeypatch):
+def test_tables_and_files_contain_all_rigs(torchcover, worlds, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")  # so that no cell is folded
     (worlds / "two.yaml").write_text(SET)
     arguments = (
@@ -67,7 +67,7 @@ def test_rigs_side_by_side_in_words_and_files(torchcover, worlds, monkeypatch):
         (SET, ["--scenario", "urban"], "--encounters: has no effect with --scenario"),
     ],
 )
-def test_a_mistake_is_one_line(torchcover, worlds, text, arguments, message):
+def test_user_error_is_one_line(torchcover, worlds, text, arguments, message):
     (worlds / "two.yaml").write_text(text)
     given = ("--encounters", worlds / "two.yaml", "--num-start-offsets", "1", "--vehicle", "suv", *arguments)
     ended, _, error = torchcover("encounter", worlds / "low.yaml", *given)
@@ -91,7 +91,7 @@ def test_a_mistake_is_one_line(torchcover, worlds, text, arguments, message):
         ([], "rigs with different names are needed; got none"),
     ],
 )
-def test_what_would_not_be_read_is_a_mistake(torchcover, worlds, arguments, message):
+def test_option_without_effect_is_a_user_error(torchcover, worlds, arguments, message):
     ended, _, error = torchcover("encounter", *(worlds / one if one == "low.yaml" else one for one in arguments))
     assert ended == 2
     assert message in error.strip().splitlines()[-1]

@@ -27,7 +27,7 @@ PROGRAM = [sys.executable, "-m", "torchcover"]
         (app.typer.Exit(), 0, 0),
     ],
 )
-def test_each_kind_of_end_has_its_exit_code(torchcover, monkeypatch, error, code, lines):
+def test_each_error_has_its_exit_code(torchcover, monkeypatch, error, code, lines):
     def run(word):
         raise error
 
@@ -48,13 +48,13 @@ def test_each_kind_of_end_has_its_exit_code(torchcover, monkeypatch, error, code
         ("", 2, ">&- 2>&-"),
     ],
 )
-def test_every_command_works_with_closed_streams(arguments, code, closed):
+def test_commands_run_with_closed_streams(arguments, code, closed):
     command = f"exec {' '.join(PROGRAM)} {arguments} {closed}"
     done = subprocess.run(["sh", "-c", command], check=False, capture_output=True, text=True)
     assert (done.returncode, "Traceback" in done.stderr) == (code, False)
 
 
-def test_a_run_with_closed_streams_writes_its_results_and_nothing_into_them(worlds):
+def test_results_are_written_with_closed_streams(worlds):
     settings = f"--scenario {worlds}/yard.yaml --set cell_m=4 --num-rays 1024 --num-frames 2 --num-workers 1"
     command = f"exec {' '.join(PROGRAM)} evaluate {worlds}/low.yaml {settings} --files numbers <&- >&- 2>&-"
     assert subprocess.run(["sh", "-c", command], check=False, cwd=worlds).returncode == 0
@@ -63,7 +63,7 @@ def test_a_run_with_closed_streams_writes_its_results_and_nothing_into_them(worl
 
 
 @pytest.mark.parametrize("arguments", ["list", "targets front_roof_32 --raster 3,5,-1,1,1 --files numbers"])
-def test_a_reader_that_is_gone_ends_it_with_141_without_a_word(arguments, tmp_path):
+def test_broken_pipe_ends_with_141_and_no_message(arguments, tmp_path):
     reader, writer = os.pipe()
     os.close(reader)
     command = [*PROGRAM, *arguments.split()]
@@ -72,13 +72,13 @@ def test_a_reader_that_is_gone_ends_it_with_141_without_a_word(arguments, tmp_pa
     assert (done.returncode, done.stderr) == (128 + signal.SIGPIPE, "")
 
 
-def test_a_full_disk_behind_the_output_is_one_line():
+def test_full_disk_at_stdout_is_one_line():
     with open("/dev/full", "w", encoding="utf-8") as full:
         done = subprocess.run([*PROGRAM, "list"], check=False, stdout=full, stderr=subprocess.PIPE, text=True)
     assert (done.returncode, done.stderr) == (2, "torchcover: [Errno 28] No space left on device\n")
 
 
-def test_help_names_the_exit_codes(torchcover):
+def test_help_lists_the_exit_codes(torchcover):
     for arguments in (["--help"], ["check", "--help"]):
         printed = " ".join(torchcover(*arguments)[1].split())
         assert all(f"{code} " in printed for code in (0, 1, 2, 70, 141)), printed

@@ -9,7 +9,7 @@ def whats(folder):
     return {row["description"]: row for row in json.loads((folder / "summary.json").read_text())["omissions"]}
 
 
-def test_a_scene_in_which_nothing_moves_reuses_its_scan(torchcover, worlds):
+def test_static_scene_reuses_its_scan(torchcover, worlds):
     options = ["--scenario", worlds / "yard.yaml", "--num-frames", "3", *RAYS, "--explain", "--out", worlds / "out"]
     code, text, complaints = torchcover("evaluate", worlds / "low.yaml", *options)
     assert code == 0, complaints
@@ -21,7 +21,7 @@ def test_a_scene_in_which_nothing_moves_reuses_its_scan(torchcover, worlds):
     assert not any("cast once" in what or "first scan" in what for what in whats(worlds / "out"))
 
 
-def test_without_the_option_it_stands_in_the_summary_only(torchcover, worlds):
+def test_omissions_without_explain_are_only_in_the_summary(torchcover, worlds):
     options = ["--scenario", worlds / "yard.yaml", "--num-frames", "2", *RAYS, "--out", worlds / "out"]
     code, text, _ = torchcover("compare", worlds / "low.yaml", worlds / "both.yaml", *options)
     assert code == 0

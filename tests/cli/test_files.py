@@ -14,7 +14,7 @@ def written(folder):
     ("files", "expected"),
     [("numbers", NUMBERS), ("page", {"report.html"}), ("page, numbers", {*NUMBERS, "report.html"}), ("maps", set())],
 )
-def test_a_result_has_the_files_that_were_asked_for(torchcover, worlds, files, expected):
+def test_result_has_the_selected_files(torchcover, worlds, files, expected):
     out = worlds / "out"
     code, printed, _ = torchcover(
         "evaluate", worlds / "low.yaml", "--scenario", worlds / "yard.yaml", *SMALL, "--files", files, "--out", out
@@ -26,7 +26,7 @@ def test_a_result_has_the_files_that_were_asked_for(torchcover, worlds, files, e
     assert ("maps/" in printed) == (files == "maps")
 
 
-def test_targets_have_the_files_that_were_asked_for(torchcover, worlds):
+def test_target_map_has_the_selected_files(torchcover, worlds):
     raster = ["--raster", "3,5,-1,1,1", "--out", worlds / "out"]
     for files, expected in (("numbers", {"targets.csv", "targets.npz"}), ("maps", {"targets.png"})):
         assert torchcover("targets", worlds / "low.yaml", *raster, "--files", files)[0] == 0
@@ -34,7 +34,7 @@ def test_targets_have_the_files_that_were_asked_for(torchcover, worlds):
 
 
 @pytest.mark.parametrize("files", ["", "number", "numbers,", "numbers;maps"])
-def test_files_that_there_are_not_are_refused_before_the_run(torchcover, worlds, files):
+def test_unknown_file_kind_is_rejected_before_the_run(torchcover, worlds, files):
     code, _, said = torchcover("evaluate", worlds / "low.yaml", "--files", files, "--out", worlds / "out")
     assert code == 2
     assert said == f"torchcover: files: numbers, maps, page, one or more of them, are needed; got {files!r}\n"

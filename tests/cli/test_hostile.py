@@ -14,12 +14,12 @@ CASES = [
 ]
 
 
-def test_there_are_enough_of_them():
+def test_there_are_enough_hostile_cases():
     assert len(list(hostile.cases())) >= 400
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name[:40])
-def test_it_ends_at_once_in_one_line(case, torchcover, tmp_path, monkeypatch):
+def test_hostile_case_ends_quickly_with_one_line(case, torchcover, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for name, content in case.files.items():
         (tmp_path / name).write_text(content)

@@ -27,7 +27,7 @@ def write(folder, target=None):
     return folder
 
 
-def test_a_link_is_read_inside_of_the_recording_or_of_a_named_root_only(tmp_path, monkeypatch):
+def test_links_may_only_lead_to_allowed_roots(tmp_path, monkeypatch):
     assert len(RecordedFrames(write(tmp_path / "within", tmp_path / "within" / "blobs" / "0"))[0].sensor) == 4
     folder, root = write(tmp_path / "out", tmp_path / "blobs" / "0"), tmp_path / "blobs"
     with pytest.raises(BadFrameError, match=rf"f\.npy: a link to {root}/0, outside of the recording; .*--allow-links"):
@@ -41,7 +41,7 @@ def test_a_link_is_read_inside_of_the_recording_or_of_a_named_root_only(tmp_path
         RecordedFrames(folder)[0]
 
 
-def test_a_folder_that_is_a_link_and_a_recording_that_is_one(tmp_path):
+def test_linked_folders_and_recordings_are_read(tmp_path):
     folder = write(tmp_path / "recording")
     (folder / "sensors").rename(tmp_path / "elsewhere")
     (folder / "sensors").symlink_to(tmp_path / "elsewhere")
@@ -51,7 +51,7 @@ def test_a_folder_that_is_a_link_and_a_recording_that_is_one(tmp_path):
     assert len(RecordedFrames(tmp_path / "named")[0].sensor) == 4
 
 
-def test_another_process_follows_the_same_links(tmp_path, monkeypatch):
+def test_workers_follow_the_same_links(tmp_path, monkeypatch):
     folder, root = write(tmp_path / "out", tmp_path / "blobs" / "0"), tmp_path / "blobs"
     for roots in ([], [root]):
         content = pickle.dumps(RecordedFrames(open_recording(folder, link_roots=roots)))
@@ -64,7 +64,7 @@ def test_another_process_follows_the_same_links(tmp_path, monkeypatch):
                 frames[0]
 
 
-def test_the_command_line_names_roots(tmp_path, torchcover):
+def test_allow_links_adds_roots(tmp_path, torchcover):
     write(tmp_path / "out", tmp_path / "blobs" / "0")
     command = ("evaluate", "--frames", "out", "--out", "result", "--files", "numbers")
     code, _, said = torchcover(*command)
@@ -76,7 +76,7 @@ def test_the_command_line_names_roots(tmp_path, torchcover):
 
 
 @pytest.mark.parametrize("kind", ["FIFO", "zero"])
-def test_a_pipe_or_a_device_in_the_place_of_a_file_is_named(tmp_path, kind):
+def test_pipe_or_device_instead_of_file_is_rejected(tmp_path, kind):
     folder = write(tmp_path / "recording")
     paths = [tmp_path / "rig.yaml", tmp_path / "mesh.ply", folder / "recording.json", folder / "reference" / "f.npy"]
     paths[-1].unlink()

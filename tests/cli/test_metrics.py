@@ -29,7 +29,7 @@ def run(torchcover, worlds, *rigs, command="compare", options=(), out="out", num
     return *torchcover(command, *paths, *arguments, "--out", folder, *options), folder
 
 
-def test_three_rigs_have_ranks_and_taus_in_every_file(torchcover, worlds):
+def test_three_rigs_have_rank_correlations_in_all_files(torchcover, worlds):
     code, printed, error, out = run(torchcover, worlds, "low", "both", "other/low", options=["--set", "metrics=all"])
     assert (code, error.count("warning")) == (0, 0)
     assert "None of these metrics is validated" in printed
@@ -56,13 +56,13 @@ def test_three_rigs_have_ranks_and_taus_in_every_file(torchcover, worlds):
     assert "tau-b" in page
 
 
-def test_two_rigs_have_no_tau_and_are_told_why(torchcover, worlds):
+def test_two_rigs_have_no_rank_correlation(torchcover, worlds):
     _, printed, _, out = run(torchcover, worlds, "low", "both", options=["--set", "metrics=point_density"])
     assert "needs at least three rigs" in " ".join(printed.split())
     assert json.loads((out / "summary.json").read_text())["metrics"]["tau"] == []
 
 
-def test_one_rig_has_its_numbers_and_its_coverage_is_what_it_is_without(torchcover, worlds):
+def test_metrics_do_not_change_the_coverage(torchcover, worlds):
     code, printed, _, out = run(torchcover, worlds, "both", command="evaluate", options=["--set", "metrics=k_cover"])
     assert code == 0
     assert "k_cover_2_2m" in printed
@@ -72,7 +72,7 @@ def test_one_rig_has_its_numbers_and_its_coverage_is_what_it_is_without(torchcov
     np.testing.assert_array_equal(with_metrics.point_counts, without.point_counts)
 
 
-def test_a_name_that_is_none_is_told_with_those_that_are(torchcover, worlds):
+def test_unknown_metric_lists_all_metrics(torchcover, worlds):
     code, _, error, _ = run(torchcover, worlds, "low", "both", options=["--set", "metrics=nosuch"])
     assert code == 2
     assert error.count("\n") == 1
@@ -80,7 +80,7 @@ def test_a_name_that_is_none_is_told_with_those_that_are(torchcover, worlds):
     assert "'nosuch'" in error
 
 
-def test_a_run_goes_on_from_its_checkpoint_with_its_metrics(torchcover, worlds):
+def test_resumed_run_continues_its_metrics(torchcover, worlds):
     options = ["--set", "metrics=all"]
     run(torchcover, worlds, "low", "both", options=options, num_frames=1)
     code, *_, out = run(torchcover, worlds, "low", "both", options=[*options, "--resume"], num_frames=3)
@@ -90,7 +90,7 @@ def test_a_run_goes_on_from_its_checkpoint_with_its_metrics(torchcover, worlds):
 
 
 @pytest.mark.filterwarnings("ignore:.*edited since it was recorded")
-def test_a_recording_without_boxes_has_the_metrics_that_need_none(torchcover, worlds):
+def test_recording_without_boxes_has_metrics_without_boxes(torchcover, worlds):
     torchcover(
         "record", worlds / "both.yaml", "--out", worlds / "drive", "--scenario", worlds / "yard.yaml", "--num-frames", 2
     )
@@ -111,7 +111,7 @@ def test_a_recording_without_boxes_has_the_metrics_that_need_none(torchcover, wo
     assert "Without false_visible" in " ".join(printed.split())
 
 
-def test_taus_have_intervals_over_worlds_that_are_drawn_the_same_again(worlds):
+def test_intervals_of_rank_correlations_are_reproducible(worlds):
     def taus():
         result = evaluate(
             [worlds / f"{rig}.yaml" for rig in ("low", "both", "other/low")],
@@ -133,7 +133,7 @@ def test_taus_have_intervals_over_worlds_that_are_drawn_the_same_again(worlds):
 
 
 @pytest.mark.parametrize("metrics", ["", ()])
-def test_nothing_is_asked_for_with_nothing(worlds, metrics):
+def test_empty_list_of_metrics_computes_none(worlds, metrics):
     result = evaluate(
         [worlds / "low.yaml", worlds / "both.yaml"],
         worlds / "yard.yaml",

@@ -3,7 +3,7 @@
 import json
 
 
-def test_several_scenarios_are_measured_apart_and_mixed(torchcover, worlds):
+def test_several_scenarios_are_evaluated_and_mixed(torchcover, worlds):
     (worlds / "plain.yaml").write_text((worlds / "yard.yaml").read_text().replace("name: yard", "name: plain"))
     (worlds / "out" / "yard").mkdir(parents=True)
     mixture = f"{worlds / 'yard.yaml'}=3,{worlds / 'plain.yaml'}=1"

@@ -22,7 +22,7 @@ def rigs(worlds):
     return worlds
 
 
-def test_what_is_left_without_a_radar_is_the_other_alone(torchcover, rigs):
+def test_failure_of_a_radar_leaves_the_other_alone(torchcover, rigs):
     code, printed, _ = torchcover("evaluate", rigs / "radars.yaml", "--scenario", rigs / "yard.yaml", *SMALL)
     assert code == 0
     assert "when one sensor fails" in printed
@@ -38,7 +38,7 @@ def test_what_is_left_without_a_radar_is_the_other_alone(torchcover, rigs):
     assert seen[0] > seen[1]
 
 
-def test_a_search_moves_a_radar(torchcover, rigs):
+def test_search_moves_a_radar(torchcover, rigs):
     (rigs / "space.yaml").write_text(
         "name: nose\nstart: radars.yaml\nscenario: yard.yaml\nobjectives: {near: {region: 20m}}\n"
         "free: {front: {z_m: [0.3, 0.9], pitch_deg: [-10, 10]}}\n"
@@ -50,7 +50,7 @@ def test_a_search_moves_a_radar(torchcover, rigs):
     assert best.sensors[0].type == "radar"
 
 
-def test_targets_count_the_points_of_a_radar_and_not_its_rays(torchcover, rigs):
+def test_targets_count_radar_points_not_rays(torchcover, rigs):
     place = ("--scenario", rigs / "yard.yaml", "--target", "adult", "--raster=4,6,-1,1,1", "--num-frames", 1)
     for rays_m in (1.0, 0.05):
         rig = f"name: fine\nsensors:\n{FRONT.replace('ray_spacing_m: 1.0', f'ray_spacing_m: {rays_m}')}"
@@ -77,7 +77,7 @@ def test_targets_count_the_points_of_a_radar_and_not_its_rays(torchcover, rigs):
         ),
     ],
 )
-def test_a_cell_wider_than_the_opening_is_one_line_that_names_the_key(torchcover, rigs, was, cell, message):
+def test_radar_cell_beyond_fov_names_the_key(torchcover, rigs, was, cell, message):
     (rigs / "radars.yaml").write_text(f"name: radars\nsensors:\n{FRONT.replace(was, cell)}")
     code, printed, error = torchcover("evaluate", rigs / "radars.yaml")
     assert (code, printed, error.count("\n")) == (2, "", 1)

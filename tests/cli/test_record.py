@@ -9,7 +9,7 @@ from torchcover import Coverage
 from torchcover.simulation import writing
 
 
-def test_a_recording_has_the_numbers_of_the_simulation(torchcover, worlds, tmp_path):
+def test_recording_has_the_numbers_of_the_simulation(torchcover, worlds, tmp_path):
     options = ("--scenario", worlds / "yard.yaml", "--num-frames", 3, "--seed", 2, "--num-rays", 1024)
     measured, read, recording = (tmp_path / name for name in ("simulated", "read", "recording"))
     code, printed, told = torchcover("record", worlds / "both.yaml", *options, "--out", recording)
@@ -37,7 +37,7 @@ def test_a_recording_has_the_numbers_of_the_simulation(torchcover, worlds, tmp_p
     assert any(row["radius_m"] for row in rows[0])
 
 
-def test_what_record_refuses(torchcover, worlds, tmp_path):
+def test_record_rejects_invalid_options(torchcover, worlds, tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "a").write_text("")
     low, both, yard = worlds / "low.yaml", worlds / "both.yaml", ("--scenario", worlds / "yard.yaml", "--num-frames", 1)
@@ -49,7 +49,7 @@ def test_what_record_refuses(torchcover, worlds, tmp_path):
     assert "format kitti: a rig of one LiDAR is needed; both has front, rear; use the format folder" in error
 
 
-def test_a_recording_that_was_ended_is_not_evaluated_and_gone_on_with(torchcover, worlds, monkeypatch):
+def test_interrupted_recording_is_resumed_but_not_evaluated(torchcover, worlds, monkeypatch):
     out, step = worlds / "drive", writing.build_frame_record
     command = ("record", worlds / "low.yaml", "--scenario", worlds / "yard.yaml", "--num-frames", 3, "--num-rays", 64)
     monkeypatch.setattr(writing, "build_frame_record", lambda *given: (given[1] == 1 and signal.raise_signal(2)) or step(*given))

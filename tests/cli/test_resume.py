@@ -18,7 +18,7 @@ def files_of(folder):
 
 
 @pytest.mark.parametrize("command", [("evaluate", "low.yaml"), ("compare", "low.yaml", "both.yaml")])
-def test_a_run_goes_on_to_the_same_files(torchcover, worlds, monkeypatch, command):
+def test_resumed_run_writes_the_same_files(torchcover, worlds, monkeypatch, command):
     monkeypatch.chdir(worlds)
     arguments = [*command, "--scenario", "yard.yaml", *SMALL]
     assert torchcover(*arguments, "--num-frames", 5, "--out", "whole")[0] == 0

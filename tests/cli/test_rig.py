@@ -6,7 +6,7 @@ import yaml
 from torchcover import Rig
 
 
-def test_a_recorded_rig_is_found_again(torchcover, worlds, tmp_path):
+def test_rig_of_a_simulated_recording_is_recovered(torchcover, worlds, tmp_path):
     recording, found = tmp_path / "recording", tmp_path / "found.yaml"
     few = ("--scenario", worlds / "yard.yaml", "--num-frames", 2, "--num-rays", 64)
     torchcover("record", worlds / "both.yaml", *few, "--out", recording)
@@ -29,7 +29,7 @@ def test_a_recorded_rig_is_found_again(torchcover, worlds, tmp_path):
     assert (code, sensor["name"], sensor["model"]) == (0, "rear", "velodyne_vlp16")
 
 
-def test_what_rig_refuses(torchcover, worlds, tmp_path):
+def test_rig_rejects_invalid_options(torchcover, worlds, tmp_path):
     for options, told in (
         (("--frames", tmp_path / "none"), "none: no such recording"),
         (("--frames", tmp_path, "--lidar", "roof"), "--lidar roof: NAME=VALUE is needed, as in LIDAR_TOP="),

@@ -33,7 +33,7 @@ def space(tmp_path, monkeypatch):
     return tmp_path / "space.yaml"
 
 
-def test_a_search_ends_with_its_gain_and_that_of_random_candidates(torchcover, space, tmp_path):
+def test_search_prints_improvement_and_random_candidates(torchcover, space, tmp_path):
     out = tmp_path / "found"
     code, printed, _ = torchcover("search", space, "--num-evaluations", 12, "--out", out, "--seed", 3)
     assert code == 0
@@ -59,7 +59,7 @@ def test_a_search_ends_with_its_gain_and_that_of_random_candidates(torchcover, s
         (("--budget", "0.00001s"), "is too short for two evaluations"),
     ],
 )
-def test_a_mistake_is_one_line(torchcover, space, tmp_path, options, message):
+def test_user_error_is_one_line(torchcover, space, tmp_path, options, message):
     code, _, said = torchcover("search", space, "--out", tmp_path / "found", *options)
     assert code == 2
     assert message in said
@@ -73,7 +73,7 @@ def test_a_mistake_is_one_line(torchcover, space, tmp_path, options, message):
         ("number: radius_m", "objectives.near: region: 'radius_m' needs one"),
     ],
 )
-def test_an_objective_that_no_result_has_is_one_line(torchcover, tmp_path, objective, message):
+def test_unknown_objective_is_one_line(torchcover, tmp_path, objective, message):
     path = tmp_path / "space.yaml"
     path.write_text(SPACE.replace("region: 20m", objective))
     code, _, said = torchcover("search", path, "--out", tmp_path / "found")
@@ -83,17 +83,17 @@ def test_an_objective_that_no_result_has_is_one_line(torchcover, tmp_path, objec
 
 
 @pytest.mark.parametrize("options", [("--budget", "5s"), ("--num-evaluations", "3"), ("--resume",)])
-def test_a_choice_has_no_budget(torchcover, tmp_path, options):
+def test_sensor_selection_rejects_a_budget(torchcover, tmp_path, options):
     code, _, said = torchcover("search", CHOICE, "--out", tmp_path / "found", *options)
     assert code == 2
     assert f"torchcover: {options[0]}: has no effect, because all candidates of this file are evaluated" in said
 
 
-def test_times():
+def test_budgets_are_parsed_to_seconds():
     assert [parse_budget_s(text) for text in ("10s", "30min", "2h", "0.5 h")] == [10, 1800, 7200, 1800]
 
 
-def test_a_search_without_optuna_is_one_line(torchcover, space, tmp_path, monkeypatch):
+def test_missing_optuna_is_one_line(torchcover, space, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "optuna", None)
     code, _, said = torchcover("search", space, "--num-evaluations", 3, "--out", tmp_path / "found")
     assert code == 2

@@ -29,7 +29,7 @@ def drawn(monkeypatch):
     return calls
 
 
-def test_a_rig_is_drawn_on_the_ego_of_a_scenario(torchcover, worlds, drawn):
+def test_rig_is_plotted_on_the_ego_vehicle(torchcover, worlds, drawn):
     code, printed, _ = torchcover(
         "show", worlds / "both.yaml", "--scenario", worlds / "yard.yaml", "--out", worlds / "new" / "out"
     )
@@ -44,7 +44,7 @@ def test_a_rig_is_drawn_on_the_ego_of_a_scenario(torchcover, worlds, drawn):
     assert sensors[1].mask_directions(np.array([[-1.0, 0.0, -0.1], [1.0, 0.0, -0.1]])).tolist() == [True, False]
 
 
-def test_a_scenario_is_drawn_in_the_frame_of_the_ego(torchcover, worlds, drawn):
+def test_scenario_is_plotted_in_the_vehicle_frame(torchcover, worlds, drawn):
     code, _, _ = torchcover(
         "show", worlds / "yard.yaml", "--rig", worlds / "low.yaml", "--frame-index", 3, "--out", worlds
     )
@@ -73,7 +73,7 @@ def test_a_scenario_is_drawn_in_the_frame_of_the_ego(torchcover, worlds, drawn):
         ("83.7 30 25", "83.70 m long", "far too large for a vehicle on a road; a file in millimeters"),
     ],
 )
-def test_a_mesh_and_the_vehicle_of_it_say_their_size_and_what_is_doubtful(torchcover, tmp_path, size, told, doubt):
+def test_mesh_prints_size_and_warnings(torchcover, tmp_path, size, told, doubt):
     trimesh.creation.box([float(number) for number in size.split()]).export(tmp_path / "car.obj")
     (tmp_path / "car.yaml").write_text("name: car\nparts: [{name: body, shape: {type: mesh, path: car.obj}}]\n")
     for name in ("car.obj", "car.yaml"):
@@ -92,7 +92,7 @@ def test_a_mesh_and_the_vehicle_of_it_say_their_size_and_what_is_doubtful(torchc
     assert "none.obj" in error
 
 
-def test_a_robot_of_urdf_becomes_a_vehicle_and_a_rig_that_can_be_shown(torchcover, tmp_path):
+def test_urdf_becomes_vehicle_and_rig(torchcover, tmp_path):
     box = "<visual><geometry><box size='0.8 0.6 0.4'/></geometry></visual>"
     camera = (
         "<camera><horizontal_fov>1.5</horizontal_fov><image><width>64</width><height>48</height></image>"
@@ -130,7 +130,7 @@ def test_a_robot_of_urdf_becomes_a_vehicle_and_a_rig_that_can_be_shown(torchcove
     ("<robot name='a'><link name='b'/><joint name='j'><parent link='b'/><child link='c'/></joint></robot>",
      "joint 'j' is about 'c', which is no link"),
 ])  # fmt: skip
-def test_a_robot_that_cannot_be_used_ends_in_one_line_and_exit_code_2(torchcover, tmp_path, text, message):
+def test_invalid_urdf_is_one_line(torchcover, tmp_path, text, message):
     path = tmp_path / "bad.urdf"
     path.write_text(text)
     code, printed, error = torchcover("robot", path, "--out", tmp_path / "bot")
@@ -140,7 +140,7 @@ def test_a_robot_that_cannot_be_used_ends_in_one_line_and_exit_code_2(torchcover
     assert not (tmp_path / "bot").exists()
 
 
-def test_a_roadside_rig_can_be_shown(torchcover, tmp_path):
+def test_roadside_rig_is_plotted(torchcover, tmp_path):
     rig = tmp_path / "mast.yaml"
     rig.write_text(
         "name: mast\nsensors: [{name: top, mount: {z_m: 6.0}, channels: 8, vertical_fov_deg: [-60, 0], columns: 64, "
@@ -149,7 +149,7 @@ def test_a_roadside_rig_can_be_shown(torchcover, tmp_path):
     assert torchcover("show", "courtyard", "--rig", rig, "--out", tmp_path)[0] == 0
 
 
-def test_a_vehicle_is_drawn_with_its_mount_regions_on_its_skin(torchcover, tmp_path, drawn):
+def test_mount_regions_lie_on_the_vehicle_surface(torchcover, tmp_path, drawn):
     (tmp_path / "cart.yaml").write_text(
         """
         name: cart
@@ -174,7 +174,7 @@ def test_a_vehicle_is_drawn_with_its_mount_regions_on_its_skin(torchcover, tmp_p
         assert patch.points_m.max(axis=(0, 1)) == pytest.approx(highest)
 
 
-def test_a_region_beside_the_body_is_named(torchcover, tmp_path):
+def test_mount_region_outside_the_body_is_named(torchcover, tmp_path):
     (tmp_path / "cart.yaml").write_text(
         "name: cart\nparts: [{name: body, shape: {type: box, size_m: [3.0, 1.0, 0.8]}}]\n"
         "mount_regions: {lid: {side: above, x_m: [1.0, 2.0], y_m: [-0.4, 0.4]}}\n"
@@ -184,7 +184,7 @@ def test_a_region_beside_the_body_is_named(torchcover, tmp_path):
     assert "mount region 'lid': at x = 1.545 m" in error
 
 
-def test_the_depth_images_of_a_rig_are_those_of_its_cameras_in_the_frame(torchcover, worlds, drawn):
+def test_depth_images_belong_to_the_chosen_frame(torchcover, worlds, drawn):
     """A wall fills the left half of the image: from the bumper 20 m ahead at first, 15 m when the frame is taken."""
     (worlds / "cameras.yaml").write_text(
         "name: cameras\nsensors:\n"
@@ -218,7 +218,7 @@ def test_the_depth_images_of_a_rig_are_those_of_its_cameras_in_the_frame(torchco
 
 
 @pytest.mark.parametrize("arguments", [["three_cameras", "--scenario"], []])
-def test_a_world_is_built_once(torchcover, worlds, monkeypatch, arguments):
+def test_scene_is_built_once(torchcover, worlds, monkeypatch, arguments):
     built = []
     build = Scenario.build_scene
     monkeypatch.setattr(Scenario, "build_scene", lambda *args: built.append(args) or build(*args))
@@ -227,7 +227,7 @@ def test_a_world_is_built_once(torchcover, worlds, monkeypatch, arguments):
 
 
 @pytest.mark.parametrize("name", list_builtin_names("rigs"))
-def test_every_built_in_rig_has_fields_of_view_within_bounds(name):
+def test_built_in_rigs_have_valid_fields_of_view(name):
     for sensor in build_sensor_views(Rig.load(name).sensors):
         low, high = sensor.vertical_fov_deg
         assert -90 <= low < high <= 90
@@ -255,7 +255,7 @@ def test_every_built_in_rig_has_fields_of_view_within_bounds(name):
         ([], "Missing argument"),
     ],
 )
-def test_a_mistake_ends_in_one_line_and_exit_code_2(torchcover, arguments, message, tmp_path):
+def test_user_error_is_one_line_with_code_2(torchcover, arguments, message, tmp_path):
     code, _, error = torchcover("show", *arguments, "--out", tmp_path / "out")
     assert code == 2
     assert message in error
@@ -268,7 +268,7 @@ def test_a_mistake_ends_in_one_line_and_exit_code_2(torchcover, arguments, messa
     ("content", "message"),
     [("{", "not a YAML file"), ("sensors: 3", "sensors: "), ("name: x", "bodies missing"), ("- 1", "a YAML mapping")],
 )
-def test_a_file_that_is_neither_says_what_is_wrong(torchcover, tmp_path, content, message):
+def test_invalid_document_names_the_mistake(torchcover, tmp_path, content, message):
     (tmp_path / "bad.yaml").write_text(content)
     code, _, error = torchcover("show", tmp_path / "bad.yaml")
     assert code == 2
@@ -276,7 +276,7 @@ def test_a_file_that_is_neither_says_what_is_wrong(torchcover, tmp_path, content
     assert error.count("\n") == 1
 
 
-def test_a_name_of_both_kinds_asks_for_the_file(torchcover, monkeypatch):
+def test_ambiguous_name_asks_for_the_file(torchcover, monkeypatch):
     monkeypatch.setattr(show, "list_builtin_names", lambda kind: ["twin", kind])
     code, _, error = torchcover("show", "twin")
     assert code == 2
@@ -284,7 +284,7 @@ def test_a_name_of_both_kinds_asks_for_the_file(torchcover, monkeypatch):
 
 
 @pytest.mark.filterwarnings("default")
-def test_a_warning_is_one_line_on_stderr_and_said_once(torchcover, worlds):
+def test_warning_is_printed_once_as_one_line(torchcover, worlds):
     """Two actors of one open mesh in millimetres."""
     mesh = Scenario.load(worlds / "yard.yaml").ego.shape.build_mesh()
     corners = "".join(f"v {x * 1000} {y * 1000} {z * 1000}\n" for x, y, z in mesh.vertices_m)
@@ -309,18 +309,18 @@ def test_a_warning_is_one_line_on_stderr_and_said_once(torchcover, worlds):
     assert len(lines) == 4
 
 
-def test_a_rig_has_its_own_name_in_every_command_whatever_its_file_is_called(worlds):
+def test_rig_keeps_its_name_in_a_renamed_file(worlds):
     (worlds / "renamed.yaml").write_text((worlds / "both.yaml").read_text())
     name = Rig.load(worlds / "both.yaml").name
     assert [load_named_rig(worlds / "renamed.yaml").name] == make_rig_names([worlds / "renamed.yaml"]) == [name]
 
 
-def test_it_prints_where_the_numbers_of_a_rig_come_from(torchcover, tmp_path):
+def test_description_of_a_rig_is_printed(torchcover, tmp_path):
     code, printed, _ = torchcover("show", "nuscenes", "--out", tmp_path)
     assert (code, " ".join(printed.split())[:60]) == (0, Rig.load("nuscenes").description[:60])
 
 
-def test_a_film_shows_what_follows(torchcover, worlds, monkeypatch):
+def test_animation_shows_the_following_frames(torchcover, worlds, monkeypatch):
     select_frames = partial(show.select_animation_frames, duration_s=0.3)
     monkeypatch.setattr(show, "select_animation_frames", select_frames)
     code, printed, _ = torchcover(
@@ -355,7 +355,7 @@ def test_a_film_shows_what_follows(torchcover, worlds, monkeypatch):
         (("yard.yaml", "--animation", "a.mp4"), ".mp4 needs the program ffmpeg, which is missing; write a .gif"),
     ],
 )
-def test_a_film_that_cannot_be_written_is_refused_at_once(options, message, torchcover, worlds, monkeypatch):
+def test_invalid_animation_file_is_rejected(options, message, torchcover, worlds, monkeypatch):
     monkeypatch.setenv("PATH", "")
     name, *others = options
     code, _, told = torchcover("show", worlds / name, *others)
@@ -364,7 +364,7 @@ def test_a_film_that_cannot_be_written_is_refused_at_once(options, message, torc
 
 
 @pytest.mark.parametrize("at_m", [50.0, 160.8])
-def test_what_stands_on_a_slope_is_as_high_as_it_is_above_the_slope(at_m, torchcover, worlds, drawn):
+def test_height_above_ground_follows_a_slope(at_m, torchcover, worlds, drawn):
     slope = np.deg2rad(4.0)
     # The second piece of the slope begins where the picture ends, but below what still reaches into that.
     grounds, kerb = (

@@ -88,7 +88,7 @@ def steps_of(out):
         (signal.SIGHUP, signal.SIG_IGN, 0, 3, []),
     ],
 )
-def test_one_between_two_rigs_leaves_a_paired_result(
+def test_signal_between_two_rigs_leaves_a_paired_result(
     torchcover, worlds, at_update, handler, number, action, expected, steps, said
 ):
     handler(number, action)
@@ -101,7 +101,7 @@ def test_one_between_two_rigs_leaves_a_paired_result(
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
-def test_one_that_is_sent_again_changes_nothing(torchcover, worlds, at_update, monkeypatch, number):
+def test_repeated_signal_has_no_effect(torchcover, worlds, at_update, monkeypatch, number):
     """To the process and to its group, by the system and by the shell."""
     monkeypatch.setattr(progress._TerminationHandler, "repeat_interval_s", 600.0)  # on a machine that is as slow as it likes
     at_update(3, lambda: send(number, times=2))
@@ -138,7 +138,7 @@ def run(worlds):
         os._exit(end.code)
 
 
-def test_ctrl_c_again_ends_at_once_and_says_what_is_kept(worlds, at_update, monkeypatch):
+def test_second_ctrl_c_stops_and_lists_kept_files(worlds, at_update, monkeypatch):
     at_update(3, lambda: send(signal.SIGINT))
     monkeypatch.setattr(DRAW, lambda *_, **__: (send(signal.SIGINT), time.sleep(60)))
     code, said = in_a_fork(worlds, worlds / "log")
@@ -149,14 +149,14 @@ def test_ctrl_c_again_ends_at_once_and_says_what_is_kept(worlds, at_update, monk
     assert steps_of(out) == ([2, 2], False, 0)
 
 
-def test_ctrl_c_again_does_not_wait_for_the_end_of_a_frame(worlds, at_update):
+def test_second_ctrl_c_stops_within_a_frame(worlds, at_update):
     at_update(1, lambda: (send(signal.SIGINT, times=2), time.sleep(60)))
     code, said = in_a_fork(worlds, worlds / "log")
     assert (code, said.splitlines()[-1]) == (130, "torchcover: stopped immediately: no file of this run is kept")
     assert not (worlds / "out" / "summary.json").exists()
 
 
-def test_a_terminal_that_is_gone_costs_nothing(worlds, at_update):
+def test_closed_terminal_loses_no_result(worlds, at_update):
     (ready, here), (there, go) = os.pipe(), os.pipe()
 
     def wait():

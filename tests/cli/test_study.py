@@ -10,7 +10,7 @@ import pytest
 from torchcover.cli import app
 
 
-def test_a_small_study_writes_tables_a_diagram_and_an_advice(torchcover, tmp_path, monkeypatch):
+def test_study_prints_tables_and_recommendations(torchcover, tmp_path, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")  # so that no heading is folded
 
     class Timed:
@@ -62,14 +62,14 @@ def test_a_small_study_writes_tables_a_diagram_and_an_advice(torchcover, tmp_pat
         (["--scenario", "nowhere"], "nowhere"),
     ],
 )
-def test_what_makes_no_sense_ends_in_one_line(torchcover, tmp_path, options, message):
+def test_user_error_is_one_line(torchcover, tmp_path, options, message):
     code, _, complaints = torchcover("study", "front_roof_32", *options, "--num-frames", "8", "--out", tmp_path / "out")
     assert code == 2
     assert message in complaints
     assert len(complaints.strip().splitlines()) == 1
 
 
-def test_run_times_are_not_measured_beside_other_ranks(torchcover, monkeypatch, tmp_path):
+def test_study_rejects_distributed_runs(torchcover, monkeypatch, tmp_path):
     monkeypatch.setenv("WORLD_SIZE", "2")
     code, _, said = torchcover("study", "front_roof_32", "--out", tmp_path / "out")
     assert (code, "run it without torchrun" in said) == (2, True)

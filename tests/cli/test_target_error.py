@@ -25,7 +25,7 @@ def long_recording(tmp_path):
 
 
 @pytest.mark.parametrize("workers", [0, 2])
-def test_evaluate_stops_when_it_is_good_enough(torchcover, long_recording, tmp_path, workers):
+def test_evaluate_stops_at_the_target_error(torchcover, long_recording, tmp_path, workers):
     arguments = ["--frames", long_recording, "--set", "cell_m=4", "--out", tmp_path / "out", "--num-workers", workers]
     code, printed, _ = torchcover("evaluate", *arguments, "--target-error", "0.05m", "--target-error", "20%")
     assert code == 0
@@ -38,7 +38,7 @@ def test_evaluate_stops_when_it_is_good_enough(torchcover, long_recording, tmp_p
     assert re.search(r"0\.\d+  \[0\.\d+, 0\.\d+\]", printed)
 
 
-def test_a_target_beyond_the_steps_ends_the_run_as_ever_and_says_what_it_would_take(
+def test_unreached_target_error_reports_the_needed_frames(
     torchcover, long_recording, tmp_path
 ):
     arguments = ["--frames", long_recording, "--set", "cell_m=4", "--out", tmp_path / "out", "--num-frames", 40]
@@ -52,7 +52,7 @@ def test_a_target_beyond_the_steps_ends_the_run_as_ever_and_says_what_it_would_t
     assert Coverage.load(tmp_path / "out" / "coverage.npz").counts["num_frames"] == 40
 
 
-def test_compare_stops_when_rigs_and_differences_are_good_enough(torchcover, worlds):
+def test_compare_stops_when_differences_reach_the_target(torchcover, worlds):
     options = [
         "--scenario",
         worlds / "yard.yaml",

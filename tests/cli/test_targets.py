@@ -24,7 +24,7 @@ def call(torchcover, worlds):
     return run
 
 
-def test_what_is_seen_is_said_and_written(call, worlds):
+def test_target_map_is_printed_and_written(call, worlds):
     ended, printed, error = call("--target", "adult", "--scenario", worlds / "yard.yaml")
     assert (ended, error) == (0, "")
     assert "dome: visibility of adult" in " ".join(printed.split())
@@ -42,7 +42,7 @@ def test_what_is_seen_is_said_and_written(call, worlds):
         (["--detection-points", "0"], "--detection-points"),
     ],
 )
-def test_a_mistake_is_one_line_and_exit_code_2(call, worlds, monkeypatch, arguments, message):
+def test_user_error_is_one_line_with_code_2(call, worlds, monkeypatch, arguments, message):
     monkeypatch.chdir(worlds)
     code, printed, error = call(*arguments)
     assert (code, printed) == (2, "")

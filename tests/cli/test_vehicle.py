@@ -37,7 +37,7 @@ def run(torchcover, free, command, *arguments):
     return code, printed, error
 
 
-def test_the_summary_and_the_table_say_which_vehicle_it_was(torchcover, free):
+def test_summary_and_table_name_the_vehicle(torchcover, free):
     for options, vehicle in (([], "sedan"), (["--vehicle", "hatchback"], "hatchback")):
         code, printed, error = run(torchcover, free, "evaluate", free / "low.yaml", *options)
         assert (code, f"Vehicle: {vehicle}." in " ".join(printed.split())) == (0, True), error
@@ -45,7 +45,7 @@ def test_the_summary_and_the_table_say_which_vehicle_it_was(torchcover, free):
         assert f"on {vehicle}" in (free / "out" / "report.html").read_text()
 
 
-def test_rigs_of_different_vehicles_are_compared_on_one_that_is_named(torchcover, free):
+def test_comparison_needs_one_vehicle_for_all_rigs(torchcover, free):
     rigs = (free / "low.yaml", free / "both.yaml")
     code, _, error = run(torchcover, free, "compare", *rigs)
     assert (code, error.count("\n")) == (2, 1)
@@ -55,7 +55,7 @@ def test_rigs_of_different_vehicles_are_compared_on_one_that_is_named(torchcover
     assert json.loads((free / "out" / "summary.json").read_text())["vehicle"] == "sedan"
 
 
-def test_pictures_and_recordings_are_of_the_vehicle_too(torchcover, free, monkeypatch):
+def test_figures_and_recordings_use_the_vehicle(torchcover, free, monkeypatch):
     titles = []
     monkeypatch.setattr(scene_figures, "plot_rig", lambda *_, **told: titles.append(told) or Blank())
     shown = ("show", free / "low.yaml", "--scenario", free / "free.yaml", "--vehicle", "suv", "--out", free)

@@ -126,7 +126,7 @@ def press():
 
 
 @pytest.mark.parametrize("workers", [0, 2])
-def test_it_goes_on_after_ctrl_c_to_the_same_bits(frame_of, path, workers):
+def test_run_resumes_after_ctrl_c_bit_for_bit(frame_of, path, workers):
     whole = bits(measured(Drive(frame_of, {7}), skip_bad_frames=True))
     for at in (0, 9, STEPS - 1):  # one run: it goes on twice
         part = cut_short(Drive(frame_of, {7}), path, seen=Seen(at, press), skip_bad_frames=True, num_workers=workers)
@@ -136,7 +136,7 @@ def test_it_goes_on_after_ctrl_c_to_the_same_bits(frame_of, path, workers):
 
 
 @pytest.mark.usefixtures("_at_every_step")
-def test_it_goes_on_after_being_killed_at_any_moment(frame_of, path):
+def test_run_resumes_after_kills_bit_for_bit(frame_of, path):
     whole, chance, kills = bits(measured(Drive(frame_of))), random.Random(0), 0
     for _ in range(5):
         before = stamp(path)
@@ -157,7 +157,7 @@ def test_it_goes_on_after_being_killed_at_any_moment(frame_of, path):
     assert [file.name for file in path.parent.iterdir()] == [path.name]
 
 
-def test_a_complete_run_goes_on_when_more_steps_are_wanted(frame_of, path):
+def test_complete_run_continues_with_more_frames(frame_of, path):
     measured(Drive(frame_of), path, num_frames=5)
     seen = Seen()
     assert bits(measured(Drive(frame_of), path, num_frames=12, seen=seen)) == bits(
@@ -170,7 +170,7 @@ def test_a_complete_run_goes_on_when_more_steps_are_wanted(frame_of, path):
         measured(Drive(frame_of), path, num_frames=11)
 
 
-def test_looks_at_a_target_error_go_on_as_they_would_have(frame_of, path, monkeypatch):
+def test_resumed_run_stops_at_the_same_frame(frame_of, path, monkeypatch):
     monkeypatch.setattr("torchcover.evaluation.target_error.MIN_FRAMES", 8)
     target = {"target_error": "0.2m", "thresholds_m": ()}
     whole = measured(Drive(frame_of), **target)
@@ -182,7 +182,7 @@ def test_looks_at_a_target_error_go_on_as_they_would_have(frame_of, path, monkey
 
 
 @pytest.mark.parametrize(("write_s", "pause_s"), [(0.0, 60.0), (2.0, 60.0), (9.0, 180.0)])
-def test_it_is_written_every_minute_and_more_seldom_where_that_took_a_twentieth_of_the_time(
+def test_writing_takes_at_most_5_percent_of_time(
     tmp_path, monkeypatch, write_s, pause_s
 ):
     now_s, written_s = 0.0, []
@@ -204,7 +204,7 @@ def test_it_is_written_every_minute_and_more_seldom_where_that_took_a_twentieth_
 
 
 @pytest.mark.usefixtures("_at_every_step")
-def test_what_one_observer_has_seen_and_another_has_not_is_not_kept(frame_of, path):
+def test_frame_missing_in_one_observer_is_not_saved(frame_of, path):
     with pytest.raises(ZeroDivisionError):
         cut_short(Drive(frame_of), path, seen=Seen(6, lambda: 1 / 0)).run.raise_failure()
     assert read_header(path)["run"]["num_frames"] == 6
@@ -223,7 +223,7 @@ def test_what_one_observer_has_seen_and_another_has_not_is_not_kept(frame_of, pa
         ({"observers": {}}, r"observers \(other content\)"),
     ],
 )
-def test_a_checkpoint_of_another_run_is_refused_by_what_differs(frame_of, path, changes, named):
+def test_error_lists_differences_to_another_run(frame_of, path, changes, named):
     measured(Drive(frame_of), path, num_frames=3)
     with pytest.raises(ValueError, match=rf"checkpoint.npz: a checkpoint of another run: {named}; resume with the"):
         measured(Drive(frame_of), path, num_frames=3, **changes)
@@ -231,24 +231,24 @@ def test_a_checkpoint_of_another_run_is_refused_by_what_differs(frame_of, path, 
         measured(Drive(frame_of, content="other"), path, num_frames=3)
 
 
-def test_all_options_decide_about_a_run_but_those_that_it_names():
+def test_identity_contains_all_other_settings():
     assert set(DESCRIPTIONS) > NOT_IN_IDENTITY
 
 
-def test_without_resume_it_starts_anew(frame_of, path):
+def test_run_without_resume_starts_again(frame_of, path):
     measured(Drive(frame_of), path, num_frames=3)
     result = measured(Drive(frame_of, content="other"), Checkpoint(path, resume=False), num_frames=2)
     assert (result.run.num_frames, read_header(path)["run"]["num_frames"]) == (2, 2)
 
 
-def test_skipped_frames_are_not_forgotten(frame_of, path):
+def test_checkpoint_keeps_skipped_frames(frame_of, path):
     measured(Drive(frame_of, {1}), path, num_frames=3, skip_bad_frames=True)
     with pytest.raises(ValueError, match=r"1 bad frames were skipped before the checkpoint, such as f1"):
         measured(Drive(frame_of, {1}), path)
 
 
 @pytest.mark.usefixtures("_at_every_step")
-def test_a_full_disk_is_told_of_once_and_the_run_goes_on(frame_of, path, monkeypatch):
+def test_full_disk_warns_once_and_run_continues(frame_of, path, monkeypatch):
     def full(_):
         raise OSError(errno.ENOSPC, "No space left on device")
 
@@ -280,13 +280,13 @@ class Odd(Seen):
         (Odd, "observer seen: its state_dict cannot be saved in a checkpoint: .* got set in it"),
     ],
 )
-def test_an_observer_that_cannot_be_kept_is_refused_before_the_run(frame_of, path, observer, message):
+def test_observer_without_state_is_rejected_before_the_run(frame_of, path, observer, message):
     with pytest.raises(TypeError, match=message):
         measured(Drive(frame_of, range(STEPS)), path, seen=observer())
     assert not path.parent.exists()
 
 
-def test_states_come_back_bit_for_bit(tmp_path):
+def test_states_are_restored_bit_for_bit(tmp_path):
     path = tmp_path / "a.npz"
     nan = torch.tensor([0x7FF8_0000_0000_1234], dtype=torch.int64).view(torch.float64)
     sparse = torch.zeros(50, 40, dtype=torch.float64)
@@ -312,7 +312,7 @@ def test_states_come_back_bit_for_bit(tmp_path):
         assert back[name].numpy().tobytes() == tensor.numpy().tobytes()
 
 
-def test_a_state_may_be_larger_than_what_the_first_zips_held(tmp_path, monkeypatch):
+def test_state_may_exceed_the_zip_limit(tmp_path, monkeypatch):
     """2 GiB, which are 1 kB here."""
     monkeypatch.setattr(zipfile, "ZIP64_LIMIT", 1000)
     path, state = tmp_path / "a.npz", {"large": torch.arange(1000)}
@@ -331,7 +331,7 @@ def test_a_state_may_be_larger_than_what_the_first_zips_held(tmp_path, monkeypat
         ({"shape": [10**9, 10**9]}, "reading it takes"),
     ],
 )
-def test_an_array_that_its_header_describes_wrongly_is_refused(tmp_path, change, message):
+def test_wrong_header_of_an_array_is_rejected(tmp_path, change, message):
     path = tmp_path / "a.npz"
     header = {"identity": {}, "run": {"num_frames": 1, "counts": {}, "skipped_frames": [], "duration_s": 0.0}}
     write_checkpoint(path, header, {"one": {"of it": torch.arange(6).view(2, 3)}})
@@ -341,7 +341,7 @@ def test_an_array_that_its_header_describes_wrongly_is_refused(tmp_path, change,
         read_state(path, header, "one")
 
 
-def test_an_array_that_is_listed_often_counts_as_often(tmp_path, monkeypatch):
+def test_repeated_array_counts_repeatedly_for_memory(tmp_path, monkeypatch):
     path = tmp_path / "a.npz"
     header = {"identity": {}, "run": {"num_frames": 1, "counts": {}, "skipped_frames": [], "duration_s": 0.0}}
     write_checkpoint(path, header, {"one": {"of it": torch.zeros(100_000)}})
@@ -353,7 +353,7 @@ def test_an_array_that_is_listed_often_counts_as_often(tmp_path, monkeypatch):
         read_state(path, header, "one")
 
 
-def test_a_damaged_checkpoint_is_named(frame_of, path):
+def test_damaged_checkpoint_is_named(frame_of, path):
     measured(Drive(frame_of), path, num_frames=3)
     data = bytearray(path.read_bytes())
     third = len(data) // 3
@@ -366,7 +366,7 @@ def test_a_damaged_checkpoint_is_named(frame_of, path):
         measured(Drive(frame_of), path, num_frames=3)
 
 
-def test_an_edited_checkpoint_is_refused(frame_of, path):
+def test_edited_checkpoint_is_rejected(frame_of, path):
     measured(Drive(frame_of), path, num_frames=3)
     with np.load(path) as file:
         arrays = dict(file)

@@ -42,7 +42,7 @@ def nothing_said(monkeypatch):
         ({"max": ""}, 8),
     ],
 )
-def test_a_container_has_the_cores_that_it_is_given(tmp_path, monkeypatch, files, expected):
+def test_container_limit_reduces_the_cores(tmp_path, monkeypatch, files, expected):
     for name, text in files.items():
         (tmp_path / name).write_text(text)
     monkeypatch.setattr(module, "CPU_QUOTAS", ((tmp_path / "max",), (tmp_path / "quota", tmp_path / "period")))
@@ -51,7 +51,7 @@ def test_a_container_has_the_cores_that_it_is_given(tmp_path, monkeypatch, files
 
 
 @pytest.mark.parametrize("said", [{}, {"OMP_NUM_THREADS": "7"}, *({name: "active"} for name in module.WAIT_VARIABLES)])
-def test_the_command_line_says_what_the_environment_does_not(nothing_said, said):
+def test_set_threads_keeps_existing_variables(nothing_said, said):
     for name, value in said.items():
         nothing_said.setenv(name, value)
     set_threads()
@@ -61,7 +61,7 @@ def test_the_command_line_says_what_the_environment_does_not(nothing_said, said)
     assert os.environ["OMP_NUM_THREADS"] == said.get("OMP_NUM_THREADS", str(count_cores()))
 
 
-def test_it_is_said_before_torch_and_numpy_are_loaded():
+def test_threads_are_set_before_torch_is_imported():
     code = (
         "import os, sys; from torchcover.cli import app; sys.argv = ['torchcover', '--version']\n"
         "try: app.main()\nexcept SystemExit: pass\n"
@@ -72,7 +72,7 @@ def test_it_is_said_before_torch_and_numpy_are_loaded():
     assert done.stdout.splitlines()[-1] == "passive"
 
 
-def test_who_lets_threads_spin_is_told_once(nothing_said):
+def test_spinning_threads_warn_once(nothing_said):
     with pytest.warns(UserWarning, match="OMP_WAIT_POLICY") as said:
         warn_about_spinning(2)
     assert said[0].filename == __file__
@@ -81,7 +81,7 @@ def test_who_lets_threads_spin_is_told_once(nothing_said):
         warn_about_spinning(2)
 
 
-def test_it_points_at_the_line_of_the_user(nothing_said, monkeypatch):
+def test_warning_points_to_the_line_of_the_user(nothing_said, monkeypatch):
     monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
     with pytest.warns(UserWarning, match="OMP_WAIT_POLICY") as said:
         evaluate("front_roof_128", "courtyard", num_frames=1, num_rays=64)
@@ -89,7 +89,7 @@ def test_it_points_at_the_line_of_the_user(nothing_said, monkeypatch):
 
 
 @pytest.mark.parametrize("said", [None, *module.WAIT_VARIABLES])
-def test_who_does_not_is_told_nothing(nothing_said, said):
+def test_passive_threads_do_not_warn(nothing_said, said):
     if said:
         nothing_said.setenv(said, "0")
     with warnings.catch_warnings():
@@ -109,7 +109,7 @@ def test_who_does_not_is_told_nothing(nothing_said, said):
         (16, 8, 8, 0),
     ],
 )
-def test_workers_are_as_many_as_have_something_to_do(monkeypatch, count, frames, worlds, expected):
+def test_num_workers_follows_cores_scenes_and_frames(monkeypatch, count, frames, worlds, expected):
     monkeypatch.setattr(module, "count_cores", lambda: count)
     monkeypatch.setattr(multiprocessing, "get_start_method", lambda allow_none: "fork")
     monkeypatch.setattr(module, "find_memory_limit_bytes", lambda: 1e12)
@@ -118,7 +118,7 @@ def test_workers_are_as_many_as_have_something_to_do(monkeypatch, count, frames,
     assert compute_num_workers(frames, worlds, sends_frames=False) == 0
 
 
-def test_workers_need_memory_and_room_for_frames_that_they_hand_over(monkeypatch, tmp_path):
+def test_num_workers_follows_memory_and_shared_memory(monkeypatch, tmp_path):
     monkeypatch.setattr(module, "count_cores", lambda: 16)
     monkeypatch.setattr(module, "SHARED_MEMORY", str(tmp_path))
     monkeypatch.setattr(multiprocessing, "get_start_method", lambda allow_none: "fork")
@@ -135,7 +135,7 @@ def test_workers_need_memory_and_room_for_frames_that_they_hand_over(monkeypatch
         assert compute_num_workers(64, 64, sends_frames=whole) == expected
 
 
-def test_a_simulation_has_the_usual_workers_and_frames_of_others_none(monkeypatch):
+def test_only_simulations_have_default_workers(monkeypatch):
     class KnownError(Exception):
         """The number of workers."""
 

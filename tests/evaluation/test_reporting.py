@@ -40,7 +40,7 @@ def found():
     return report([ONE, TWO], "courtyard", num_frames=8, encounters=crossing, requirements=needs, num_workers=0)
 
 
-def test_the_first_sentence_is_the_share_of_places_near_the_vehicle(found):
+def test_first_finding_is_the_detected_share_of_positions(found):
     words = found.verdict[0]
     assert words.startswith("A child of 1.10 m is detected (5 points or more) at ")
     for rig, seen in found.targets.items():
@@ -50,7 +50,7 @@ def test_the_first_sentence_is_the_share_of_places_near_the_vehicle(found):
     assert words.index(NASTY) < words.index("one")  # who sees most comes first
 
 
-def test_a_sensor_that_fails_takes_what_it_alone_sees(found):
+def test_failure_loses_positions_of_one_sensor_only(found):
     seen = found.targets[NASTY]
     for k, (sensor, lost_m2) in enumerate(seen.compute_failure_effects_m2(MAX_DISTANCE_M).items()):
         others = np.delete(seen.sensor_points, k, axis=0).sum(axis=0)
@@ -63,14 +63,14 @@ def test_a_sensor_that_fails_takes_what_it_alone_sees(found):
     assert "one has one sensor, so it detects nothing if this sensor fails." in found.verdict
 
 
-def test_a_difference_of_sensor_models_is_said(found):
+def test_different_sensor_models_are_reported(found):
     source = {**found.result.source, "sensor_model": {"one": "real", "two": "ideal"}}
     mixed = replace(found, result=replace(found.result, source=source))
     assert "Sensor models differ: one real, two ideal; differences between rigs include their effect." in mixed.verdict
     assert not any("Sensor model" in sentence for sentence in found.verdict)
 
 
-def test_sensors_that_cells_cannot_tell_apart_are_named_together():
+def test_sensors_with_similar_losses_are_named_together():
     rig = Rig.model_validate({"name": "sides", "sensors": [
         {**lidar(side, 0.0), "mount": {"y_m": y_m, "z_m": 1.0}} for side, y_m in (("left", 1.1), ("right", -1.1))
     ]})  # fmt: skip
@@ -78,7 +78,7 @@ def test_sensors_that_cells_cannot_tell_apart_are_named_together():
     assert "loses most without left or right: up to" in words
 
 
-def test_a_plan_tells_by_how_many_sensors_each_place_is_seen(found):
+def test_map_contains_detecting_sensors_per_position(found):
     for seen in found.targets.values():
         plan = build_target_plan(seen)
         assert ((plan.sensor_counts == -1) == ~seen.free_mask).all()
@@ -88,12 +88,12 @@ def test_a_plan_tells_by_how_many_sensors_each_place_is_seen(found):
         assert f"{(near & (plan.sensor_counts == 0)).sum():,} of {near.sum():,} positions" in plan.title
 
 
-def test_what_was_asked_too_is_told(found):
+def test_encounters_and_requirements_are_reported(found):
     assert "Always detected in time: " in " ".join(found.verdict)
     assert found.verdict[-1].startswith("Of the 1 bounds of needs: one meets 1; ")
 
 
-def test_the_page_answers_before_anything_else_and_names_are_text(found, tmp_path):
+def test_page_starts_with_findings_and_escapes_names(found, tmp_path):
     text = render_page(found.page)
     assert NASTY not in text
     assert text.index("A child of 1.10 m is detected") < text.index("<svg") < text.index('id="maps"')
@@ -106,7 +106,7 @@ def test_the_page_answers_before_anything_else_and_names_are_text(found, tmp_pat
     assert (tmp_path / "report.md").read_text(encoding="utf-8").startswith("**A child of 1.10 m is detected")
 
 
-def test_areas_of_the_plan_are_those_of_its_cells(found):
+def test_rectangles_of_the_map_cover_its_cells(found):
     """Rectangles of a colour have the area of its cells."""
     seen = found.targets["one"]
     text = render_page(found.page)
@@ -116,19 +116,19 @@ def test_areas_of_the_plan_are_those_of_its_cells(found):
         assert m2 == pytest.approx((build_target_plan(seen).sensor_counts == number).sum() * 0.04)
 
 
-def test_a_budget_ends_the_traffic_once_it_has_intervals():
+def test_budget_ends_the_traffic_after_8_blocks():
     found = report(ONE, "courtyard", num_frames=64, budget_s=0.01, num_workers=0)
     assert found.result.table.first_conditions.counts["num_frames"] == 8
     assert found.verdict[-1] == "The time budget ended after 8 of 64 frames of traffic."
     assert not found.record["complete"]
 
 
-def test_of_too_few_steps_no_range_is_told_but_how_many_are_needed():
+def test_too_few_frames_report_the_needed_number():
     words = "4 frames form 4 blocks, 11 are needed (about 11 frames; `--num-frames`)."
     assert f"Not enough frames for ranges: {words}" in report(ONE, "courtyard", num_frames=4, num_workers=0).verdict
 
 
-def test_where_no_place_is_free_nothing_is_claimed(found):
+def test_no_free_position_gives_an_unknown_share(found):
 
     seen = found.targets["one"]
     nowhere = replace(seen, state=np.full_like(seen.state, 2))
@@ -143,12 +143,12 @@ def test_where_no_place_is_free_nothing_is_claimed(found):
     ({"rigs": ONE, "budget_s": 0.0}, "seconds above 0 are needed; got 0.0"),
     ({"rigs": ONE, "scenario": "urban,highway"}, "a single scenario is needed"),
 ])  # fmt: skip
-def test_what_fits_on_no_page_is_refused(given, words):
+def test_report_rejects_invalid_arguments(given, words):
     with pytest.raises(ValueError, match=re.escape(words)):
         report(**given)
 
 
-def test_rigs_high_above_see_nothing_beside_the_vehicle_and_say_so():
+def test_rig_far_above_detects_no_position():
     high = Rig.model_validate({"name": "high", "sensors": [lidar("mast", 0.0, 10.0)]})
     assert (
         report(high, "courtyard", num_frames=8, num_workers=0)

@@ -39,7 +39,7 @@ def trial(a, seconds=64.0, bias=0.0, options="", least=64):
 
 
 @pytest.mark.parametrize("a", [0.01, 0.36, 25.0])
-def test_the_model_falls_to_the_bias_and_says_which_steps_reach_an_error(a):
+def test_error_model_decreases_to_the_bias(a):
     model = ErrorModel(a, bias=0.003)
     assert model.estimate_error(10**12) == pytest.approx(0.003, rel=1e-3)
     assert ErrorModel(a).estimate_error(400) == pytest.approx(0.5 * ErrorModel(a).estimate_error(100), rel=1e-12)
@@ -50,7 +50,7 @@ def test_the_model_falls_to_the_bias_and_says_which_steps_reach_an_error(a):
     assert ErrorModel.from_error(ErrorModel(a).estimate_error(77), 77).error_coefficient == pytest.approx(a, rel=1e-12)
 
 
-def test_a_study_says_of_the_same_steps_what_an_evaluation_says(study):
+def test_trial_has_the_numbers_of_an_evaluation(study):
     first, fewer, _ = study.trials
     # Of 8 blocks at least: here the others see all of them.
     for each, rays in ((first, 256), (fewer, 64)):
@@ -65,13 +65,13 @@ def test_a_study_says_of_the_same_steps_what_an_evaluation_says(study):
     assert any(one.difference.value != 0.0 for one in fewer.numbers)
 
 
-def test_numbers_of_another_definition_are_not_held_against_each_other(study):
+def test_different_averages_have_no_difference(study):
     paper = study.trials[2]
     assert all(math.isnan(one.difference.value) and math.isnan(one.error.bias) for one in paper.numbers)
     assert paper.estimate_num_frames(0.02) is None
 
 
-def test_times_are_those_of_a_whole_command(study):
+def test_times_include_the_startup_of_the_command(study):
     first = study.trials[0]
     assert first.estimate_duration_s(16, study.startup_s) - first.estimate_duration_s(8, study.startup_s) == pytest.approx(
         first.duration_s
@@ -80,7 +80,7 @@ def test_times_are_those_of_a_whole_command(study):
     assert first.cpu_s > 0
 
 
-def test_the_worst_awaited_number_decides_and_what_prints_no_error_is_not_recommended():
+def test_largest_error_determines_the_number_of_frames():
     assert trial(0.04).estimate_num_frames(0.01) == 400
     assert trial(0.0004).estimate_num_frames(0.01) == 64  # fewer print no error
     assert trial(0.0123456).estimate_num_frames(0.01) == 130  # in two digits, never fewer
@@ -88,7 +88,7 @@ def test_the_worst_awaited_number_decides_and_what_prints_no_error_is_not_recomm
     assert trial(0.04, bias=0.02).estimate_num_frames(0.01) is None
 
 
-def test_another_setting_is_recommended_only_where_it_saves_a_fifth():
+def test_variant_is_recommended_if_it_saves_a_fifth():
     plan = StudyPlan(SMALL)
     for seconds, expected in ((60.0, ""), (40.0, "--set num_rays=64")):
         found = Study(plan, [trial(0.04), trial(0.04, seconds, options="--set num_rays=64")], 1.0).find_recommended(
@@ -108,14 +108,14 @@ def test_another_setting_is_recommended_only_where_it_saves_a_fifth():
     )
 
 
-def test_only_a_bias_beyond_chance_counts_and_is_marked(study):
+def test_only_significant_bias_counts(study):
     for one in study.trials[1].numbers:
         if not math.isnan(one.difference.value):
             assert one.is_biased is (one.difference.p_value * len(study.trials[1].numbers) < 0.05)
             assert one.error.bias == (abs(one.difference.value) if one.is_biased else 0.0)
 
 
-def test_records_are_json_without_nan_and_the_files_are_written(study, tmp_path):
+def test_record_is_json_without_nan(study, tmp_path):
     paths = study.save(tmp_path / "out")
     assert [path.name for path in paths] == ["work_precision.png", "summary.json"]
     record = json.loads(json.dumps(study.record, allow_nan=False))
@@ -128,7 +128,7 @@ def test_records_are_json_without_nan_and_the_files_are_written(study, tmp_path)
     assert [one["error"] for one in record["recommended"]] == [0.02, 0.01, 0.005]
 
 
-def test_the_command_that_is_timed_has_every_option_that_is_not_as_usual():
+def test_timed_command_has_all_changed_options():
     settings = Settings(
         "rig", "urban", cell_m=0.5, thresholds_m=(0.2, 1), frame_interval_s=5.0, num_frames=7, num_workers=2
     )
@@ -140,12 +140,12 @@ def test_the_command_that_is_timed_has_every_option_that_is_not_as_usual():
 
 
 @pytest.mark.parametrize("settings", [Settings(), Settings(Rig.load("front_roof_32"))])
-def test_what_cannot_be_timed_as_a_command_is_refused_at_once(settings):
+def test_plan_without_names_is_rejected(settings):
     with pytest.raises(ValueError, match="one rig and a scenario are needed, by names or paths"):
         StudyPlan(settings)
 
 
-def test_a_run_that_was_cut_short_is_no_study(monkeypatch):
+def test_interrupted_study_raises(monkeypatch):
     def interrupted(*_):
         raise KeyboardInterrupt
 

@@ -36,7 +36,7 @@ def rows_of(folder):
         return list(csv.DictReader(file))
 
 
-def test_what_is_asked_on_the_command_line_in_a_file_and_in_python_is_the_same(evaluate, worlds):
+def test_regions_agree_between_options_file_and_python(evaluate, worlds):
     code, printed, _ = evaluate(*write_regions(worlds))
     assert code == 0
     assert "dog -0.1 to 0.5 m above ground, child -0.1 to 1.1 m above ground" in " ".join(printed.split())
@@ -64,7 +64,7 @@ def test_what_is_asked_on_the_command_line_in_a_file_and_in_python_is_the_same(e
     assert record["regions"]["behind"] == {"x_m": [-6.0, -2.0], "y_m": [-2.0, 2.0], "corners_m": []}
 
 
-def test_the_sensor_behind_is_what_the_place_behind_depends_on(evaluate, torchcover, worlds):
+def test_region_behind_depends_on_the_rear_sensor(evaluate, torchcover, worlds):
     code, printed, _ = evaluate(*write_regions(worlds), "--redundancy")
     assert code == 0
     assert "Single point of failure: " in printed
@@ -88,7 +88,7 @@ def test_the_sensor_behind_is_what_the_place_behind_depends_on(evaluate, torchco
     assert "out: change of detection" in " ".join(printed.split())
 
 
-def test_a_run_goes_on_with_the_same_question_only(evaluate, worlds):
+def test_resume_requires_the_same_regions_and_grid(evaluate, worlds):
     asked = [*write_regions(worlds), "--redundancy"]
     assert evaluate(*asked)[0] == 0
     assert evaluate(*asked, "--resume")[0] == 0
@@ -116,7 +116,7 @@ def test_a_run_goes_on_with_the_same_question_only(evaluate, worlds):
         (["--regions", "nowhere.yaml"], "nowhere.yaml"),
     ],
 )
-def test_what_asks_nothing_ends_in_one_line(evaluate, options, message):
+def test_invalid_region_is_one_line(evaluate, options, message):
     code, _, complaints = evaluate(*options)
     assert code == 2
     assert message in complaints
@@ -132,12 +132,12 @@ def test_what_asks_nothing_ends_in_one_line(evaluate, options, message):
         ({"grid": "{x_m: [-2000, 2000], y_m: [-2000, 2000]}"}, "128,000,000 cells, over 100,000,000: use larger cells"),
     ],
 )
-def test_a_file_of_regions_that_makes_no_sense_is_refused(evaluate, worlds, changed, message):
+def test_invalid_regions_file_is_rejected(evaluate, worlds, changed, message):
     code, _, complaints = evaluate(*write_regions(worlds, **changed))
     assert (code, message in complaints) == (2, True)
 
 
-def test_maps_without_room_are_refused_before_anything_runs(evaluate, monkeypatch):
+def test_maps_beyond_memory_are_rejected_before_the_run(evaluate, monkeypatch):
     monkeypatch.setattr("torchcover.simulation.memory.find_memory_limit_bytes", lambda: 1e6)
     code, _, complaints = evaluate()
     assert code == 2
@@ -145,21 +145,21 @@ def test_maps_without_room_are_refused_before_anything_runs(evaluate, monkeypatc
 
 
 @pytest.mark.filterwarnings("always:region:UserWarning")
-def test_a_region_within_the_vehicle_is_unknown_and_a_line_says_why(evaluate, worlds):
+def test_region_inside_the_vehicle_warns_and_is_unknown(evaluate, worlds):
     code, _, said = evaluate("--region", "hold:-1,1,-0.5,0.5")
     assert code == 0
     assert "warning: region 'hold' lies within the vehicle (x = -2 to 2 m, y = -1 to 1 m)" in said
     assert [(row["detection_2m"], row["observed_cells"]) for row in rows_of(worlds / "out")] == [("", "0")] * 2
 
 
-def test_where_nothing_was_seen_no_sensor_is_called_dispensable(evaluate, worlds):
+def test_unobserved_region_has_unknown_single_point_of_failure(evaluate, worlds):
     asked = write_regions(worlds, regions="{sky: {x_m: [2, 6], y_m: [-2, 2]}}", heights="{sky: [50, 60]}")
     code, printed, _ = evaluate(*asked, "--redundancy")
     assert (code, "Single point of failure unknown: no surface in the regions was observed." in " ".join(printed.split())) == (0, True)
     assert "No single point of failure" not in printed
 
 
-def test_where_nothing_is_detected_no_sensor_is_called_dispensable_either(torchcover, worlds):
+def test_undetected_region_has_unknown_single_point_of_failure(torchcover, worlds):
     scene = ("--scenario", worlds / "yard.yaml", "--out", worlds / "out", "--num-frames", 2, "--num-rays", 1024)
     asked = ("--set", "cell_m=0.5", "--region", "ahead:2,6,-2,2", "--thresholds-m", 2e-3, "--redundancy")
     code, printed, _ = torchcover("evaluate", worlds / "both.yaml", *scene, *asked)
@@ -167,7 +167,7 @@ def test_where_nothing_is_detected_no_sensor_is_called_dispensable_either(torchc
     assert "No single point of failure" not in printed
 
 
-def test_bands_over_the_ground_and_over_z_agree_on_level_ground(torchcover, evaluate, worlds):
+def test_band_frames_agree_on_level_ground(torchcover, evaluate, worlds):
     rows = {}
     spans = {"ground": ("-0.5 to 0.5 m above ground",), "vehicle": ("z -0.5 to 0.5 m", "--set", "band_frame=vehicle")}
     for band_frame, (words, *options) in spans.items():
@@ -180,7 +180,7 @@ def test_bands_over_the_ground_and_over_z_agree_on_level_ground(torchcover, eval
     np.testing.assert_allclose(rows["ground"], rows["vehicle"], atol=0.03)
 
 
-def test_the_paper_s_reference_has_bands_over_z(evaluate, worlds):
+def test_paper_reference_has_bands_of_the_vehicle_frame(evaluate, worlds):
     assert evaluate("--reference", "paper")[0] == 0
     assert json.loads((worlds / "out" / "summary.json").read_text())["band_frame"] == "vehicle"
     code, _, errors = evaluate("--reference", "paper", "--set", "band_frame=ground")
@@ -188,7 +188,7 @@ def test_the_paper_s_reference_has_bands_over_z(evaluate, worlds):
     assert "band_frame ground: the paper reference has height bands of the vehicle frame; omit it" in errors
 
 
-def test_a_recording_keeps_the_heights(torchcover, worlds):
+def test_recording_keeps_heights_above_ground(torchcover, worlds):
     recorded = worlds / "recorded"
     scenario = ["--scenario", worlds / "yard.yaml", "--out", recorded]
     assert torchcover("record", worlds / "both.yaml", *scenario, *SMALL[:2])[0] == 0
