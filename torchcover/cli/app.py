@@ -147,6 +147,7 @@ def _make_signal_callback() -> Callable[[Sequence[int]], None]:
     terminals = [stream for stream in (1, 2) if os.isatty(stream)]
 
     def handle_signal(arrived: Sequence[int]) -> None:
+        """Redirect output after SIGHUP; stop at once after the second SIGINT."""
         name = signal.Signals(arrived[-1]).name
         if name == "SIGHUP":
             null = os.open(os.devnull, os.O_WRONLY)
@@ -212,6 +213,7 @@ app.command("list")(commands.list_builtin)
 
 
 def _print_warning(message: Warning | str, *_: Any, **__: Any) -> None:  # noqa: ANN401  (the line of code)
+    """Print a warning of the library as one line on stderr."""
     typer.echo(f"torchcover: warning: {_join_lines(str(message))}", err=True)
 
 
@@ -231,6 +233,7 @@ def print_error(message: str, max_chars: int = 2000) -> None:
 
 
 def _join_lines(text: str) -> str:
+    """Join the lines of a text and escape control characters."""
     from torchcover.files import escape_control_chars  # imports NumPy, which `--help` does not need
 
     return escape_control_chars(" ".join(text.split()))

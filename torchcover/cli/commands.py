@@ -197,8 +197,7 @@ def check(
 def encounter(
     context: typer.Context,
     rigs: Annotated[
-        list[str] | None,
-        typer.Argument(help="Rigs: built-in names (see `list`) or YAML files; not with --frames."),
+        list[str] | None, typer.Argument(help="Rigs: built-in names (see `list`) or YAML files; not with --frames.")
     ] = None,
     encounters: Annotated[
         str, typer.Option("--encounters", help="Set of encounters: a built-in name or a YAML file.")

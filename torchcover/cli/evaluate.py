@@ -32,8 +32,7 @@ def _run_evaluation(
         typer.Option(help="Sensors of the recording that form a rig, as in `roof,left`; may be repeated (all)."),
     ] = None,
     region: Annotated[
-        list[str] | None,
-        typer.Option(help="Region NAME:x0,x1,y0,y1 in meters instead of --regions; may be repeated."),
+        list[str] | None, typer.Option(help="Region NAME:x0,x1,y0,y1 in meters instead of --regions; may be repeated.")
     ] = None,
     out: options.OutOption = Path("out"),
     files: options.FilesOption = options.ALL_FILES,

@@ -77,6 +77,7 @@ def _format_rows(rows: list[tuple[str, ...]], width: int | None, *, is_shortened
 
 
 def _describe_sensors(rig: Document) -> str:
+    """Count the sensors of a rig by type."""
     labels = {"lidar": "LiDAR", "camera": "camera"}
     counts = Counter(sensor["type"] for sensor in rig["sensors"])
     items = []
@@ -87,18 +88,22 @@ def _describe_sensors(rig: Document) -> str:
 
 
 def _describe_traffic(scenario: Document) -> str:
+    """Name the kind of traffic of a scenario."""
     return f"{scenario['traffic']['type']} traffic" if "traffic" in scenario else "static"
 
 
 def _describe_lidar(lidar: Document) -> str:
+    """State channels and maximum range of a LiDAR model."""
     num_channels = lidar["channels"] if "channels" in lidar else len(lidar["elevations_deg"])
     return f"{num_channels} channels, {lidar['max_range_m']:g} m"
 
 
 def _describe_material(material: Document) -> str:
+    """State the reflectivity of a material."""
     return f"reflectivity {material['reflectivity']}"
 
 
 def _get_first_sentence(text: str) -> str:
+    """Return the first sentence, or its part before a colon or semicolon."""
     # The full stop of a number or an abbreviation is not followed by a blank and a capital.
     return re.split(r"(?<=[.:;]) (?=[A-Z])", text, maxsplit=1)[0]

@@ -58,6 +58,7 @@ def with_options(parameters: Sequence[inspect.Parameter]) -> Callable[[Command],
 
     def decorate(command: Command) -> Command:
         def call_with_values(**values: Any) -> None:  # noqa: ANN401  (values of typer)
+            """Call the command without options that have no value."""
             command(**{name: value for name, value in values.items() if name not in added or value is not None})
 
         own = [item for item in get_parameters(command) if item.kind is not inspect.Parameter.VAR_KEYWORD]
@@ -155,6 +156,7 @@ def check_out(folder: Path) -> Path:
 
 
 def _check_files(files: str) -> str:
+    """Check the value of `--files` before a run."""
     parse_file_kinds(files)
     return files
 
@@ -163,8 +165,7 @@ RigArgument = Annotated[str, typer.Argument(help="Rig: a built-in name (see `lis
 RigsArgument = Annotated[list[str], typer.Argument(help="Rigs: built-in names (see `list`) or YAML files.")]
 ConfigOption = Annotated[Path | None, typer.Option(help="YAML file of settings; `torchcover config` prints all.")]
 AssignmentsOption = Annotated[
-    list[str] | None,
-    typer.Option("--set", help="KEY=VALUE of --config, as in cell_m=0.5 or recording.units=mm."),
+    list[str] | None, typer.Option("--set", help="KEY=VALUE of --config, as in cell_m=0.5 or recording.units=mm.")
 ]
 OutOption = Annotated[Path, typer.Option(help="Folder for the results.", callback=check_out)]
 FilesOption = Annotated[str, typer.Option(help="Kinds of files besides `summary.json`.", callback=_check_files)]

@@ -155,6 +155,7 @@ def select_animation_frames(
 
 
 def _print_text(text: str) -> None:
+    """Print a text as one paragraph; nothing if it is empty."""
     if text:
         Terminal().print(" ".join(text.split()), markup=False, highlight=False)
 

@@ -53,6 +53,7 @@ def accept_fields(
         signature = inspect.signature(settings_class)
 
         def call_with_fields(*args: Arguments.args, **kwargs: Arguments.kwargs) -> ReturnT:
+            """Call the function with settings from the fields; a wrong field is an error of the function."""
             try:
                 signature.bind(*args, **kwargs)
             except TypeError as error:

@@ -285,6 +285,7 @@ def _compute_checksum(archive: zipfile.ZipFile) -> bytes:
 
 
 def _add_array(archive: zipfile.ZipFile, name: str, array: Array) -> None:
+    """Add an array to the archive as a member in the format of `numpy.save`."""
     with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
         np.lib.format.write_array(member, array, allow_pickle=False)
 
@@ -346,5 +347,6 @@ def _count_bytes(node: Any) -> int:  # noqa: ANN401  (a tree)
 
 
 def _read_array(path: Path, name: str) -> Array:
+    """Read one array of the archive, within the memory limit."""
     # Types: bytes of a tensor, and the text of the header.
     return read_npz(path, partial(check_dtype_kind, "uU"), lambda _: [name])[name]

@@ -111,12 +111,14 @@ def warn_about_spinning(num_threads: int) -> None:
 
 
 def _is_wait_policy_set() -> bool:
+    """Return True if the environment defines how threads wait."""
     return any(name in os.environ for name in WAIT_VARIABLES)
 
 
 @cache
 def _warn_about_spinning_once() -> None:
-    # The warning points to the first line outside this package.
+    """Warn at the first call; the cache drops later calls."""
+    # The user has to change the program: the warning points to the first line outside this package.
     frame, level = inspect.currentframe(), 1
     while frame and frame.f_globals.get("__name__", "").partition(".")[0] in ("torchcover", "contextlib"):
         frame, level = frame.f_back, level + 1

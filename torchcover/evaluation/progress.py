@@ -140,6 +140,7 @@ def defer_signals() -> Iterator[list[int]]:
     handlers = {number: signal.getsignal(number) for number in deferred}
 
     def record_signal(number: int, _: FrameType | None) -> None:
+        """Record a signal that would end the program."""
         handler = handlers[number]
         if not isinstance(handler, _TerminationHandler) or handler.register(number):
             arrived.append(number)

@@ -84,6 +84,7 @@ class Report:
 
     @property
     def _encounters_page(self) -> Page:
+        """Page of the encounters; an empty one without encounters."""
         return build_encounters_page(self.encounters) if self.encounters else Page("", "")
 
     @property
@@ -116,6 +117,7 @@ class Report:
         )
 
     def _repr_html_(self) -> str:
+        """Return the findings as HTML for notebooks."""
         return build_result_html(self.verdict)
 
     @property
@@ -165,6 +167,7 @@ class Report:
         return files.paths
 
     def _add_numbers(self, files: AtomicOutput) -> None:
+        """Add the files of numbers: coverage, target maps, encounters and verdicts."""
         self.result.add_numbers(files)
         for stem, target_map in zip(build_file_stems(list(self.targets)), self.targets.values(), strict=True):
             files.add(f"targets/{stem}.csv", partial(write_csv, target_map))
@@ -281,8 +284,10 @@ class _BudgetRule:
     progress_text: str = ""
 
     def is_reached(self, num_frames: int) -> bool:
+        """Return True if the budget is used up and the numbers have confidence intervals."""
         self.bar.advance(self.num_steps)
         return num_frames >= MIN_BLOCKS and time.monotonic() >= self.end_s
 
     def estimate_num_frames(self, max_frames: int) -> int:
+        """Return the maximum: the budget does not predict a number of frames."""
         return max_frames

@@ -66,6 +66,7 @@ def load_contrib() -> Any:  # noqa: ANN401  (a package that no other module may 
 
 
 def _convert_rigs(rigs: "AnyRig | Sequence[AnyRig] | None") -> "tuple[AnyRig, ...]":
+    """Convert a rig or several to a tuple."""
     if rigs is None:
         return ()
     return (rigs,) if isinstance(rigs, str) or not isinstance(rigs, Sequence) else tuple(rigs)
@@ -134,6 +135,7 @@ def _get_scenario_name(scenario: object) -> str:
 
 
 def _convert_thresholds(thresholds_m: "float | Iterable[float]") -> tuple[float, ...]:
+    """Convert a threshold or several to a tuple of floats."""
     values = tuple(thresholds_m) if isinstance(thresholds_m, Iterable) else (thresholds_m,)
     if not all(isinstance(value, Real) for value in values):
         raise TypeError(f"thresholds_m: meters are needed, as in 0.4 or (0.4, 1.0); got {thresholds_m!r}")
@@ -141,6 +143,7 @@ def _convert_thresholds(thresholds_m: "float | Iterable[float]") -> tuple[float,
 
 
 def _convert_aggregations(aggregations: "str | Sequence[Aggregation | str]") -> "tuple[Aggregation, ...]":
+    """Convert names and objects to aggregations."""
     if not aggregations:
         return ()
     from torchcover.coverage import parse_aggregation
@@ -155,6 +158,7 @@ def _convert_aggregations(aggregations: "str | Sequence[Aggregation | str]") -> 
 
 
 def _convert_metrics(metrics: str | Iterable[str]) -> tuple[str, ...]:
+    """Convert names of published metrics to a tuple of valid names."""
     if not metrics:
         return ()
     names: tuple[str, ...] = load_contrib().parse_metric_names(metrics)
@@ -162,6 +166,7 @@ def _convert_metrics(metrics: str | Iterable[str]) -> tuple[str, ...]:
 
 
 def _convert_regions(regions: "RegionsOfInterest | str | Path | None") -> "RegionsOfInterest | None":
+    """Load regions of interest from a file unless they are an object."""
     if regions is None:
         return None
     from torchcover.simulation import RegionsOfInterest
@@ -174,6 +179,7 @@ def _convert_regions(regions: "RegionsOfInterest | str | Path | None") -> "Regio
 
 
 def _convert_target_error(target_error: "TargetError | str | Sequence[str] | None") -> "TargetError | None":
+    """Parse a target error unless it is an object."""
     if target_error is None:
         return None
     from torchcover.evaluation.target_error import TargetError
@@ -182,6 +188,7 @@ def _convert_target_error(target_error: "TargetError | str | Sequence[str] | Non
 
 
 def _convert_weather(weather: "Weather | str | Path | Sequence[Weather | str | Path]") -> "tuple[Weather, ...]":
+    """Load one weather or several from names and files."""
     if not weather:
         return ()
     from torchcover.simulation import Weather
@@ -259,8 +266,7 @@ class Settings:
     no_cache: bool = DEFAULTS.no_cache
     skip_bad_frames: bool = DEFAULTS.skip_bad_frames
     observers: Annotated[
-        "Mapping[str, AnyObserver]",
-        "Name -> observer of the same frames; `Result.observed` contains their results.",
+        "Mapping[str, AnyObserver]", "Name -> observer of the same frames; `Result.observed` contains their results."
     ] = field(default_factory=dict)
     checkpoint: Annotated[
         "Checkpoint | str | Path | None",

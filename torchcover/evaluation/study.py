@@ -17,14 +17,7 @@ from torch import Tensor
 
 from torchcover import __version__
 from torchcover.coverage import Coverage, Region, list_region_bands
-from torchcover.estimation import (
-    MIN_BLOCKS,
-    ROUND_OFF,
-    Difference,
-    ErrorModel,
-    Estimate,
-    estimate_blocks_needed,
-)
+from torchcover.estimation import MIN_BLOCKS, ROUND_OFF, Difference, ErrorModel, Estimate, estimate_blocks_needed
 from torchcover.evaluation.measurement import measure_coverage
 from torchcover.evaluation.settings import Settings
 from torchcover.evaluation.study_plan import StudiedNumber, StudyParams, StudyPlan, Trial
@@ -88,9 +81,11 @@ class Study:
         return [self._build_settings_table(), self._build_numbers_table()]
 
     def _list_frames_headings(self) -> list[str]:
+        """List the headings of the columns with numbers of frames."""
         return [f"frames for {_format_points(error)}" for error in self.plan.params.target_errors]
 
     def _build_settings_table(self) -> PageTable:
+        """Build the table with run time, bias and needed frames of each setting."""
         rows = []
         for trial in self.trials:
             frame_ms = f"{1000 * trial.duration_s / trial.num_frames:.0f}"
@@ -107,6 +102,7 @@ class Study:
         )
 
     def _build_numbers_table(self) -> PageTable:
+        """Build the table with the error and the needed frames of each number of the baseline."""
         baseline = self.trials[0]
         rows = []
         for number in baseline.numbers:
@@ -198,10 +194,12 @@ class Study:
 
 
 def _format_points(error: float) -> str:
+    """Format an error of a share in percentage points."""
     return f"{100 * error:g} percentage point{'' if error == 0.01 else 's'}"
 
 
 def _format_frames(trial: Trial, num_frames: int | None, startup_s: float) -> str:
+    """Format a number of frames with its run time."""
     return "-" if num_frames is None else f"{num_frames:,} ({trial.estimate_duration_s(num_frames, startup_s):.0f} s)"
 
 
