@@ -1,4 +1,4 @@
-"""The command in this process, and worlds small enough to be cast at once."""
+"""Fixtures of commands: the command in this process, and scenes that are fast to ray cast."""
 
 import os
 import sys
@@ -8,25 +8,25 @@ import pytest
 
 from torchcover.cli import app
 
-# Of a file that is aside, or is no result.
-ASIDE = (".torchcover_", ".unfinished_")
+# Prefixes of temporary files, which are no results.
+TEMPORARY_PREFIXES = (".torchcover_", ".unfinished_")
 opened = []
 
 
-def _told(event, arguments):
+def record_opened(event, arguments):
     if event == "open" and isinstance(arguments[0], str | os.PathLike):
         path, mode, flags = arguments
         writes = any(letter in (mode or "") for letter in "wax+") or flags & (os.O_WRONLY | os.O_RDWR)
-        if writes and not Path(path).is_dir():  # where only a file without a name is written
+        if writes and not Path(path).is_dir():  # a folder is only opened for a file without a name
             opened.append(Path(path).absolute())
 
 
-sys.addaudithook(_told)
+sys.addaudithook(record_opened)
 
 
 @pytest.fixture
 def torchcover(monkeypatch, capsys, tmp_path):
-    """Run the command in a folder of its own, where it writes nothing in place; returns exit code, stdout, stderr."""
+    """Run the command in an empty folder and check that it replaces files atomically; exit code, stdout, stderr."""
     monkeypatch.chdir(tmp_path)
 
     def run(*arguments):
@@ -37,8 +37,8 @@ def torchcover(monkeypatch, capsys, tmp_path):
         captured = capsys.readouterr()
         results = [path.relative_to(tmp_path) for path in opened if path.is_relative_to(tmp_path)]
         # The journal of a search grows line by line, so that a torn line is recognized.
-        others = [path for path in results if path.name != "search.journal"]
-        in_place = [path for path in others if not any(part.startswith(ASIDE) for part in path.parts)]
+        replaced = [path for path in results if path.name != "search.journal"]
+        in_place = [path for path in replaced if not any(part.startswith(TEMPORARY_PREFIXES) for part in path.parts)]
         assert in_place == []
         return stop.value.code, captured.out, captured.err
 
@@ -46,8 +46,8 @@ def torchcover(monkeypatch, capsys, tmp_path):
 
 
 @pytest.fixture
-def worlds(tmp_path):
-    """A folder with a rig `low`, one more sensor in `both`, another `low` in `other/`, and a scenario `yard`."""
+def scenes(tmp_path):
+    """Folder with rig `low`, rig `both` with one more sensor, a different `low` in `other/`, and scenario `yard`."""
     pattern = "channels: 8, vertical_fov_deg: [-30, 0], horizontal_fov_deg: 90, columns: 30, max_range_m: 60"
     front = f"  - {{name: front, mount: {{x_m: 2.5, z_m: 0.8}}, {pattern}}}\n"
     rear = f"  - {{name: rear, mount: {{x_m: -2.5, z_m: 0.8, yaw_deg: 180}}, {pattern}}}\n"
@@ -70,6 +70,6 @@ def worlds(tmp_path):
 
 @pytest.fixture(autouse=True)
 def _maps(request):
-    """Blank, unless a test asks for `drawn_maps`: what is on them is the business of tests/report."""
+    """Replace maps by blank images, unless a test has `drawn_maps`; tests/report checks the maps."""
     if "drawn_maps" not in request.fixturenames:
         request.getfixturevalue("blank_maps")

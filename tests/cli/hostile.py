@@ -1,4 +1,4 @@
-"""Documents and options that nobody should write: what each must end in is an exit code and one line, at once."""
+"""Hostile documents and options: each must end quickly with an exit code and one line."""
 
 from collections.abc import Callable, Iterator
 from itertools import chain
@@ -51,7 +51,7 @@ traffic:
 """
 BASES = {"rig": RIG, "camera": CAMERA, "yard": YARD, "town": TOWN}
 
-# Instead of a number: other types, YAML 1.1's readings, and numbers that have no room.
+# Values instead of a number: other types, interpretations of YAML 1.1, and numbers out of range.
 VALUES = (
     "true", "'60'", "0100", "1:40", "1_000", "~", "[]", "{}", "abc", ".nan", "-.inf", "1e400", "-1e300", "-1", "1e-320",
     "99999999999999999999", "1000000000", "9" * 5000, "[[[[1]]]]", "2020-01-01", "!!python/object:os.system x",

@@ -1,4 +1,4 @@
-"""The command line as a user meets it: files that agree with each other, and one line for each mistake."""
+"""Command line: results agree between files, and every user error is one line."""
 
 import csv
 import io
@@ -24,7 +24,7 @@ CELL_4M = ("--set", "cell_m=4")
 
 @pytest.fixture
 def recording(tmp_path):
-    """Four frames of a line of reference points beside one sensor point."""
+    """Recording of four frames with a line of reference points that starts at the only sensor point."""
     folder = tmp_path / "recording"
     for source in ("sensor", "reference"):
         (folder / source).mkdir(parents=True)
@@ -132,7 +132,7 @@ def test_simulation_is_reproducible(torchcover, tmp_path):
     assert 0 < a.summary()[0].observed_share <= 1
     summary = json.loads((tmp_path / "a" / "summary.json").read_text())
     assert summary["frame_counts"]["reference_rays"] == 128 * 128
-    # Every ray that the frame counts as ended by the ego is named beside its sensor.
+    # The note lists all self hits of the frame by sensor.
     self_hits = summary["frame_counts"]["sensor_self_hits"]
     notes = [f"Rays that end on the own vehicle: top {self_hits} of 720 ({self_hits / 720:.1%})."]
     assert self_hits > 50
@@ -144,18 +144,18 @@ def test_simulation_is_reproducible(torchcover, tmp_path):
     }
 
 
-def test_metric_receives_area_weights_of_the_reference(torchcover, worlds, monkeypatch):
-    given = []
+def test_metric_receives_area_weights_of_the_reference(torchcover, scenes, monkeypatch):
+    calls = []
 
-    def noted(self, sensor, reference, **more):
-        given.append((len(reference), more["weights"], more["block_index"]))
+    def record_call(self, sensor, reference, **more):
+        calls.append((len(reference), more["weights"], more["block_index"]))
         return sums_of(self, sensor, reference, **more)
 
     sums_of = CoverageSums.compute_sums
-    monkeypatch.setattr(CoverageSums, "compute_sums", noted)
+    monkeypatch.setattr(CoverageSums, "compute_sums", record_call)
     options = [
         "--scenario",
-        worlds / "yard.yaml",
+        scenes / "yard.yaml",
         "--num-frames",
         2,
         "--set",
@@ -163,22 +163,22 @@ def test_metric_receives_area_weights_of_the_reference(torchcover, worlds, monke
         "--num-rays",
         4096,
         "--out",
-        worlds / "out",
+        scenes / "out",
     ]
     for reference in ("surface", "paper"):
-        assert torchcover("evaluate", worlds / "low.yaml", *options, "--reference", reference)[0] == 0
-    (points, weights, _), _, (_, none, _), _ = given
+        assert torchcover("evaluate", scenes / "low.yaml", *options, "--reference", reference)[0] == 0
+    (points, weights, _), _, (_, no_weights, _), _ = calls
     assert weights.shape == (points,)
     assert float(weights.max() / weights.min()) > 2
-    assert none is None
-    assert [index for *_, index in given] == [0, 1, 0, 1]
+    assert no_weights is None
+    assert [index for *_, index in calls] == [0, 1, 0, 1]
 
 
 @pytest.mark.parametrize("name", REFERENCE_SENSORS)
-def test_reference_sensors_have_averages_and_are_in_help(torchcover, worlds, name):
+def test_reference_sensors_have_averages_and_are_in_help(torchcover, scenes, name):
     options = [
         "--scenario",
-        worlds / "yard.yaml",
+        scenes / "yard.yaml",
         "--num-frames",
         1,
         "--set",
@@ -186,43 +186,43 @@ def test_reference_sensors_have_averages_and_are_in_help(torchcover, worlds, nam
         "--num-rays",
         1024,
         "--out",
-        worlds / "out",
+        scenes / "out",
     ]
-    assert torchcover("evaluate", worlds / "low.yaml", *options, "--reference", name)[0] == 0
-    summary = json.loads((worlds / "out" / "summary.json").read_text())
+    assert torchcover("evaluate", scenes / "low.yaml", *options, "--reference", name)[0] == 0
+    summary = json.loads((scenes / "out" / "summary.json").read_text())
     by_area = REFERENCE_SENSORS[name].has_area_weights
     assert (summary["reference"]["sensor"], summary["average"]) == (name, "area" if by_area else "cells")
-    assert Coverage.load(worlds / "out" / "coverage.npz").average == summary["average"]
+    assert Coverage.load(scenes / "out" / "coverage.npz").average == summary["average"]
     assert name in torchcover("evaluate", "--help")[1]
 
 
-def test_cell_average_is_equal_in_both_averages(torchcover, worlds):
-    options = ["--scenario", worlds / "yard.yaml", "--num-frames", 2, "--set", "cell_m=4", "--num-rays", 1024, "--out"]
+def test_cell_average_is_equal_in_both_averages(torchcover, scenes):
+    options = ["--scenario", scenes / "yard.yaml", "--num-frames", 2, "--set", "cell_m=4", "--num-rays", 1024, "--out"]
     rows = {}
-    for measure in ("area", "cells"):
+    for average in ("area", "cells"):
         assert (
-            torchcover("evaluate", worlds / "low.yaml", *options, worlds / measure, "--set", f"average={measure}")[0]
+            torchcover("evaluate", scenes / "low.yaml", *options, scenes / average, "--set", f"average={average}")[0]
             == 0
         )
-        summary = json.loads((worlds / measure / "summary.json").read_text())
-        assert summary["average"] == measure
-        rows[measure] = summary["rows"]
-    for area, known in zip(rows["area"], rows["cells"], strict=True):
-        assert area["cells_radius_m"] == known["radius_m"]
-        assert area["observed_share"] == known["observed_share"]
-    assert any(area["radius_m"] != known["radius_m"] for area, known in zip(rows["area"], rows["cells"], strict=True))
+        summary = json.loads((scenes / average / "summary.json").read_text())
+        assert summary["average"] == average
+        rows[average] = summary["rows"]
+    for area, cells in zip(rows["area"], rows["cells"], strict=True):
+        assert area["cells_radius_m"] == cells["radius_m"]
+        assert area["observed_share"] == cells["observed_share"]
+    assert any(area["radius_m"] != cells["radius_m"] for area, cells in zip(rows["area"], rows["cells"], strict=True))
 
 
 def test_skipped_frames_keep_their_block_index(torchcover, recording, tmp_path, monkeypatch):
     (recording / "reference" / "f2.npy").write_bytes(b"rubbish")
-    sums_of, given = CoverageSums.compute_sums, []
+    sums_of, block_indices = CoverageSums.compute_sums, []
     monkeypatch.setattr(
         CoverageSums,
         "compute_sums",
-        lambda self, *clouds, **more: given.append(more["block_index"]) or sums_of(self, *clouds, **more),
+        lambda self, *clouds, **more: block_indices.append(more["block_index"]) or sums_of(self, *clouds, **more),
     )
     assert torchcover("evaluate", "--frames", recording, *SKIPPING, "--out", tmp_path / "out")[0] == 0
-    assert given == [0, 2, 3]
+    assert block_indices == [0, 2, 3]
 
 
 def test_too_few_frames_for_intervals_are_reported(torchcover, recording, tmp_path):
@@ -296,7 +296,10 @@ def test_too_few_frames_for_intervals_are_reported(torchcover, recording, tmp_pa
         ),
         (["evaluate", "--frames", "recording", "--reference", "paper"], "a recording has `recorded` or `accumulated`"),
         (["evaluate", "--frames", "recording", "--reference", "accumulated"], "has no times of its scans"),
-        (["evaluate", "--frames", "recording", "--sensors", "roof"], "got roof; give sensors of the recording recording: sensor, reference"),
+        (
+            ["evaluate", "--frames", "recording", "--sensors", "roof"],
+            "got roof; give sensors of the recording recording: sensor, reference",
+        ),
         (
             ["evaluate", "--frames", "recording", "--reference", "recorded", "--set", "recording.window_s=1"],
             "recorded reference has none",
@@ -334,9 +337,7 @@ def test_output_folder_below_a_file_is_rejected(torchcover, recording, tmp_path)
 
 
 def test_invalid_output_folder_is_rejected_before_the_run(torchcover, recording, tmp_path, monkeypatch):
-    monkeypatch.setattr(
-        "torchcover.evaluation.measurement.observe", lambda *_, **__: pytest.fail("it ran all the same")
-    )
+    monkeypatch.setattr("torchcover.evaluation.measurement.observe", lambda *_, **__: pytest.fail("the run started"))
     (tmp_path / "file").write_text("")
     (tmp_path / "link").symlink_to(tmp_path / "nothing")
     for out in (tmp_path / "file", tmp_path / "file" / "below", tmp_path / "link", tmp_path / "link" / "below"):
@@ -365,26 +366,26 @@ def test_list_prints_all_built_in_names_and_properties(torchcover):
     assert code == 0
     assert len(printed.splitlines()) < 60
     assert max(map(len, printed.splitlines())) <= 100
-    named, said = set(re.split(r"[\s,]+", printed)), {}
+    named, properties = set(re.split(r"[\s,]+", printed)), {}
     for kind in ("rigs", "scenarios", "lidars", "vehicles", "requirements"):
         assert set(list_builtin_names(kind)) <= named
         assert f"{kind} ({len(list_builtin_names(kind))})" in printed.splitlines()
         lines = [line.split(maxsplit=1) for line in torchcover("list", kind)[1].splitlines()]
         of_kind = {name: rest[0] for name, *rest in filter(None, lines) if rest}
         assert set(list_builtin_names(kind)) <= set(of_kind)
-        assert not said.keys() & of_kind.keys()
-        said |= of_kind
-    assert said["nuscenes_cameras"].startswith("6 cameras  The six cameras of the nuScenes cars (Renault Zoe)")
-    assert said["velodyne_vlp16"].startswith("16 channels, 100 m   Velodyne VLP-16.")
-    assert said["courtyard"].startswith("static")
+        assert not properties.keys() & of_kind.keys()
+        properties |= of_kind
+    assert properties["nuscenes_cameras"].startswith("6 cameras  The six cameras of the nuScenes cars (Renault Zoe)")
+    assert properties["velodyne_vlp16"].startswith("16 channels, 100 m   Velodyne VLP-16.")
+    assert properties["courtyard"].startswith("static")
 
 
 def test_list_finds_text_and_prints_complete_descriptions(torchcover):
     code, printed, _ = torchcover("list", "PANDAR64")
     assert (code, "hesai_pandar64" in printed, "velodyne_vlp16" in printed) == (0, True, False)
     assert " ".join(load_builtin_documents("lidars")["hesai_pandar64"]["description"].split()) in printed
-    code, _, said = torchcover("list", "no such thing")
-    assert (code, said) == (
+    code, _, stderr = torchcover("list", "no such thing")
+    assert (code, stderr) == (
         2,
         "torchcover: nothing built in contains 'no such thing'; `torchcover list` prints all names\n",
     )
@@ -424,15 +425,13 @@ def test_help_imports_no_heavy_library():
 
 
 @pytest.mark.parametrize(
-    ("error", "told"),
+    ("error", "message"),
     [
         (MemoryError("cuda:0: the search among 7 points"), "(cuda:0: the search among 7 points); reduce the size"),
-        (torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 7.00 GiB.\nGPU 0 ..."), "7.00 GiB.); reduce"),
+        (torch.cuda.OutOfMemoryError("CUDA out of memory. Tried to allocate 7.00 GiB.\nGPU 0 ..."), "GiB.); reduce"),
     ],
 )
-def test_out_of_memory_keeps_earlier_frames(
-    torchcover, recording, tmp_path, monkeypatch, error, told
-):
+def test_out_of_memory_keeps_earlier_frames(torchcover, recording, tmp_path, monkeypatch, error, message):
     def search(*arguments, **options):
         if next(calls) == 2:
             raise error
@@ -440,8 +439,8 @@ def test_out_of_memory_keeps_earlier_frames(
 
     calls = count()
     monkeypatch.setattr("torchcover.coverage.sums.nearest", search)
-    code, _, complaints = torchcover("evaluate", "--frames", recording, "--set", "cell_m=4", "--out", tmp_path / "out")
+    code, _, stderr = torchcover("evaluate", "--frames", recording, "--set", "cell_m=4", "--out", tmp_path / "out")
     assert code == 2
-    assert complaints.splitlines()[-1].startswith("torchcover: not enough memory (")
-    assert told in complaints.splitlines()[-1]
+    assert stderr.splitlines()[-1].startswith("torchcover: not enough memory (")
+    assert message in stderr.splitlines()[-1]
     assert Coverage.load(tmp_path / "out" / "coverage.npz").counts["num_frames"] == 2

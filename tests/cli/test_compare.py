@@ -1,4 +1,4 @@
-"""`torchcover compare`: paired, complete, and honest about what was cut short."""
+"""Command `compare`: paired differences, complete files, and reports of interrupted runs."""
 
 import csv
 import json
@@ -16,13 +16,13 @@ from torchcover.simulation import REFERENCE_SENSORS
 QUICK = ("--set", "cell_m=4", "--set", "test_targets=none")
 
 
-def compare(torchcover, worlds, *rigs, num_frames=1, out="out", options=()):
-    """Run it on the tiny yard; returns exit code, stdout, stderr, and the folder."""
-    paths = [worlds / f"{rig}.yaml" for rig in rigs]
-    folder = worlds / out
+def compare(torchcover, scenes, *rigs, num_frames=1, out="out", options=()):
+    """Run the command in the scene `yard`; returns exit code, stdout, stderr, and the folder."""
+    paths = [scenes / f"{rig}.yaml" for rig in rigs]
+    folder = scenes / out
     arguments = [
         "--scenario",
-        worlds / "yard.yaml",
+        scenes / "yard.yaml",
         "--num-frames",
         num_frames,
         "--set",
@@ -36,14 +36,14 @@ def compare(torchcover, worlds, *rigs, num_frames=1, out="out", options=()):
     return *torchcover("compare", *paths, *arguments), folder
 
 
-def test_files_agree_with_each_other_and_with_evaluate(torchcover, worlds):
-    code, printed, _, out = compare(torchcover, worlds, "low", "both", num_frames=2)
+def test_files_agree_with_each_other_and_with_evaluate(torchcover, scenes):
+    code, printed, _, out = compare(torchcover, scenes, "low", "both", num_frames=2)
     assert code == 0
     assert str(out) in printed.replace("\n", "")
     coverages = {name: Coverage.load(out / "coverage" / f"{name}.npz") for name in ("low", "both")}
     np.testing.assert_array_equal(coverages["low"].point_counts, coverages["both"].point_counts)
     summary = json.loads((out / "summary.json").read_text())
-    assert summary["rigs"] == {"low": str(worlds / "low.yaml"), "both": str(worlds / "both.yaml")}
+    assert summary["rigs"] == {"low": str(scenes / "low.yaml"), "both": str(scenes / "both.yaml")}
     assert summary["complete"] is True
     assert summary["counts"]["both"]["num_frames"] == 2
     with (out / "summary.csv").open() as file:
@@ -53,10 +53,10 @@ def test_files_agree_with_each_other_and_with_evaluate(torchcover, worlds):
         assert row["rig"] == same["rig"]
         assert row["radius_m"] == ("" if same["radius_m"] is None else str(same["radius_m"]))
         assert row["radius_m_best"] == str(same["radius_m_best"])
-    alone = worlds / "alone"
+    alone = scenes / "alone"
     options = [
         "--scenario",
-        worlds / "yard.yaml",
+        scenes / "yard.yaml",
         "--num-frames",
         2,
         "--set",
@@ -66,14 +66,14 @@ def test_files_agree_with_each_other_and_with_evaluate(torchcover, worlds):
         "--out",
         alone,
     ]
-    assert torchcover("evaluate", worlds / "both.yaml", *options, "--num-rays", 4096, *QUICK)[0] == 0
+    assert torchcover("evaluate", scenes / "both.yaml", *options, "--num-rays", 4096, *QUICK)[0] == 0
     np.testing.assert_array_equal(Coverage.load(alone / "coverage.npz").radius, coverages["both"].radius)
 
 
-def test_fog_never_increases_coverage(torchcover, worlds):
-    path = worlds / "both.yaml"
+def test_fog_never_increases_coverage(torchcover, scenes):
+    path = scenes / "both.yaml"
     path.write_text(path.read_text().replace("max_range_m: 60", "max_range_m: 60, range_at_10_percent_m: 30"))
-    *_, out = compare(torchcover, worlds, "both", options=["--weather", "clear", "--weather", "fog_50m"])
+    *_, out = compare(torchcover, scenes, "both", options=["--weather", "clear", "--weather", "fog_50m"])
     rows = json.loads((out / "summary.json").read_text())["rows"]
     in_fog = {(row["region"], row["band"]): row for row in rows if row["rig"] == "both, fog_50m"}
     pairs = [(row, in_fog[row["region"], row["band"]]) for row in rows if row["rig"] == "both, clear"]
@@ -85,8 +85,8 @@ def test_fog_never_increases_coverage(torchcover, worlds):
     assert max(lost) > 0.05
 
 
-def test_one_more_sensor_never_reduces_coverage(torchcover, worlds):
-    *_, out = compare(torchcover, worlds, "low", "both")
+def test_one_more_sensor_never_reduces_coverage(torchcover, scenes):
+    *_, out = compare(torchcover, scenes, "low", "both")
     rows = [row for row in json.loads((out / "summary.json").read_text())["rows"] if row["rig"] == "both"]
     known = [row for row in rows if row["observed_cells"]]
     assert known
@@ -96,36 +96,36 @@ def test_one_more_sensor_never_reduces_coverage(torchcover, worlds):
     assert (both.radius < low.radius - 1.0).any()
 
 
-def test_rigs_with_equal_names_get_separate_files(torchcover, worlds):
-    code, printed, _, out = compare(torchcover, worlds, "low", "other/low", "low")
+def test_rigs_with_equal_names_get_separate_files(torchcover, scenes):
+    code, printed, _, out = compare(torchcover, scenes, "low", "other/low", "low")
     assert code == 0
     assert sorted(path.name for path in (out / "coverage").iterdir()) == ["low.npz", "low_2.npz", "low_3.npz"]
     assert "low_3" in printed
-    first, other, again = (Coverage.load(out / "coverage" / f"low{n}.npz") for n in ("", "_2", "_3"))
-    np.testing.assert_array_equal(first.radius, again.radius)
-    assert not np.array_equal(first.radius, other.radius, equal_nan=True)
+    first, different, repeated = (Coverage.load(out / "coverage" / f"low{n}.npz") for n in ("", "_2", "_3"))
+    np.testing.assert_array_equal(first.radius, repeated.radius)
+    assert not np.array_equal(first.radius, different.radius, equal_nan=True)
     summary = json.loads((out / "summary.json").read_text())
-    assert summary["rigs"]["low_2"] == str(worlds / "other" / "low.yaml")
+    assert summary["rigs"]["low_2"] == str(scenes / "other" / "low.yaml")
     for row in summary["rows"]:
         if row["rig"] == "low_3" and row["observed_cells"]:
             assert row["radius_m_difference"] == 0.0
 
 
-def test_maps_and_their_differences_are_plotted(torchcover, worlds):
-    *_, out = compare(torchcover, worlds, "low", "both")
+def test_maps_and_their_differences_are_plotted(torchcover, scenes):
+    *_, out = compare(torchcover, scenes, "low", "both")
     metrics = "radius_area_m", "detection_area_2m"
-    of_bands = [
+    band_maps = [
         f"{prefix}{metric}_{band}{suffix}.png"
         for metric in metrics
         for band in ("ground", "obstacle")
         for prefix, suffix in (("", ""), ("difference_", "_both_minus_low"))
     ]
     near = [f"near_field_{metric}.png" for metric in metrics]
-    assert sorted(path.name for path in (out / "maps").iterdir()) == sorted([*of_bands, *near])
+    assert sorted(path.name for path in (out / "maps").iterdir()) == sorted([*band_maps, *near])
 
 
-def test_differences_have_standard_errors(torchcover, worlds):
-    *_, out = compare(torchcover, worlds, "low", "both", num_frames=9)
+def test_differences_have_standard_errors(torchcover, scenes):
+    *_, out = compare(torchcover, scenes, "low", "both", num_frames=9)
     summary = json.loads((out / "summary.json").read_text())
     assert (summary["blocks"], summary["frames_per_block"]) == (9, 1)
     known = [row for row in summary["rows"] if row["rig"] == "both" and row["band"] == "ground"][:3]
@@ -138,8 +138,8 @@ def test_differences_have_standard_errors(torchcover, worlds):
     assert [row["radius_m_difference_error"] for row in first] == [0.0, 0.0, 0.0]
 
 
-def test_reference_sensor_is_used_and_named(torchcover, worlds):
-    _, printed, _, out = compare(torchcover, worlds, "low", "both", num_frames=2, options=["--reference", "paper"])
+def test_reference_sensor_is_used_and_named(torchcover, scenes):
+    _, printed, _, out = compare(torchcover, scenes, "low", "both", num_frames=2, options=["--reference", "paper"])
     summary = json.loads((out / "summary.json").read_text())
     (ground,) = summary["reference"].pop("notes")
     assert ground.startswith("Ground: level faces under the ego")
@@ -150,12 +150,12 @@ def test_reference_sensor_is_used_and_named(torchcover, worlds):
 
 @pytest.fixture
 def recording(tmp_path):
-    """Three frames of the rigs `far`, `kitti` and `near` against one reference point."""
+    """Recording of three frames with the rigs `far`, `kitti` and `near` and one reference point."""
     folder = tmp_path / "recording"
-    for place, x in (("rigs/near", 5.0), ("rigs/kitti", 3.0), ("rigs/far", 1.0), ("reference", 6.0)):
-        (folder / place).mkdir(parents=True)
+    for source, x in (("rigs/near", 5.0), ("rigs/kitti", 3.0), ("rigs/far", 1.0), ("reference", 6.0)):
+        (folder / source).mkdir(parents=True)
         for frame in range(3):
-            np.save(folder / place / f"f{frame}.npy", np.array([[x, 0.1, 0.0]], dtype=np.float32))
+            np.save(folder / source / f"f{frame}.npy", np.array([[x, 0.1, 0.0]], dtype=np.float32))
     return folder
 
 
@@ -170,8 +170,8 @@ def recording(tmp_path):
 def test_rigs_of_a_recording_are_compared(torchcover, recording, tmp_path, rigs, radii):
     out = tmp_path / "out"
     arguments = ["--frames", recording, "--set", "recording.format=folder", "--set", "cell_m=4", "--out", out]
-    code, _, complaints = torchcover("compare", *rigs, *arguments)
-    assert code == 0, complaints
+    code, _, stderr = torchcover("compare", *rigs, *arguments)
+    assert code == 0, stderr
     summary = json.loads((out / "summary.json").read_text())
     assert list(summary["rigs"]) == list(radii)
     assert (summary["frames"], summary["reference"]["sensor"], summary["complete"]) == (
@@ -179,8 +179,8 @@ def test_rigs_of_a_recording_are_compared(torchcover, recording, tmp_path, rigs,
         "recorded",
         True,
     )
-    found = {row["rig"]: row["radius_m"] for row in summary["rows"] if row["region"] == "20m" and row["observed_cells"]}
-    assert found == pytest.approx(radii)
+    rows = [row for row in summary["rows"] if row["region"] == "20m" and row["observed_cells"]]
+    assert {row["rig"]: row["radius_m"] for row in rows} == pytest.approx(radii)
 
 
 def test_error_lists_the_rigs_of_a_recording(torchcover, recording, tmp_path):
@@ -234,8 +234,8 @@ def test_user_error_is_one_line_with_code_2(torchcover, arguments, message, tmp_
     assert not (tmp_path / "out").exists()
 
 
-def test_pages_of_many_rigs_are_announced_or_rejected(torchcover, worlds, monkeypatch):
-    code, _, error, out = compare(torchcover, worlds, "low", "both", out="few")
+def test_pages_of_many_rigs_are_announced_or_rejected(torchcover, scenes, monkeypatch):
+    code, _, error, out = compare(torchcover, scenes, "low", "both", out="few")
     assert (code, "page and maps" in error) == (0, False)
     few = compare_saved(sorted((out / "coverage").glob("*.npz")))
     many = replace(few, coverages={str(number): few.coverages["low"] for number in range(200)})
@@ -244,8 +244,9 @@ def test_pages_of_many_rigs_are_announced_or_rejected(torchcover, worlds, monkey
     assert "page and maps of 200 rigs take about" in many.describe_rendering_cost("maps,page")
     assert many.describe_rendering_cost("numbers") == ""
     for needed_bytes, expected in ((3e9, 0), (1e18, 2)):
-        monkeypatch.setattr(Result, "estimate_rendering_cost", lambda *_, needed_bytes=needed_bytes: (needed_bytes, 120.0))
-        code, _, error, out = compare(torchcover, worlds, "low", "both", out=str(expected))
+        cost = (needed_bytes, 120.0)
+        monkeypatch.setattr(Result, "estimate_rendering_cost", lambda *_, cost=cost: cost)
+        code, _, error, out = compare(torchcover, scenes, "low", "both", out=str(expected))
         assert code == expected
         assert f"page and maps of 2 rigs take about {needed_bytes / 1e9:.2g} GB of memory and 2 min" in error
         assert (out / "coverage" / "low.npz").exists()

@@ -1,4 +1,4 @@
-"""Settings of a run in a file, by `--set` and by options of their own."""
+"""Settings of a run from a file, from `--set` and from options."""
 
 import json
 
@@ -70,19 +70,21 @@ def test_error_of_a_file_names_key_and_value(tmp_path, text, message):
     assert message in str(refused.value)
 
 
-@pytest.mark.parametrize("text", ["rays", "=", "rayz=3", "recording=1", "recording.unit=mm", "num_rays=x", "cell_m=25cm"])
+@pytest.mark.parametrize(
+    "text", ["rays", "=", "rayz=3", "recording=1", "recording.unit=mm", "num_rays=x", "cell_m=25cm"]
+)
 def test_invalid_assignment_is_rejected(text):
     with pytest.raises(ValueError, match=r"^--set "):
         load_config(None, [text])
 
 
-def test_result_contains_the_file_of_settings(torchcover, worlds):
-    path = worlds / "run.yaml"
-    path.write_text(f"scenario: {worlds / 'yard.yaml'}\ncell_m: 4\nnum_rays: 64\nnum_frames: 3\ntest_targets: [none]\n")
-    options = ("--config", path, "--num-frames", 2, "--files", "numbers", "--out", worlds / "out")
-    code, _, complaints = torchcover("evaluate", worlds / "both.yaml", *options)
-    assert code == 0, complaints
-    summary = json.loads((worlds / "out" / "summary.json").read_text())
+def test_result_contains_the_file_of_settings(torchcover, scenes):
+    path = scenes / "run.yaml"
+    path.write_text(f"scenario: {scenes / 'yard.yaml'}\ncell_m: 4\nnum_rays: 64\nnum_frames: 3\ntest_targets: [none]\n")
+    options = ("--config", path, "--num-frames", 2, "--files", "numbers", "--out", scenes / "out")
+    code, _, stderr = torchcover("evaluate", scenes / "both.yaml", *options)
+    assert code == 0, stderr
+    summary = json.loads((scenes / "out" / "summary.json").read_text())
     assert summary["rows"][0]["num_frames"] == 2
     assert summary["config"]["settings"]["cell_m"] == 4
     assert summary["config"]["replaced"]["num_frames"] == {"file": 3, "option": 2}

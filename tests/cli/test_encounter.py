@@ -1,4 +1,4 @@
-"""`torchcover encounter`: tables, files, and what is wrong with a set."""
+"""Command `encounter`: tables, files, and user errors."""
 
 import json
 
@@ -12,12 +12,12 @@ encounters:
 """
 
 
-def test_tables_and_files_contain_all_rigs(torchcover, worlds, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "200")  # so that no cell is folded
-    (worlds / "two.yaml").write_text(SET)
+def test_tables_and_files_contain_all_rigs(torchcover, scenes, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "200")  # wide enough for every cell on one line
+    (scenes / "two.yaml").write_text(SET)
     arguments = (
         "--encounters",
-        worlds / "two.yaml",
+        scenes / "two.yaml",
         "--num-start-offsets",
         "2",
         "--points",
@@ -27,7 +27,7 @@ def test_tables_and_files_contain_all_rigs(torchcover, worlds, monkeypatch):
         "--vehicle",
         "suv",
     )
-    ended, printed, _ = torchcover("encounter", worlds / "low.yaml", worlds / "both.yaml", *arguments)
+    ended, printed, _ = torchcover("encounter", scenes / "low.yaml", scenes / "both.yaml", *arguments)
     assert ended == 0
     for words in (
         "child: yaw_deg 90",
@@ -38,14 +38,14 @@ def test_tables_and_files_contain_all_rigs(torchcover, worlds, monkeypatch):
         "1 LiDAR points",
     ):
         assert words in printed
-    out = worlds / "out" / "encounters"
+    out = scenes / "out" / "encounters"
     record = json.loads((out / "summary.json").read_text())
     assert list(record["files"]) == ["encounters.csv", "report.html", "encounters.png"]
     assert [(row["encounter"], row["speed_kmh"], row["rig"]) for row in record["rows"]][:2] == [
         ("child: yaw_deg 90", 10.0, "low"), ("child: yaw_deg 90", 10.0, "both")]  # fmt: skip
     assert len(record["rows"]) == len((out / "encounters.csv").read_text().splitlines()) - 1 == 8
     assert record["rows"][0]["interval_low"] is None
-    assert {one["max_speed_kmh"] for one in record["speeds"]} == {10.0}
+    assert {row["max_speed_kmh"] for row in record["speeds"]} == {10.0}
     assert "Detection before a collision: low, both" in (out / "report.html").read_text()
 
 
@@ -67,10 +67,10 @@ def test_tables_and_files_contain_all_rigs(torchcover, worlds, monkeypatch):
         (SET, ["--scenario", "urban"], "--encounters: has no effect with --scenario"),
     ],
 )
-def test_user_error_is_one_line(torchcover, worlds, text, arguments, message):
-    (worlds / "two.yaml").write_text(text)
-    given = ("--encounters", worlds / "two.yaml", "--num-start-offsets", "1", "--vehicle", "suv", *arguments)
-    ended, _, error = torchcover("encounter", worlds / "low.yaml", *given)
+def test_user_error_is_one_line(torchcover, scenes, text, arguments, message):
+    (scenes / "two.yaml").write_text(text)
+    options = ("--encounters", scenes / "two.yaml", "--num-start-offsets", "1", "--vehicle", "suv", *arguments)
+    ended, _, error = torchcover("encounter", scenes / "low.yaml", *options)
     assert ended == 2
     assert message in error.strip().splitlines()[-1]
 
@@ -91,7 +91,7 @@ def test_user_error_is_one_line(torchcover, worlds, text, arguments, message):
         ([], "rigs with different names are needed; got none"),
     ],
 )
-def test_option_without_effect_is_a_user_error(torchcover, worlds, arguments, message):
-    ended, _, error = torchcover("encounter", *(worlds / one if one == "low.yaml" else one for one in arguments))
+def test_option_without_effect_is_a_user_error(torchcover, scenes, arguments, message):
+    ended, _, error = torchcover("encounter", *(scenes / item if item == "low.yaml" else item for item in arguments))
     assert ended == 2
     assert message in error.strip().splitlines()[-1]

@@ -1,4 +1,4 @@
-"""Every end of a command has one exit code, with closed streams too."""
+"""Exit codes of commands, also with closed streams."""
 
 import os
 import signal
@@ -32,10 +32,10 @@ def test_each_error_has_its_exit_code(torchcover, monkeypatch, error, code, line
         raise error
 
     monkeypatch.setattr(listing, "print_builtin", run)
-    ended, _, complaints = torchcover("list")
-    assert (ended, ("Traceback" in complaints)) == (code, code == 70)
-    assert len(complaints.splitlines()) >= lines if code == 70 else len(complaints.splitlines()) == lines
-    assert code != 70 or complaints.splitlines()[-1].startswith("torchcover: internal error (")
+    ended, _, stderr = torchcover("list")
+    assert (ended, ("Traceback" in stderr)) == (code, code == 70)
+    assert len(stderr.splitlines()) >= lines if code == 70 else len(stderr.splitlines()) == lines
+    assert code != 70 or stderr.splitlines()[-1].startswith("torchcover: internal error (")
 
 
 @pytest.mark.parametrize(
@@ -54,12 +54,12 @@ def test_commands_run_with_closed_streams(arguments, code, closed):
     assert (done.returncode, "Traceback" in done.stderr) == (code, False)
 
 
-def test_results_are_written_with_closed_streams(worlds):
-    settings = f"--scenario {worlds}/yard.yaml --set cell_m=4 --num-rays 1024 --num-frames 2 --num-workers 1"
-    command = f"exec {' '.join(PROGRAM)} evaluate {worlds}/low.yaml {settings} --files numbers <&- >&- 2>&-"
-    assert subprocess.run(["sh", "-c", command], check=False, cwd=worlds).returncode == 0
-    assert {path.name for path in (worlds / "out").iterdir()} >= {"summary.json", "coverage.npz", "summary.csv"}
-    assert b"\x1b" not in (worlds / "out" / "summary.csv").read_bytes()
+def test_results_are_written_with_closed_streams(scenes):
+    settings = f"--scenario {scenes}/yard.yaml --set cell_m=4 --num-rays 1024 --num-frames 2 --num-workers 1"
+    command = f"exec {' '.join(PROGRAM)} evaluate {scenes}/low.yaml {settings} --files numbers <&- >&- 2>&-"
+    assert subprocess.run(["sh", "-c", command], check=False, cwd=scenes).returncode == 0
+    assert {path.name for path in (scenes / "out").iterdir()} >= {"summary.json", "coverage.npz", "summary.csv"}
+    assert b"\x1b" not in (scenes / "out" / "summary.csv").read_bytes()
 
 
 @pytest.mark.parametrize("arguments", ["list", "targets front_roof_32 --raster 3,5,-1,1,1 --files numbers"])

@@ -1,4 +1,4 @@
-"""What is written: what was asked for, at once, and nothing in place."""
+"""Option `--files`: selected files, which replace older ones atomically."""
 
 import pytest
 
@@ -14,10 +14,10 @@ def written(folder):
     ("files", "expected"),
     [("numbers", NUMBERS), ("page", {"report.html"}), ("page, numbers", {*NUMBERS, "report.html"}), ("maps", set())],
 )
-def test_result_has_the_selected_files(torchcover, worlds, files, expected):
-    out = worlds / "out"
+def test_result_has_the_selected_files(torchcover, scenes, files, expected):
+    out = scenes / "out"
     code, printed, _ = torchcover(
-        "evaluate", worlds / "low.yaml", "--scenario", worlds / "yard.yaml", *SMALL, "--files", files, "--out", out
+        "evaluate", scenes / "low.yaml", "--scenario", scenes / "yard.yaml", *SMALL, "--files", files, "--out", out
     )
     assert code == 0
     maps = {name for name in written(out) if name.endswith(".png")}
@@ -26,16 +26,16 @@ def test_result_has_the_selected_files(torchcover, worlds, files, expected):
     assert ("maps/" in printed) == (files == "maps")
 
 
-def test_target_map_has_the_selected_files(torchcover, worlds):
-    raster = ["--raster", "3,5,-1,1,1", "--out", worlds / "out"]
+def test_target_map_has_the_selected_files(torchcover, scenes):
+    raster = ["--raster", "3,5,-1,1,1", "--out", scenes / "out"]
     for files, expected in (("numbers", {"targets.csv", "targets.npz"}), ("maps", {"targets.png"})):
-        assert torchcover("targets", worlds / "low.yaml", *raster, "--files", files)[0] == 0
-        assert written(worlds / "out") == {*expected, "summary.json"}
+        assert torchcover("targets", scenes / "low.yaml", *raster, "--files", files)[0] == 0
+        assert written(scenes / "out") == {*expected, "summary.json"}
 
 
 @pytest.mark.parametrize("files", ["", "number", "numbers,", "numbers;maps"])
-def test_unknown_file_kind_is_rejected_before_the_run(torchcover, worlds, files):
-    code, _, said = torchcover("evaluate", worlds / "low.yaml", "--files", files, "--out", worlds / "out")
+def test_unknown_file_kind_is_rejected_before_the_run(torchcover, scenes, files):
+    code, _, stderr = torchcover("evaluate", scenes / "low.yaml", "--files", files, "--out", scenes / "out")
     assert code == 2
-    assert said == f"torchcover: files: numbers, maps, page, one or more of them, are needed; got {files!r}\n"
-    assert not (worlds / "out").exists()
+    assert stderr == f"torchcover: files: numbers, maps, page, one or more of them, are needed; got {files!r}\n"
+    assert not (scenes / "out").exists()

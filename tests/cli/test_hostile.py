@@ -1,4 +1,4 @@
-"""Documents and options that nobody should write end at once, in one line; `benchmarks hostile_documents` has all."""
+"""Hostile documents and options end quickly with one line; `benchmarks hostile_documents` runs all."""
 
 import time
 from itertools import chain
@@ -25,9 +25,9 @@ def test_hostile_case_ends_quickly_with_one_line(case, torchcover, tmp_path, mon
         (tmp_path / name).write_text(content)
     case.prepare(tmp_path)
     start = time.perf_counter()
-    code, _, said = torchcover(*case.arguments)
+    code, _, stderr = torchcover(*case.arguments)
     assert time.perf_counter() - start < 30
-    assert code == 2, said
-    assert said.startswith("torchcover: ")
-    assert said.count("\n") == 1
-    assert len(said) < 2100
+    assert code == 2, stderr
+    assert stderr.startswith("torchcover: ")
+    assert stderr.count("\n") == 1
+    assert len(stderr) < 2100

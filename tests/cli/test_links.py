@@ -1,4 +1,4 @@
-"""Links in recordings lead to regular files inside of a root that somebody named; pipes and devices stop no reader."""
+"""Links in recordings: only to regular files in allowed roots; pipes and devices do not block a reader."""
 
 import os
 import pickle
@@ -16,7 +16,7 @@ NO_FILE = r"a pipe, a socket or a device|a link to /dev/zero"
 
 
 def write(folder, target=None):
-    """Write a plain recording of a frame, whose cloud is a link to a target if one is given."""
+    """Write a recording of one frame; its cloud is a link if there is a target."""
     for name in ("sensors/roof", "reference"):
         (folder / name).mkdir(parents=True)
         np.save(folder / name / "f.npy", np.ones((4, 3), np.float32))
@@ -55,7 +55,7 @@ def test_workers_follow_the_same_links(tmp_path, monkeypatch):
     folder, root = write(tmp_path / "out", tmp_path / "blobs" / "0"), tmp_path / "blobs"
     for roots in ([], [root]):
         content = pickle.dumps(RecordedFrames(open_recording(folder, link_roots=roots)))
-        monkeypatch.setattr("torchcover.files.bad_file._link_roots", {})  # as in a process that was spawned
+        monkeypatch.setattr("torchcover.files.bad_file._link_roots", {})  # as in a spawned process
         frames = pickle.loads(content)
         if roots:
             assert len(frames[0].sensor) == 4
@@ -67,8 +67,8 @@ def test_workers_follow_the_same_links(tmp_path, monkeypatch):
 def test_allow_links_adds_roots(tmp_path, torchcover):
     write(tmp_path / "out", tmp_path / "blobs" / "0")
     command = ("evaluate", "--frames", "out", "--out", "result", "--files", "numbers")
-    code, _, said = torchcover(*command)
-    assert (code, "outside of the recording" in said) == (2, True)
+    code, _, stderr = torchcover(*command)
+    assert (code, "outside of the recording" in stderr) == (2, True)
     try:
         assert torchcover("--allow-links", "blobs", *command)[0] == 0
     finally:

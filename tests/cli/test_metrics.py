@@ -1,4 +1,4 @@
-"""`--metrics`: metrics of others beside the coverage."""
+"""Setting `metrics`: published metrics in addition to the coverage."""
 
 import csv
 import json
@@ -11,10 +11,10 @@ from torchcover import Coverage
 from torchcover.evaluation import evaluate
 
 
-def run(torchcover, worlds, *rigs, command="compare", options=(), out="out", num_frames=2):
+def run(torchcover, scenes, *rigs, command="compare", options=(), out="out", num_frames=2):
     arguments = [
         "--scenario",
-        worlds / "yard.yaml",
+        scenes / "yard.yaml",
         "--num-frames",
         num_frames,
         "--set",
@@ -24,13 +24,13 @@ def run(torchcover, worlds, *rigs, command="compare", options=(), out="out", num
         "--num-rays",
         4096,
     ]
-    paths = [worlds / f"{rig}.yaml" for rig in rigs]
-    folder = worlds / out
+    paths = [scenes / f"{rig}.yaml" for rig in rigs]
+    folder = scenes / out
     return *torchcover(command, *paths, *arguments, "--out", folder, *options), folder
 
 
-def test_three_rigs_have_rank_correlations_in_all_files(torchcover, worlds):
-    code, printed, error, out = run(torchcover, worlds, "low", "both", "other/low", options=["--set", "metrics=all"])
+def test_three_rigs_have_rank_correlations_in_all_files(torchcover, scenes):
+    code, printed, error, out = run(torchcover, scenes, "low", "both", "other/low", options=["--set", "metrics=all"])
     assert (code, error.count("warning")) == (0, 0)
     assert "None of these metrics is validated" in printed
     assert "m_sog: only for ranks" in " ".join(printed.split())
@@ -49,73 +49,73 @@ def test_three_rigs_have_rank_correlations_in_all_files(torchcover, worlds):
     with (out / "metrics_rank_correlation.csv").open() as file:
         taus = list(csv.DictReader(file))
     assert len(taus) == len(summary["metrics"]["tau"]) > 50
-    assert all(tau["low"] == "" for tau in taus)  # two instants are too few to draw again
+    assert all(tau["low"] == "" for tau in taus)  # two frames are too few for resampling
     assert {"metrics.csv", "metrics_rank_correlation.csv"} <= set(summary["files"])
     page = (out / "report.html").read_text()
     assert "Published metrics" in page
     assert "tau-b" in page
 
 
-def test_two_rigs_have_no_rank_correlation(torchcover, worlds):
-    _, printed, _, out = run(torchcover, worlds, "low", "both", options=["--set", "metrics=point_density"])
+def test_two_rigs_have_no_rank_correlation(torchcover, scenes):
+    _, printed, _, out = run(torchcover, scenes, "low", "both", options=["--set", "metrics=point_density"])
     assert "needs at least three rigs" in " ".join(printed.split())
     assert json.loads((out / "summary.json").read_text())["metrics"]["tau"] == []
 
 
-def test_metrics_do_not_change_the_coverage(torchcover, worlds):
-    code, printed, _, out = run(torchcover, worlds, "both", command="evaluate", options=["--set", "metrics=k_cover"])
+def test_metrics_do_not_change_the_coverage(torchcover, scenes):
+    code, printed, _, out = run(torchcover, scenes, "both", command="evaluate", options=["--set", "metrics=k_cover"])
     assert code == 0
     assert "k_cover_2_2m" in printed
-    *_, plain = run(torchcover, worlds, "both", command="evaluate", out="plain")
+    *_, plain = run(torchcover, scenes, "both", command="evaluate", out="plain")
     with_metrics, without = (Coverage.load(folder / "coverage.npz") for folder in (out, plain))
     np.testing.assert_array_equal(with_metrics.radius, without.radius)
     np.testing.assert_array_equal(with_metrics.point_counts, without.point_counts)
 
 
-def test_unknown_metric_lists_all_metrics(torchcover, worlds):
-    code, _, error, _ = run(torchcover, worlds, "low", "both", options=["--set", "metrics=nosuch"])
+def test_unknown_metric_lists_all_metrics(torchcover, scenes):
+    code, _, error, _ = run(torchcover, scenes, "low", "both", options=["--set", "metrics=nosuch"])
     assert code == 2
     assert error.count("\n") == 1
     assert "k_cover" in error
     assert "'nosuch'" in error
 
 
-def test_resumed_run_continues_its_metrics(torchcover, worlds):
+def test_resumed_run_continues_its_metrics(torchcover, scenes):
     options = ["--set", "metrics=all"]
-    run(torchcover, worlds, "low", "both", options=options, num_frames=1)
-    code, *_, out = run(torchcover, worlds, "low", "both", options=[*options, "--resume"], num_frames=3)
-    *_, whole = run(torchcover, worlds, "low", "both", options=options, num_frames=3, out="whole")
+    run(torchcover, scenes, "low", "both", options=options, num_frames=1)
+    code, *_, out = run(torchcover, scenes, "low", "both", options=[*options, "--resume"], num_frames=3)
+    *_, whole = run(torchcover, scenes, "low", "both", options=options, num_frames=3, out="whole")
     assert code == 0
     assert (out / "metrics.csv").read_text() == (whole / "metrics.csv").read_text()
 
 
 @pytest.mark.filterwarnings("ignore:.*edited since it was recorded")
-def test_recording_without_boxes_has_metrics_without_boxes(torchcover, worlds):
+def test_recording_without_boxes_has_metrics_without_boxes(torchcover, scenes):
     torchcover(
-        "record", worlds / "both.yaml", "--out", worlds / "drive", "--scenario", worlds / "yard.yaml", "--num-frames", 2
+        "record", scenes / "both.yaml", "--out", scenes / "drive", "--scenario", scenes / "yard.yaml", "--num-frames", 2
     )
-    shutil.rmtree(worlds / "drive" / "boxes")
+    shutil.rmtree(scenes / "drive" / "boxes")
     code, printed, error = torchcover(
         "evaluate",
         "--frames",
-        worlds / "drive",
+        scenes / "drive",
         "--set",
         "metrics=all",
         "--set",
         "cell_m=4",
         "--out",
-        worlds / "of",
+        scenes / "of",
     )
     assert code == 0, error
     assert "point_density" in printed
     assert "Without false_visible" in " ".join(printed.split())
 
 
-def test_intervals_of_rank_correlations_are_reproducible(worlds):
-    def taus():
+def test_intervals_of_rank_correlations_are_reproducible(scenes):
+    def compute_taus():
         result = evaluate(
-            [worlds / f"{rig}.yaml" for rig in ("low", "both", "other/low")],
-            worlds / "yard.yaml",
+            [scenes / f"{rig}.yaml" for rig in ("low", "both", "other/low")],
+            scenes / "yard.yaml",
             num_frames=9,
             cell_m=4.0,
             thresholds_m=2.0,
@@ -124,19 +124,19 @@ def test_intervals_of_rank_correlations_are_reproducible(worlds):
         )
         return [tau for tau in result.metrics.compute_taus() if tau.first == "k_cover_1_2m"]
 
-    first = taus()
-    known = [tau for tau in first if not np.isnan(tau.low)]
-    assert known
-    for tau in known:
+    first = compute_taus()
+    finite = [tau for tau in first if not np.isnan(tau.low)]
+    assert finite
+    for tau in finite:
         assert -1 <= tau.low <= tau.high <= 1
-    assert repr(taus()) == repr(first)
+    assert repr(compute_taus()) == repr(first)
 
 
 @pytest.mark.parametrize("metrics", ["", ()])
-def test_empty_list_of_metrics_computes_none(worlds, metrics):
+def test_empty_list_of_metrics_computes_none(scenes, metrics):
     result = evaluate(
-        [worlds / "low.yaml", worlds / "both.yaml"],
-        worlds / "yard.yaml",
+        [scenes / "low.yaml", scenes / "both.yaml"],
+        scenes / "yard.yaml",
         num_frames=1,
         cell_m=4.0,
         num_rays=1024,

@@ -1,4 +1,4 @@
-"""A radar on the command line: coverage, what is left without it, targets, a better place, and its mistakes."""
+"""Radars on the command line: coverage, failure, targets, search and user errors."""
 
 import numpy as np
 import pytest
@@ -15,27 +15,27 @@ SMALL = ("--num-frames", 3, "--set", "cell_m=0.5", "--num-rays", 2048, "--redund
 
 
 @pytest.fixture
-def rigs(worlds):
-    """A rig `radars` with two, and one `alone` with the rear one."""
-    (worlds / "radars.yaml").write_text(f"name: radars\nsensors:\n{FRONT}{REAR}")
-    (worlds / "alone.yaml").write_text(f"name: alone\nsensors:\n{REAR}")
-    return worlds
+def rigs(scenes):
+    """Folder with rig `radars` of two radars and rig `alone` of the rear one."""
+    (scenes / "radars.yaml").write_text(f"name: radars\nsensors:\n{FRONT}{REAR}")
+    (scenes / "alone.yaml").write_text(f"name: alone\nsensors:\n{REAR}")
+    return scenes
 
 
 def test_failure_of_a_radar_leaves_the_other_alone(torchcover, rigs):
     code, printed, _ = torchcover("evaluate", rigs / "radars.yaml", "--scenario", rigs / "yard.yaml", *SMALL)
     assert code == 0
     assert "when one sensor fails" in printed
-    given = {"num_frames": 3, "cell_m": 0.5, "num_rays": 2048}
-    both = evaluate(rigs / "radars.yaml", rigs / "yard.yaml", redundancy=True, **given)
-    alone = evaluate(rigs / "alone.yaml", rigs / "yard.yaml", **given)
+    settings = {"num_frames": 3, "cell_m": 0.5, "num_rays": 2048}
+    both = evaluate(rigs / "radars.yaml", rigs / "yard.yaml", redundancy=True, **settings)
+    alone = evaluate(rigs / "alone.yaml", rigs / "yard.yaml", **settings)
     for row, rest in zip(both.coverage.summary(), alone.coverage.summary(), strict=True):
         for key, number in rest.numbers.items():
             assert row.redundancy.failure_numbers["front"][key].value == pytest.approx(
                 number.value, rel=1e-12, nan_ok=True
             )
-    seen = [found.coverage.summary()[0].numbers["detection_0.4m"].value for found in (both, alone)]
-    assert seen[0] > seen[1]
+    rates = [result.coverage.summary()[0].numbers["detection_0.4m"].value for result in (both, alone)]
+    assert rates[0] > rates[1]
 
 
 def test_search_moves_a_radar(torchcover, rigs):

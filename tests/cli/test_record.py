@@ -1,4 +1,4 @@
-"""`torchcover record`: what it writes measures as the simulation does."""
+"""Command `record`: its recording gives the numbers of the simulation."""
 
 import json
 import signal
@@ -9,23 +9,22 @@ from torchcover import Coverage
 from torchcover.simulation import writing
 
 
-def test_recording_has_the_numbers_of_the_simulation(torchcover, worlds, tmp_path):
-    options = ("--scenario", worlds / "yard.yaml", "--num-frames", 3, "--seed", 2, "--num-rays", 1024)
+def test_recording_has_the_numbers_of_the_simulation(torchcover, scenes, tmp_path):
+    options = ("--scenario", scenes / "yard.yaml", "--num-frames", 3, "--seed", 2, "--num-rays", 1024)
     measured, read, recording = (tmp_path / name for name in ("simulated", "read", "recording"))
-    code, printed, told = torchcover("record", worlds / "both.yaml", *options, "--out", recording)
-    assert "record" in told
-    assert "3/3" in told  # the bar
+    code, printed, stderr = torchcover("record", scenes / "both.yaml", *options, "--out", recording)
+    assert "record" in stderr
+    assert "3/3" in stderr  # the bar
     assert (code, len(printed.splitlines())) == (0, 1)
     assert printed.startswith(f"Wrote 3 frames to {recording}; ")
     cell = ("--set", "cell_m=1", "--thresholds-m", 0.4, "--thresholds-m", 1)
-    assert (
-        torchcover("evaluate", worlds / "both.yaml", *options, *cell, "--set", "test_targets=none", "--out", measured)[0] == 0
-    )
+    without_targets = ("--set", "test_targets=none", "--out", measured)
+    assert torchcover("evaluate", scenes / "both.yaml", *options, *cell, *without_targets)[0] == 0
     code, printed, _ = torchcover("evaluate", "--frames", recording, *cell, "--out", read)
     assert code == 0
     assert "No test targets in the near field: a recording" in " ".join(printed.split())
-    code, _, told = torchcover("evaluate", "--frames", recording, "--set", "test_targets=child", "--out", read)
-    assert (code, "test_targets are for simulations" in told) == (2, True)
+    code, _, stderr = torchcover("evaluate", "--frames", recording, "--set", "test_targets=child", "--out", read)
+    assert (code, "test_targets are for simulations" in stderr) == (2, True)
     first, second = (Coverage.load(folder / "coverage.npz") for folder in (measured, read))
     assert first.average == second.average == "area"
     for name in ("radius", "detection", "observed_frames", "point_counts"):
@@ -37,10 +36,10 @@ def test_recording_has_the_numbers_of_the_simulation(torchcover, worlds, tmp_pat
     assert any(row["radius_m"] for row in rows[0])
 
 
-def test_record_rejects_invalid_options(torchcover, worlds, tmp_path):
+def test_record_rejects_invalid_options(torchcover, scenes, tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "a").write_text("")
-    low, both, yard = worlds / "low.yaml", worlds / "both.yaml", ("--scenario", worlds / "yard.yaml", "--num-frames", 1)
+    low, both, yard = scenes / "low.yaml", scenes / "both.yaml", ("--scenario", scenes / "yard.yaml", "--num-frames", 1)
     code, _, error = torchcover("record", low, *yard, "--out", tmp_path / "out")
     assert (code, len(error.splitlines())) == (2, 1)
     assert "not empty; a new or empty folder is needed" in error
@@ -49,17 +48,21 @@ def test_record_rejects_invalid_options(torchcover, worlds, tmp_path):
     assert "format kitti: a rig of one LiDAR is needed; both has front, rear; use the format folder" in error
 
 
-def test_interrupted_recording_is_resumed_but_not_evaluated(torchcover, worlds, monkeypatch):
-    out, step = worlds / "drive", writing.build_frame_record
-    command = ("record", worlds / "low.yaml", "--scenario", worlds / "yard.yaml", "--num-frames", 3, "--num-rays", 64)
-    monkeypatch.setattr(writing, "build_frame_record", lambda *given: (given[1] == 1 and signal.raise_signal(2)) or step(*given))
-    code, _, said = torchcover(*command, "--out", out)
+def test_interrupted_recording_is_resumed_but_not_evaluated(torchcover, scenes, monkeypatch):
+    out, step = scenes / "drive", writing.build_frame_record
+    command = ("record", scenes / "low.yaml", "--scenario", scenes / "yard.yaml", "--num-frames", 3, "--num-rays", 64)
+
+    def interrupt_at_frame_1(*args):
+        return (args[1] == 1 and signal.raise_signal(2)) or step(*args)
+
+    monkeypatch.setattr(writing, "build_frame_record", interrupt_at_frame_1)
+    code, _, stderr = torchcover(*command, "--out", out)
     assert code == 130
-    assert said.endswith("torchcover: 1 of 3 frames are kept; continue with --resume\ntorchcover: interrupted\n")
-    code, _, said = torchcover("evaluate", "--frames", out, "--set", "cell_m=8", "--out", worlds / "out")
+    assert stderr.endswith("torchcover: 1 of 3 frames are kept; continue with --resume\ntorchcover: interrupted\n")
+    code, _, stderr = torchcover("evaluate", "--frames", out, "--set", "cell_m=8", "--out", scenes / "out")
     assert code == 2
-    assert f"{out}: an incomplete recording with 1 frames; continue it with `torchcover record" in said
+    assert f"{out}: an incomplete recording with 1 frames; continue it with `torchcover record" in stderr
     monkeypatch.setattr(writing, "build_frame_record", step)
     code, printed, _ = torchcover(*command, "--out", out, "--resume")
     assert (code, printed.startswith("Wrote 3 frames to ")) == (0, True)
-    assert torchcover("evaluate", "--frames", out, "--set", "cell_m=8", "--out", worlds / "out")[0] == 0
+    assert torchcover("evaluate", "--frames", out, "--set", "cell_m=8", "--out", scenes / "out")[0] == 0

@@ -1,4 +1,4 @@
-"""`torchcover rig`: a simulated rig is found in what it recorded."""
+"""Command `rig`: the rig of a simulated recording is recovered."""
 
 import numpy as np
 import yaml
@@ -6,14 +6,14 @@ import yaml
 from torchcover import Rig
 
 
-def test_rig_of_a_simulated_recording_is_recovered(torchcover, worlds, tmp_path):
-    recording, found = tmp_path / "recording", tmp_path / "found.yaml"
-    few = ("--scenario", worlds / "yard.yaml", "--num-frames", 2, "--num-rays", 64)
-    torchcover("record", worlds / "both.yaml", *few, "--out", recording)
+def test_rig_of_a_simulated_recording_is_recovered(torchcover, scenes, tmp_path):
+    recording, rig_file = tmp_path / "recording", tmp_path / "rig.yaml"
+    few = ("--scenario", scenes / "yard.yaml", "--num-frames", 2, "--num-rays", 64)
+    torchcover("record", scenes / "both.yaml", *few, "--out", recording)
     code, printed, error = torchcover("rig", "--frames", recording)
     assert (code, error) == (0, "")
-    found.write_text(printed)
-    rig, true = Rig.load(found), Rig.load(worlds / "both.yaml")
+    rig_file.write_text(printed)
+    rig, true = Rig.load(rig_file), Rig.load(scenes / "both.yaml")
     assert rig.name == "recording"
     assert "7 rows (those that returned anything), 30 columns" in rig.description
     for lidar, of in zip(rig.sensors, true.sensors, strict=True):
@@ -23,18 +23,18 @@ def test_rig_of_a_simulated_recording_is_recovered(torchcover, worlds, tmp_path)
         assert (lidar.name, lidar.columns, lidar.horizontal_fov_deg) == (of.name, 30, 90.0)
         np.testing.assert_allclose(lidar.mount.to_matrix(), of.mount.to_matrix(), atol=1e-6)
         assert lidar.max_range_m <= 60.1
-    assert torchcover("evaluate", found, *few, "--set", "cell_m=1", "--out", tmp_path / "out")[0] == 0
+    assert torchcover("evaluate", rig_file, *few, "--set", "cell_m=1", "--out", tmp_path / "out")[0] == 0
     code, printed, _ = torchcover("rig", "--frames", recording, "--sensors", "rear", "--lidar", "rear=velodyne_vlp16")
     (sensor,) = yaml.safe_load(printed)["sensors"]
     assert (code, sensor["name"], sensor["model"]) == (0, "rear", "velodyne_vlp16")
 
 
-def test_rig_rejects_invalid_options(torchcover, worlds, tmp_path):
-    for options, told in (
+def test_rig_rejects_invalid_options(torchcover, scenes, tmp_path):
+    for options, message in (
         (("--frames", tmp_path / "none"), "none: no such recording"),
         (("--frames", tmp_path, "--lidar", "roof"), "--lidar roof: NAME=VALUE is needed, as in LIDAR_TOP="),
         (("--frames", tmp_path, "--set", "recording.format=bag"), "no such format of recordings; there are"),
     ):
         code, printed, error = torchcover("rig", *options)
         assert (code, printed, len(error.splitlines())) == (2, "", 1)
-        assert told in error
+        assert message in error

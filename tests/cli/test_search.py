@@ -1,4 +1,4 @@
-"""The command `search`."""
+"""Command `search`."""
 
 import sys
 from functools import partial
@@ -23,7 +23,7 @@ objectives: {near: {region: 20m}}
 
 @pytest.fixture
 def space(tmp_path, monkeypatch):
-    """A file; frames are surfaces, and one target is looked at in the end."""
+    """Search space whose frames are synthetic surfaces; the validation has one test target."""
     monkeypatch.setattr("torchcover.placement.validation.TARGETS", ("pole",))
     makes = lambda space, plan, seed, num_scenes: Surface(seed, num_scenes, plan.frames_per_scene)  # noqa: E731
     create_plan = partial(SearchPlan, make_frames=makes)
@@ -44,9 +44,9 @@ def test_search_prints_improvement_and_random_candidates(torchcover, space, tmp_
     assert (out / "best.yaml").exists()
     code, again, _ = torchcover("search", space, "--num-evaluations", 12, "--out", out, "--seed", 3, "--resume")
     assert again.splitlines()[-1] == last
-    code, _, said = torchcover("search", space, "--num-evaluations", 12, "--out", out, "--resume")
+    code, _, stderr = torchcover("search", space, "--num-evaluations", 12, "--out", out, "--resume")
     assert code == 2
-    assert "the journal belongs to another search: seed (3 there, 0 here)" in said
+    assert "the journal belongs to another search: seed (3 there, 0 here)" in stderr
 
 
 @pytest.mark.parametrize(
@@ -60,9 +60,9 @@ def test_search_prints_improvement_and_random_candidates(torchcover, space, tmp_
     ],
 )
 def test_user_error_is_one_line(torchcover, space, tmp_path, options, message):
-    code, _, said = torchcover("search", space, "--out", tmp_path / "found", *options)
+    code, _, stderr = torchcover("search", space, "--out", tmp_path / "found", *options)
     assert code == 2
-    assert message in said
+    assert message in stderr
     assert not (tmp_path / "found" / "summary.json").exists()
 
 
@@ -76,17 +76,17 @@ def test_user_error_is_one_line(torchcover, space, tmp_path, options, message):
 def test_unknown_objective_is_one_line(torchcover, tmp_path, objective, message):
     path = tmp_path / "space.yaml"
     path.write_text(SPACE.replace("region: 20m", objective))
-    code, _, said = torchcover("search", path, "--out", tmp_path / "found")
+    code, _, stderr = torchcover("search", path, "--out", tmp_path / "found")
     assert code == 2
-    assert message in said
-    assert said.count("\n") == 1
+    assert message in stderr
+    assert stderr.count("\n") == 1
 
 
 @pytest.mark.parametrize("options", [("--budget", "5s"), ("--num-evaluations", "3"), ("--resume",)])
 def test_sensor_selection_rejects_a_budget(torchcover, tmp_path, options):
-    code, _, said = torchcover("search", CHOICE, "--out", tmp_path / "found", *options)
+    code, _, stderr = torchcover("search", CHOICE, "--out", tmp_path / "found", *options)
     assert code == 2
-    assert f"torchcover: {options[0]}: has no effect, because all candidates of this file are evaluated" in said
+    assert f"torchcover: {options[0]}: has no effect, because all candidates of this file are evaluated" in stderr
 
 
 def test_budgets_are_parsed_to_seconds():
@@ -95,6 +95,6 @@ def test_budgets_are_parsed_to_seconds():
 
 def test_missing_optuna_is_one_line(torchcover, space, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "optuna", None)
-    code, _, said = torchcover("search", space, "--num-evaluations", 3, "--out", tmp_path / "found")
+    code, _, stderr = torchcover("search", space, "--num-evaluations", 3, "--out", tmp_path / "found")
     assert code == 2
-    assert said == "torchcover: a placement search needs Optuna: pip install 'torchcover[search]'\n"
+    assert stderr == "torchcover: a placement search needs Optuna: pip install 'torchcover[search]'\n"

@@ -1,4 +1,4 @@
-"""`torchcover show`: it finds what is meant, and draws it where it is."""
+"""Command `show`: figures of rigs, scenarios and vehicles."""
 
 from functools import partial
 from itertools import pairwise
@@ -17,7 +17,7 @@ from torchcover.simulation import Rig, Scenario, list_builtin_names
 
 @pytest.fixture
 def drawn(monkeypatch):
-    """What was drawn: the arguments of the last call."""
+    """Arguments of the last plotting call."""
     calls: dict = {}
     for name in ("plot_rig", "plot_vehicle", "plot_scene", "plot_depth_images"):
         draw = getattr(scene_figures, name)
@@ -29,13 +29,13 @@ def drawn(monkeypatch):
     return calls
 
 
-def test_rig_is_plotted_on_the_ego_vehicle(torchcover, worlds, drawn):
+def test_rig_is_plotted_on_the_ego_vehicle(torchcover, scenes, drawn):
     code, printed, _ = torchcover(
-        "show", worlds / "both.yaml", "--scenario", worlds / "yard.yaml", "--out", worlds / "new" / "out"
+        "show", scenes / "both.yaml", "--scenario", scenes / "yard.yaml", "--out", scenes / "new" / "out"
     )
     assert code == 0
     assert "both.png" in printed
-    assert min(imread(worlds / "new" / "out" / "both.png").shape[:2]) > 500
+    assert min(imread(scenes / "new" / "out" / "both.png").shape[:2]) > 500
     vertices_m, _, sensors = drawn["args"]
     assert np.ptp(vertices_m, axis=0).tolist() == [4.0, 2.0, 1.0]
     assert [sensor.name for sensor in sensors] == ["front", "rear"]
@@ -44,18 +44,18 @@ def test_rig_is_plotted_on_the_ego_vehicle(torchcover, worlds, drawn):
     assert sensors[1].mask_directions(np.array([[-1.0, 0.0, -0.1], [1.0, 0.0, -0.1]])).tolist() == [True, False]
 
 
-def test_scenario_is_plotted_in_the_vehicle_frame(torchcover, worlds, drawn):
+def test_scenario_is_plotted_in_the_vehicle_frame(torchcover, scenes, drawn):
     code, _, _ = torchcover(
-        "show", worlds / "yard.yaml", "--rig", worlds / "low.yaml", "--frame-index", 3, "--out", worlds
+        "show", scenes / "yard.yaml", "--rig", scenes / "low.yaml", "--frame-index", 3, "--out", scenes
     )
     assert code == 0
-    assert min(imread(worlds / "yard.png").shape[:2]) > 500
+    assert min(imread(scenes / "yard.png").shape[:2]) > 500
     ahead, far = drawn["actors"]
     assert (ahead.category, far.category) == ("box", "far")
     np.testing.assert_allclose(sorted(ahead.outline_m[:, 0].round(6)), [18.0, 18.0, 22.0, 22.0])
     np.testing.assert_allclose(sorted(ahead.outline_m[:, 1].round(6)), [4.0, 4.0, 6.0, 6.0])
     assert drawn["title"] == "yard, frame 3"
-    # The rig saw the actor, where it is drawn.
+    # Sensor points lie on the plotted actor.
     sensor = drawn["sensor_points"]
     on_actor = sensor[sensor[:, 2] > 0.1]
     assert len(on_actor)
@@ -66,26 +66,26 @@ def test_scenario_is_plotted_in_the_vehicle_frame(torchcover, worlds, drawn):
 
 @pytest.mark.filterwarnings("default")
 @pytest.mark.parametrize(
-    ("size", "told", "doubt"),
+    ("size", "message", "warning"),
     [
         ("4.5 1.8 1.5", "4.50 m long (x, forward), 1.80 m wide (y), 1.50 m high (z, up)", ""),
         ("1.8 4.5 1.5", "1.80 m long", "wider than long; a vehicle's x axis points forward"),
         ("83.7 30 25", "83.70 m long", "far too large for a vehicle on a road; a file in millimeters"),
     ],
 )
-def test_mesh_prints_size_and_warnings(torchcover, tmp_path, size, told, doubt):
+def test_mesh_prints_size_and_warnings(torchcover, tmp_path, size, message, warning):
     trimesh.creation.box([float(number) for number in size.split()]).export(tmp_path / "car.obj")
     (tmp_path / "car.yaml").write_text("name: car\nparts: [{name: body, shape: {type: mesh, path: car.obj}}]\n")
     for name in ("car.obj", "car.yaml"):
-        code, printed, warned = torchcover("show", tmp_path / name, "--out", tmp_path)
+        code, printed, stderr = torchcover("show", tmp_path / name, "--out", tmp_path)
         assert code == 0
-        assert told in printed
-        half_m = float(size.split()[2]) / 2  # a box of trimesh's is about the origin
+        assert message in printed
+        half_m = float(size.split()[2]) / 2  # trimesh centers a box at the origin
         moved = f"Moved by x +0.00, y +0.00, z {half_m:+.2f} m: mounting positions are relative to the ground"
         assert moved in " ".join(printed.split())
         assert (tmp_path / "car.png").is_file()
-        assert doubt in warned
-        assert bool(warned) == bool(doubt)
+        assert warning in stderr
+        assert bool(stderr) == bool(warning)
     assert "Moved" not in torchcover("show", "suv", "--out", tmp_path)[1]
     code, _, error = torchcover("show", tmp_path / "none.obj")
     assert code == 2
@@ -184,15 +184,15 @@ def test_mount_region_outside_the_body_is_named(torchcover, tmp_path):
     assert "mount region 'lid': at x = 1.545 m" in error
 
 
-def test_depth_images_belong_to_the_chosen_frame(torchcover, worlds, drawn):
-    """A wall fills the left half of the image: from the bumper 20 m ahead at first, 15 m when the frame is taken."""
-    (worlds / "cameras.yaml").write_text(
+def test_depth_images_belong_to_the_chosen_frame(torchcover, scenes, drawn):
+    """A wall fills the left half of the image: 20 m ahead of the bumper in the first frame, 15 m in the chosen one."""
+    (scenes / "cameras.yaml").write_text(
         "name: cameras\nsensors:\n"
         "  - {type: camera, name: a, mount: {x_m: 2, z_m: 1}, width: 40, height: 20, fov_deg: 90, max_range_m: 60}\n"
         "  - {type: camera, name: b, mount: {x_m: 2, z_m: 1}, width: 40, height: 40, stride: 2, fx: 20, fy: 20,"
         " cx: 19.5, cy: 19.5, lens: brown_conrady, coefficients: [-0.5, 0, 0, 0], max_range_m: 60}\n"
     )
-    (worlds / "wall.yaml").write_text(
+    (scenes / "wall.yaml").write_text(
         "name: wall\n"
         "ego: {shape: {type: box, size_m: [3.8, 2, 0.5]}, trajectory: drive.csv}\n"
         "bodies:\n"
@@ -200,13 +200,13 @@ def test_depth_images_belong_to_the_chosen_frame(torchcover, worlds, drawn):
         "  - {name: wall, shape: {type: box, size_m: [1, 50, 3]}, poses: [{x_m: 22.5, y_m: 25}]}\n"
         "duration_s: 1\ntime_step_s: 0.5\n"
     )
-    (worlds / "drive.csv").write_text("t,x,y,z,roll,pitch,yaw\n0,0,0,0,0,0,0\n0.5,2.5,0,0,0,0,0\n1,5,0,0,0,0,0\n")
+    (scenes / "drive.csv").write_text("t,x,y,z,roll,pitch,yaw\n0,0,0,0,0,0,0\n0.5,2.5,0,0,0,0,0\n1,5,0,0,0,0,0\n")
     code, printed, _ = torchcover(
-        "show", worlds / "cameras.yaml", "--scenario", worlds / "wall.yaml", "--frame-index", 2, "--out", worlds
+        "show", scenes / "cameras.yaml", "--scenario", scenes / "wall.yaml", "--frame-index", 2, "--out", scenes
     )
     assert code == 0
     assert "cameras_depth.png" in printed
-    assert imread(worlds / "cameras_depth.png").shape[1] > 500
+    assert imread(scenes / "cameras_depth.png").shape[1] > 500
     (images,) = drawn["args"]
     assert {name: image.shape for name, image in images.items()} == {"a": (20, 40), "b": (20, 20)}
     # One row above the middle the rays rise by half a pixel of 20 a metre.
@@ -218,11 +218,11 @@ def test_depth_images_belong_to_the_chosen_frame(torchcover, worlds, drawn):
 
 
 @pytest.mark.parametrize("arguments", [["three_cameras", "--scenario"], []])
-def test_scene_is_built_once(torchcover, worlds, monkeypatch, arguments):
+def test_scene_is_built_once(torchcover, scenes, monkeypatch, arguments):
     built = []
     build = Scenario.build_scene
     monkeypatch.setattr(Scenario, "build_scene", lambda *args: built.append(args) or build(*args))
-    assert torchcover("show", *arguments, worlds / "yard.yaml", "--out", worlds)[0] == 0
+    assert torchcover("show", *arguments, scenes / "yard.yaml", "--out", scenes)[0] == 0
     assert len(built) == 1
 
 
@@ -284,20 +284,20 @@ def test_ambiguous_name_asks_for_the_file(torchcover, monkeypatch):
 
 
 @pytest.mark.filterwarnings("default")
-def test_warning_is_printed_once_as_one_line(torchcover, worlds):
-    """Two actors of one open mesh in millimetres."""
-    mesh = Scenario.load(worlds / "yard.yaml").ego.shape.build_mesh()
+def test_warning_is_printed_once_as_one_line(torchcover, scenes):
+    """Two actors share an open mesh in millimeters."""
+    mesh = Scenario.load(scenes / "yard.yaml").ego.shape.build_mesh()
     corners = "".join(f"v {x * 1000} {y * 1000} {z * 1000}\n" for x, y, z in mesh.vertices_m)
-    (worlds / "car.obj").write_text(corners + "".join(f"f {a} {b} {c}\n" for a, b, c in mesh.faces[1:] + 1))
+    (scenes / "car.obj").write_text(corners + "".join(f"f {a} {b} {c}\n" for a, b, c in mesh.faces[1:] + 1))
     shape = "shape: {type: mesh, path: car.obj}"
-    (worlds / "yard.yaml").write_text(
+    (scenes / "yard.yaml").write_text(
         "name: yard\n"
         "ego: {shape: {type: box, size_m: [4, 2, 1]}}\n"
         "bodies: [{name: ground, shape: {type: plane, size_m: [400, 400]}}]\n"
         f"actors: [{{name: a, category: car, {shape}, pose: {{x_m: 9000}}}}, {{name: b, category: car, {shape},"
         " pose: {x_m: -9000}}]\n"
     )
-    code, _, error = torchcover("show", worlds / "yard.yaml", "--rig", worlds / "low.yaml", "--out", worlds)
+    code, _, error = torchcover("show", scenes / "yard.yaml", "--rig", scenes / "low.yaml", "--out", scenes)
     assert code == 0
     lines = error.splitlines()
     assert all(line.startswith("torchcover: warning: ") for line in lines)
@@ -309,10 +309,10 @@ def test_warning_is_printed_once_as_one_line(torchcover, worlds):
     assert len(lines) == 4
 
 
-def test_rig_keeps_its_name_in_a_renamed_file(worlds):
-    (worlds / "renamed.yaml").write_text((worlds / "both.yaml").read_text())
-    name = Rig.load(worlds / "both.yaml").name
-    assert [load_named_rig(worlds / "renamed.yaml").name] == make_rig_names([worlds / "renamed.yaml"]) == [name]
+def test_rig_keeps_its_name_in_a_renamed_file(scenes):
+    (scenes / "renamed.yaml").write_text((scenes / "both.yaml").read_text())
+    name = Rig.load(scenes / "both.yaml").name
+    assert [load_named_rig(scenes / "renamed.yaml").name] == make_rig_names([scenes / "renamed.yaml"]) == [name]
 
 
 def test_description_of_a_rig_is_printed(torchcover, tmp_path):
@@ -320,31 +320,31 @@ def test_description_of_a_rig_is_printed(torchcover, tmp_path):
     assert (code, " ".join(printed.split())[:60]) == (0, Rig.load("nuscenes").description[:60])
 
 
-def test_animation_shows_the_following_frames(torchcover, worlds, monkeypatch):
+def test_animation_shows_the_following_frames(torchcover, scenes, monkeypatch):
     select_frames = partial(show.select_animation_frames, duration_s=0.3)
     monkeypatch.setattr(show, "select_animation_frames", select_frames)
     code, printed, _ = torchcover(
         "show",
-        worlds / "yard.yaml",
+        scenes / "yard.yaml",
         "--rig",
-        worlds / "low.yaml",
+        scenes / "low.yaml",
         "--animation",
-        worlds / "new" / "a.gif",
+        scenes / "new" / "a.gif",
         "--frame-index",
         1,
     )
     assert (code, "a.gif" in printed) == (0, True)
-    with Image.open(worlds / "new" / "a.gif") as film:
-        seen = []
-        for number in range(film.n_frames):
-            film.seek(number)
-            seen.append(np.asarray(film.convert("RGB")))
-        pace_s = film.info["duration"] / 1000
-    time_step_s = Scenario.load(worlds / "yard.yaml").effective_time_step_s
+    with Image.open(scenes / "new" / "a.gif") as animation:
+        images = []
+        for number in range(animation.n_frames):
+            animation.seek(number)
+            images.append(np.asarray(animation.convert("RGB")))
+        pace_s = animation.info["duration"] / 1000
+    time_step_s = Scenario.load(scenes / "yard.yaml").effective_time_step_s
     frame_indices = select_frames(time_step_s, 1)
-    assert len(seen) == len(frame_indices) >= 2
+    assert len(images) == len(frame_indices) >= 2
     assert pace_s == pytest.approx(frame_indices.step * time_step_s)
-    assert all((one != other).any() for one, other in pairwise(seen))
+    assert all((first != second).any() for first, second in pairwise(images))
 
 
 @pytest.mark.parametrize(
@@ -355,31 +355,31 @@ def test_animation_shows_the_following_frames(torchcover, worlds, monkeypatch):
         (("yard.yaml", "--animation", "a.mp4"), ".mp4 needs the program ffmpeg, which is missing; write a .gif"),
     ],
 )
-def test_invalid_animation_file_is_rejected(options, message, torchcover, worlds, monkeypatch):
+def test_invalid_animation_file_is_rejected(options, message, torchcover, scenes, monkeypatch):
     monkeypatch.setenv("PATH", "")
-    name, *others = options
-    code, _, told = torchcover("show", worlds / name, *others)
+    name, *arguments = options
+    code, _, stderr = torchcover("show", scenes / name, *arguments)
     assert code == 2
-    assert message in told
+    assert message in stderr
 
 
 @pytest.mark.parametrize("at_m", [50.0, 160.8])
-def test_height_above_ground_follows_a_slope(at_m, torchcover, worlds, drawn):
+def test_height_above_ground_follows_a_slope(at_m, torchcover, scenes, drawn):
     slope = np.deg2rad(4.0)
-    # The second piece of the slope begins where the picture ends, but below what still reaches into that.
+    # The second part of the slope begins at the edge of the picture, below bodies that reach into the picture.
     grounds, kerb = (
         ", ".join(f"{{x_m: {x * np.cos(slope)}, z_m: {x * np.sin(slope)}, pitch_deg: -4}}" for x in along_m)
         for along_m in ([-39.5, 360.5], [at_m])
     )
-    (worlds / "slope.yaml").write_text(
+    (scenes / "slope.yaml").write_text(
         "name: slope\nego: {shape: {type: box, size_m: [4, 2, 1]}, pose: {z_m: 0.2}}\nbodies:\n"
         f"  - {{name: ground, shape: {{type: plane, size_m: [400, 400]}}, poses: [{grounds}]}}\n"
         f"  - {{name: kerb, shape: {{type: box, size_m: [9, 5, 1]}}, poses: [{kerb}]}}\n"
     )
-    code, _, _ = torchcover("show", worlds / "slope.yaml", "--rig", worlds / "low.yaml", "--out", worlds)
+    code, _, _ = torchcover("show", scenes / "slope.yaml", "--rig", scenes / "low.yaml", "--out", scenes)
     assert code == 0
-    standing = drawn["static_faces"]
-    assert np.abs(standing.triangles_m[..., 0] - at_m).max() < 5.0  # the slope itself is no scenery
-    # The last two faces of a box are its top, the two before them its bottom, which lies on the slope.
-    np.testing.assert_allclose(standing.height_m[-4:], [0, 0, 1.0024, 1.0024], atol=1e-3)
-    assert standing.height_m.max() < 1.5  # and not 4.5, as above the ego
+    static_faces = drawn["static_faces"]
+    assert np.abs(static_faces.triangles_m[..., 0] - at_m).max() < 5.0  # the slope is ground, not scenery
+    # The last two faces of a box are its top; the two faces before are its bottom, which lies on the slope.
+    np.testing.assert_allclose(static_faces.height_m[-4:], [0, 0, 1.0024, 1.0024], atol=1e-3)
+    assert static_faces.height_m.max() < 1.5  # 4.5 m above the ego vehicle

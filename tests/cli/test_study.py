@@ -1,4 +1,4 @@
-"""`torchcover study`: error against run time."""
+"""Command `study`: error against run time."""
 
 import json
 import os
@@ -11,10 +11,10 @@ from torchcover.cli import app
 
 
 def test_study_prints_tables_and_recommendations(torchcover, tmp_path, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "200")  # so that no heading is folded
+    monkeypatch.setenv("COLUMNS", "200")  # wide enough for every heading on one line
 
     class Timed:
-        """The command that is timed, in this process, which has imported all that it needs."""
+        """Timed command, run in this process because its imports are loaded."""
 
         pid = os.getpid()
 
@@ -42,14 +42,14 @@ def test_study_prints_tables_and_recommendations(torchcover, tmp_path, monkeypat
     monkeypatch.setattr("torchcover.evaluation.study.subprocess", SimpleNamespace(Popen=Timed, DEVNULL=None, PIPE=None))
     out = tmp_path / "out"
     options = ["--num-rays", "256", "--set", "cell_m=4", "--num-frames", "8"]
-    code, text, complaints = torchcover("study", "front_roof_32", "--scenario", "courtyard", *options, "--out", out)
-    assert code == 0, complaints
+    code, text, stderr = torchcover("study", "front_roof_32", "--scenario", "courtyard", *options, "--out", out)
+    assert code == 0, stderr
     assert "…" not in text
     for words in ("as given", "error after 8", "Standard error of 1 percentage point for every detection rate"):
         assert words in text
     assert (out / "work_precision.png").read_bytes()[:4] == b"\x89PNG"
     study = json.loads((out / "summary.json").read_text())
-    assert [each["options"] for each in study["trials"]] == [""]
+    assert [trial["options"] for trial in study["trials"]] == [""]
     assert codes == [0]
 
 
@@ -63,13 +63,13 @@ def test_study_prints_tables_and_recommendations(torchcover, tmp_path, monkeypat
     ],
 )
 def test_user_error_is_one_line(torchcover, tmp_path, options, message):
-    code, _, complaints = torchcover("study", "front_roof_32", *options, "--num-frames", "8", "--out", tmp_path / "out")
+    code, _, stderr = torchcover("study", "front_roof_32", *options, "--num-frames", "8", "--out", tmp_path / "out")
     assert code == 2
-    assert message in complaints
-    assert len(complaints.strip().splitlines()) == 1
+    assert message in stderr
+    assert len(stderr.strip().splitlines()) == 1
 
 
 def test_study_rejects_distributed_runs(torchcover, monkeypatch, tmp_path):
     monkeypatch.setenv("WORLD_SIZE", "2")
-    code, _, said = torchcover("study", "front_roof_32", "--out", tmp_path / "out")
-    assert (code, "run it without torchrun" in said) == (2, True)
+    code, _, stderr = torchcover("study", "front_roof_32", "--out", tmp_path / "out")
+    assert (code, "run it without torchrun" in stderr) == (2, True)

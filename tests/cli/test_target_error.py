@@ -1,4 +1,4 @@
-"""`--target-error`: a run that ends when it is good enough."""
+"""Option `--target-error`: a run stops at a standard error."""
 
 import json
 import re
@@ -11,7 +11,7 @@ from torchcover import Coverage
 
 @pytest.fixture
 def long_recording(tmp_path):
-    """200 frames of two reference points in every step, with random radii."""
+    """Recording of 200 frames with two reference points and random radii."""
     folder = tmp_path / "recording"
     random = np.random.default_rng(0)
     for source in ("sensor", "reference"):
@@ -38,9 +38,7 @@ def test_evaluate_stops_at_the_target_error(torchcover, long_recording, tmp_path
     assert re.search(r"0\.\d+  \[0\.\d+, 0\.\d+\]", printed)
 
 
-def test_unreached_target_error_reports_the_needed_frames(
-    torchcover, long_recording, tmp_path
-):
+def test_unreached_target_error_reports_the_needed_frames(torchcover, long_recording, tmp_path):
     arguments = ["--frames", long_recording, "--set", "cell_m=4", "--out", tmp_path / "out", "--num-frames", 40]
     code, printed, _ = torchcover("evaluate", *arguments, "--target-error", "1e-3m")
     assert code == 0
@@ -52,10 +50,10 @@ def test_unreached_target_error_reports_the_needed_frames(
     assert Coverage.load(tmp_path / "out" / "coverage.npz").counts["num_frames"] == 40
 
 
-def test_compare_stops_when_differences_reach_the_target(torchcover, worlds):
+def test_compare_stops_when_differences_reach_the_target(torchcover, scenes):
     options = [
         "--scenario",
-        worlds / "yard.yaml",
+        scenes / "yard.yaml",
         "--set",
         "cell_m=4",
         "--thresholds-m",
@@ -63,12 +61,12 @@ def test_compare_stops_when_differences_reach_the_target(torchcover, worlds):
         "--num-rays",
         512,
         "--out",
-        worlds / "out",
+        scenes / "out",
     ]
-    rigs = [worlds / "low.yaml", worlds / "both.yaml"]
+    rigs = [scenes / "low.yaml", scenes / "both.yaml"]
     code, printed, _ = torchcover("compare", *rigs, *options, "--target-error", "50m")
     assert code == 0
     assert "Target error reached after 67 frames." in printed
     assert "Difference to low: mean blind spot radius (m)" in printed
-    target = json.loads((worlds / "out" / "summary.json").read_text())["target_error"]
+    target = json.loads((scenes / "out" / "summary.json").read_text())["target_error"]
     assert {number["rig"] for number in target["numbers"]} == {"low", "both", "both minus low"}

@@ -1,4 +1,4 @@
-"""`torchcover targets`: it says what is seen."""
+"""Command `targets`: visibility of a test target."""
 
 import json
 
@@ -15,20 +15,20 @@ sensors:
 
 
 @pytest.fixture
-def call(torchcover, worlds):
-    (worlds / "dome.yaml").write_text(RIG)
+def call(torchcover, scenes):
+    (scenes / "dome.yaml").write_text(RIG)
 
     def run(*arguments):
-        return torchcover("targets", worlds / "dome.yaml", RASTER, "--out", worlds / "out", *arguments)
+        return torchcover("targets", scenes / "dome.yaml", RASTER, "--out", scenes / "out", *arguments)
 
     return run
 
 
-def test_target_map_is_printed_and_written(call, worlds):
-    ended, printed, error = call("--target", "adult", "--scenario", worlds / "yard.yaml")
+def test_target_map_is_printed_and_written(call, scenes):
+    ended, printed, error = call("--target", "adult", "--scenario", scenes / "yard.yaml")
     assert (ended, error) == (0, "")
     assert "dome: visibility of adult" in " ".join(printed.split())
-    record = json.loads((worlds / "out" / "summary.json").read_text())
+    record = json.loads((scenes / "out" / "summary.json").read_text())
     assert list(record["files"]) == ["targets.csv", "targets.npz", "report.html", "targets.png"]
 
 
@@ -42,10 +42,10 @@ def test_target_map_is_printed_and_written(call, worlds):
         (["--detection-points", "0"], "--detection-points"),
     ],
 )
-def test_user_error_is_one_line_with_code_2(call, worlds, monkeypatch, arguments, message):
-    monkeypatch.chdir(worlds)
+def test_user_error_is_one_line_with_code_2(call, scenes, monkeypatch, arguments, message):
+    monkeypatch.chdir(scenes)
     code, printed, error = call(*arguments)
     assert (code, printed) == (2, "")
     assert message in error
     assert error.count("\n") == 1
-    assert not (worlds / "out").exists()
+    assert not (scenes / "out").exists()

@@ -1,4 +1,4 @@
-"""`--vehicle`: what carries the rig, in numbers, files and titles."""
+"""Option `--vehicle`: host vehicle in numbers, files and titles."""
 
 import json
 import warnings
@@ -11,13 +11,13 @@ FREE = "name: free\nego: {pose: {}}\nbodies: [{name: ground, shape: {type: plane
 
 
 @pytest.fixture
-def free(worlds):
-    """A scenario that leaves the vehicle open; `low` is on a sedan, `both` on a van."""
-    (worlds / "free.yaml").write_text(FREE)
+def free(scenes):
+    """Scenario without ego vehicle; rig `low` names a sedan, rig `both` a van."""
+    (scenes / "free.yaml").write_text(FREE)
     for name, vehicle in (("low", "sedan"), ("both", "van")):
-        path = worlds / f"{name}.yaml"
+        path = scenes / f"{name}.yaml"
         path.write_text(f"vehicle: {vehicle}\n{path.read_text()}".replace("2.5", "3.1"))
-    return worlds
+    return scenes
 
 
 def run(torchcover, free, command, *arguments):
@@ -57,7 +57,7 @@ def test_comparison_needs_one_vehicle_for_all_rigs(torchcover, free):
 
 def test_figures_and_recordings_use_the_vehicle(torchcover, free, monkeypatch):
     titles = []
-    monkeypatch.setattr(scene_figures, "plot_rig", lambda *_, **told: titles.append(told) or Blank())
+    monkeypatch.setattr(scene_figures, "plot_rig", lambda *_, **options: titles.append(options) or Blank())
     shown = ("show", free / "low.yaml", "--scenario", free / "free.yaml", "--vehicle", "suv", "--out", free)
     assert torchcover(*shown)[0] == 0
     assert titles[0]["subtitle"] == "on suv in free, 4.90 x 1.94 x 1.63 m"

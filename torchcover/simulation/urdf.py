@@ -312,17 +312,19 @@ def _shape_mesh(shape: Element, link: str, meshes: Mapping[str, Mesh]) -> Mesh:
         return mesh._replace(vertices_m=mesh.vertices_m * scale, faces=faces)
     if shape.tag == "box":
         x, y, height_m = read_numbers(shape.get("size"), 3, "box size")
-        return _centered(Box(type="box", size_m=(x, y, height_m)).build_mesh(), height_m)
+        return _centered(Box.model_validate({"type": "box", "size_m": (x, y, height_m)}).build_mesh(), height_m)
     if shape.tag not in ("cylinder", "capsule", "sphere"):
         raise ValueError(
             f"link {link!r}: geometry <{shape.tag}> cannot be applied; use box, cylinder, capsule, sphere or mesh"
         )
     (radius_m,) = read_numbers(shape.get("radius"), 1, f"{shape.tag} radius")
-    ball = _centered(Ellipsoid(type="ellipsoid", size_m=(2 * radius_m,) * 3).build_mesh(), 2 * radius_m)
+    ellipsoid = Ellipsoid.model_validate({"type": "ellipsoid", "size_m": (2 * radius_m,) * 3})
+    ball = _centered(ellipsoid.build_mesh(), 2 * radius_m)
     if shape.tag == "sphere":
         return ball
     (length_m,) = read_numbers(shape.get("length"), 1, f"{shape.tag} length")
-    tube = _centered(Cylinder(type="cylinder", radius_m=radius_m, height_m=length_m).build_mesh(), length_m)
+    cylinder = Cylinder.model_validate({"type": "cylinder", "radius_m": radius_m, "height_m": length_m})
+    tube = _centered(cylinder.build_mesh(), length_m)
     if shape.tag == "cylinder":
         return tube
     ends_m = (-length_m / 2, length_m / 2)
