@@ -1,4 +1,4 @@
-"""No run is lost: whatever ends it, it goes on from its checkpoint to the same bits."""
+"""Checkpoints: an interrupted run continues to a result that is equal to the last bit."""
 
 import errno
 import json
@@ -23,12 +23,12 @@ from torchcover.evaluation.config import DESCRIPTIONS
 from torchcover.evaluation.task import NOT_IN_IDENTITY
 from torchcover.files import BadFileError
 
-STEPS = 16
+NUM_FRAMES = 16
 SETTINGS = {"cell_m": 8.0, "aggregations": (Maximum(), FrameQuantiles((0.5,)))}
 
 
-class Drive(FrameDataset):
-    """A source of frames, some of which may be bad; slower than nothing, so that a kill finds it at work."""
+class SyntheticFrames(FrameDataset):
+    """Source of frames, some of which may be bad; a delay allows a test to kill it during a frame."""
 
     rigs = ("a",)
     sensors = {}  # noqa: RUF012
@@ -42,7 +42,7 @@ class Drive(FrameDataset):
         self.frame_of, self.bad, self.content, self.delay_s = frame_of, bad, {"frames": content}, delay_s
 
     def __len__(self):
-        return STEPS
+        return NUM_FRAMES
 
     def __getitem__(self, index):
         time.sleep(self.delay_s)
@@ -51,16 +51,16 @@ class Drive(FrameDataset):
         return self.frame_of(index)
 
 
-class Seen:
-    """An observer whose state is no tensor; it may do something at a frame."""
+class RecordingObserver:
+    """Observer with the names of its frames; it may call a function at a frame."""
 
-    def __init__(self, at=None, then=lambda: None):
-        self.names, self.at, self.then = [], at, then
+    def __init__(self, call_index=None, call=lambda: None):
+        self.names, self.call_index, self.call = [], call_index, call
 
     def update(self, frame):
         self.names.append(frame.name)
-        if frame.index == self.at:
-            self.then()
+        if frame.index == self.call_index:
+            self.call()
 
     def compute(self):
         return tuple(self.names)
@@ -81,24 +81,30 @@ def path(tmp_path):
 
 
 @pytest.fixture
-def _at_every_step(monkeypatch):
+def _write_every_frame(monkeypatch):
     monkeypatch.setattr(checkpoint.CheckpointManager, "params", checkpoint.CheckpointParams(0.0, 1e9))
 
 
-def measured(source, path=None, *, seen=None, **settings):
-    settings = {"frames": source, "observers": {"seen": seen or Seen()}, "checkpoint": path, **SETTINGS, **settings}
+def evaluate(source, path=None, *, recorder=None, **settings):
+    settings = {
+        "frames": source,
+        "observers": {"recorder": recorder or RecordingObserver()},
+        "checkpoint": path,
+        **SETTINGS,
+        **settings,
+    }
     return torchcover.evaluate("a", **settings)
 
 
-def cut_short(*args, **settings):
-    """The same, of a run that is ended before its time."""
+def evaluate_interrupted(*args, **settings):
+    """Run an evaluation that an observer interrupts."""
     with pytest.warns(RuntimeWarning, match="The run was cut short after"):
-        return measured(*args, **settings)
+        return evaluate(*args, **settings)
 
 
-def bits(result):
-    """All that was measured."""
-    found = {
+def collect_bits(result):
+    """Collect all results, tensors as bytes."""
+    results = {
         "observed": result.observer_results,
         "num_frames": result.run.num_frames,
         "counts": dict(result.run.counts),
@@ -112,79 +118,83 @@ def bits(result):
             "points": coverage.point_counts,
             "probed": coverage.observed_frames,
         }.items():
-            found[f"{name} {key}"] = tensor.numpy().tobytes()
-    return {**found, "skipped_frames": tuple(result.run.skipped_frames)}
+            results[f"{name} {key}"] = tensor.numpy().tobytes()
+    return {**results, "skipped_frames": tuple(result.run.skipped_frames)}
 
 
-def stamp(path):
-    """Another one for every file that is put there."""
+def identify_file(path):
+    """Identify a file by its inode and time, which differ for every replacement."""
     return (path.stat().st_ino, path.stat().st_mtime_ns) if path.exists() else None
 
 
-def press():
+def press_ctrl_c():
     os.kill(os.getpid(), signal.SIGINT)
 
 
 @pytest.mark.parametrize("workers", [0, 2])
 def test_run_resumes_after_ctrl_c_bit_for_bit(frame_of, path, workers):
-    whole = bits(measured(Drive(frame_of, {7}), skip_bad_frames=True))
-    for at in (0, 9, STEPS - 1):  # one run: it goes on twice
-        part = cut_short(Drive(frame_of, {7}), path, seen=Seen(at, press), skip_bad_frames=True, num_workers=workers)
+    whole = collect_bits(evaluate(SyntheticFrames(frame_of, {7}), skip_bad_frames=True))
+    for index in (0, 9, NUM_FRAMES - 1):  # the run continues twice
+        part = evaluate_interrupted(
+            SyntheticFrames(frame_of, {7}),
+            path,
+            recorder=RecordingObserver(index, press_ctrl_c),
+            skip_bad_frames=True,
+            num_workers=workers,
+        )
         assert isinstance(part.run.failure, KeyboardInterrupt)
-        assert len(part.observer_results["seen"]) == part.run.num_frames == at + 1 - (at > 7)
-    assert bits(measured(Drive(frame_of, {7}), path, skip_bad_frames=True)) == whole
+        assert len(part.observer_results["recorder"]) == part.run.num_frames == index + 1 - (index > 7)
+    assert collect_bits(evaluate(SyntheticFrames(frame_of, {7}), path, skip_bad_frames=True)) == whole
 
 
-@pytest.mark.usefixtures("_at_every_step")
+@pytest.mark.usefixtures("_write_every_frame")
 def test_run_resumes_after_kills_bit_for_bit(frame_of, path):
-    whole, chance, kills = bits(measured(Drive(frame_of))), random.Random(0), 0
+    whole, rng, kills = collect_bits(evaluate(SyntheticFrames(frame_of))), random.Random(0), 0
     for _ in range(5):
-        before = stamp(path)
+        before = identify_file(path)
         child = os.fork()
         if not child:
             torch.set_num_threads(1)
-            measured(Drive(frame_of), path)
+            evaluate(SyntheticFrames(frame_of), path)
             os._exit(0)
         deadline_s = time.monotonic() + 60
-        while stamp(path) == before and time.monotonic() < deadline_s:
+        while identify_file(path) == before and time.monotonic() < deadline_s:
             time.sleep(0.001)
-        time.sleep(chance.uniform(0.0, 0.02))
+        time.sleep(rng.uniform(0.0, 0.02))
         os.kill(child, signal.SIGKILL)
         kills += os.waitpid(child, 0)[1] == signal.SIGKILL
-        assert 0 < read_header(path)["run"]["num_frames"] <= STEPS
+        assert 0 < read_header(path)["run"]["num_frames"] <= NUM_FRAMES
     assert kills >= 2
-    assert bits(measured(Drive(frame_of), path)) == whole
+    assert collect_bits(evaluate(SyntheticFrames(frame_of), path)) == whole
     assert [file.name for file in path.parent.iterdir()] == [path.name]
 
 
 def test_complete_run_continues_with_more_frames(frame_of, path):
-    measured(Drive(frame_of), path, num_frames=5)
-    seen = Seen()
-    assert bits(measured(Drive(frame_of), path, num_frames=12, seen=seen)) == bits(
-        measured(Drive(frame_of), num_frames=12)
+    evaluate(SyntheticFrames(frame_of), path, num_frames=5)
+    recorder = RecordingObserver()
+    assert collect_bits(evaluate(SyntheticFrames(frame_of), path, num_frames=12, recorder=recorder)) == collect_bits(
+        evaluate(SyntheticFrames(frame_of), num_frames=12)
     )
-    assert len(seen.names) == 12
-    again = measured(Drive(frame_of, range(STEPS)), path, num_frames=12)  # not a frame is made
-    assert bits(again) == bits(measured(Drive(frame_of), num_frames=12))
+    assert len(recorder.names) == 12
+    again = evaluate(SyntheticFrames(frame_of, range(NUM_FRAMES)), path, num_frames=12)  # no frame is read
+    assert collect_bits(again) == collect_bits(evaluate(SyntheticFrames(frame_of), num_frames=12))
     with pytest.raises(ValueError, match="num_frames: 12 are done in the checkpoint; got 11, which is less"):
-        measured(Drive(frame_of), path, num_frames=11)
+        evaluate(SyntheticFrames(frame_of), path, num_frames=11)
 
 
 def test_resumed_run_stops_at_the_same_frame(frame_of, path, monkeypatch):
     monkeypatch.setattr("torchcover.evaluation.target_error.MIN_FRAMES", 8)
     target = {"target_error": "0.2m", "thresholds_m": ()}
-    whole = measured(Drive(frame_of), **target)
-    assert 8 < whole.run.num_frames < STEPS
-    for at in range(6, whole.run.num_frames - 1):
-        cut_short(Drive(frame_of), path, seen=Seen(at, press), **target)
-    assert bits(measured(Drive(frame_of), path, **target)) == bits(whole)
-    assert bits(measured(Drive(frame_of, range(STEPS)), path, **target)) == bits(whole)
+    whole = evaluate(SyntheticFrames(frame_of), **target)
+    assert 8 < whole.run.num_frames < NUM_FRAMES
+    for index in range(6, whole.run.num_frames - 1):
+        evaluate_interrupted(SyntheticFrames(frame_of), path, recorder=RecordingObserver(index, press_ctrl_c), **target)
+    assert collect_bits(evaluate(SyntheticFrames(frame_of), path, **target)) == collect_bits(whole)
+    assert collect_bits(evaluate(SyntheticFrames(frame_of, range(NUM_FRAMES)), path, **target)) == collect_bits(whole)
 
 
 @pytest.mark.parametrize(("write_s", "pause_s"), [(0.0, 60.0), (2.0, 60.0), (9.0, 180.0)])
-def test_writing_takes_at_most_5_percent_of_time(
-    tmp_path, monkeypatch, write_s, pause_s
-):
+def test_writing_takes_at_most_5_percent_of_time(tmp_path, monkeypatch, write_s, pause_s):
     now_s, written_s = 0.0, []
 
     def write(*_):
@@ -203,12 +213,14 @@ def test_writing_takes_at_most_5_percent_of_time(
     assert len(written_s) >= 9
 
 
-@pytest.mark.usefixtures("_at_every_step")
+@pytest.mark.usefixtures("_write_every_frame")
 def test_frame_missing_in_one_observer_is_not_saved(frame_of, path):
     with pytest.raises(ZeroDivisionError):
-        cut_short(Drive(frame_of), path, seen=Seen(6, lambda: 1 / 0)).run.raise_failure()
+        evaluate_interrupted(
+            SyntheticFrames(frame_of), path, recorder=RecordingObserver(6, lambda: 1 / 0)
+        ).run.raise_failure()
     assert read_header(path)["run"]["num_frames"] == 6
-    assert bits(measured(Drive(frame_of), path)) == bits(measured(Drive(frame_of)))
+    assert collect_bits(evaluate(SyntheticFrames(frame_of), path)) == collect_bits(evaluate(SyntheticFrames(frame_of)))
 
 
 @pytest.mark.parametrize(
@@ -224,11 +236,11 @@ def test_frame_missing_in_one_observer_is_not_saved(frame_of, path):
     ],
 )
 def test_error_lists_differences_to_another_run(frame_of, path, changes, named):
-    measured(Drive(frame_of), path, num_frames=3)
+    evaluate(SyntheticFrames(frame_of), path, num_frames=3)
     with pytest.raises(ValueError, match=rf"checkpoint.npz: a checkpoint of another run: {named}; resume with the"):
-        measured(Drive(frame_of), path, num_frames=3, **changes)
+        evaluate(SyntheticFrames(frame_of), path, num_frames=3, **changes)
     with pytest.raises(ValueError, match=r"another run: frames \(\"drive\" there, \"other\" here\)"):
-        measured(Drive(frame_of, content="other"), path, num_frames=3)
+        evaluate(SyntheticFrames(frame_of, content="other"), path, num_frames=3)
 
 
 def test_identity_contains_all_other_settings():
@@ -236,39 +248,42 @@ def test_identity_contains_all_other_settings():
 
 
 def test_run_without_resume_starts_again(frame_of, path):
-    measured(Drive(frame_of), path, num_frames=3)
-    result = measured(Drive(frame_of, content="other"), Checkpoint(path, resume=False), num_frames=2)
+    evaluate(SyntheticFrames(frame_of), path, num_frames=3)
+    result = evaluate(SyntheticFrames(frame_of, content="other"), Checkpoint(path, resume=False), num_frames=2)
     assert (result.run.num_frames, read_header(path)["run"]["num_frames"]) == (2, 2)
 
 
 def test_checkpoint_keeps_skipped_frames(frame_of, path):
-    measured(Drive(frame_of, {1}), path, num_frames=3, skip_bad_frames=True)
+    evaluate(SyntheticFrames(frame_of, {1}), path, num_frames=3, skip_bad_frames=True)
     with pytest.raises(ValueError, match=r"1 bad frames were skipped before the checkpoint, such as f1"):
-        measured(Drive(frame_of, {1}), path)
+        evaluate(SyntheticFrames(frame_of, {1}), path)
 
 
-@pytest.mark.usefixtures("_at_every_step")
+@pytest.mark.usefixtures("_write_every_frame")
 def test_full_disk_warns_once_and_run_continues(frame_of, path, monkeypatch):
     def full(_):
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    measured(Drive(frame_of), path, num_frames=3)
+    evaluate(SyntheticFrames(frame_of), path, num_frames=3)
     with monkeypatch.context() as patch:
         patch.setattr(os, "fsync", full)
-        with pytest.warns(UserWarning, match="no checkpoint was written .*No space left.*; the run goes on") as told:
-            result = measured(Drive(frame_of), path, num_frames=9)
-    assert len(told) == 1
-    assert (result.run.is_complete, bits(result)) == (True, bits(measured(Drive(frame_of), num_frames=9)))
+        with pytest.warns(UserWarning, match="no checkpoint was written .*No space left.*; the run goes on") as warned:
+            result = evaluate(SyntheticFrames(frame_of), path, num_frames=9)
+    assert len(warned) == 1
+    assert (result.run.is_complete, collect_bits(result)) == (
+        True,
+        collect_bits(evaluate(SyntheticFrames(frame_of), num_frames=9)),
+    )
     assert read_header(path)["run"]["num_frames"] == 3
     assert [file.name for file in path.parent.iterdir()] == [path.name]
-    assert bits(measured(Drive(frame_of), path)) == bits(measured(Drive(frame_of)))
+    assert collect_bits(evaluate(SyntheticFrames(frame_of), path)) == collect_bits(evaluate(SyntheticFrames(frame_of)))
 
 
-class Mute:
+class ObserverWithoutState:
     update = compute = merge_state = None
 
 
-class Odd(Seen):
+class ObserverWithSet(RecordingObserver):
     def state_dict(self):
         return {"names": {1, 2}}
 
@@ -276,13 +291,16 @@ class Odd(Seen):
 @pytest.mark.parametrize(
     ("observer", "message"),
     [
-        (Mute, "observer seen: a Mute without state_dict and load_state_dict, which a checkpoint needs"),
-        (Odd, "observer seen: its state_dict cannot be saved in a checkpoint: .* got set in it"),
+        (
+            ObserverWithoutState,
+            "observer recorder: a ObserverWithoutState without state_dict and load_state_dict",
+        ),
+        (ObserverWithSet, "observer recorder: its state_dict cannot be saved in a checkpoint: .* got set in it"),
     ],
 )
 def test_observer_without_state_is_rejected_before_the_run(frame_of, path, observer, message):
     with pytest.raises(TypeError, match=message):
-        measured(Drive(frame_of, range(STEPS)), path, seen=observer())
+        evaluate(SyntheticFrames(frame_of, range(NUM_FRAMES)), path, recorder=observer())
     assert not path.parent.exists()
 
 
@@ -301,8 +319,8 @@ def test_states_are_restored_bit_for_bit(tmp_path):
         "tree": {"list": [1, 0.1, None, "text", True, [torch.tensor([1.5])]], "": {}},
     }
     header = {"identity": {}, "run": {"num_frames": 1, "counts": {}, "skipped_frames": [], "duration_s": 0.0}}
-    write_checkpoint(path, header, {"one": state})
-    back = read_state(path, read_header(path), "one")
+    write_checkpoint(path, header, {"observer": state})
+    back = read_state(path, read_header(path), "observer")
     tree, tree_back = state.pop("tree"), back.pop("tree")
     assert tree_back.pop("list")[5][0].equal(tree.pop("list")[5][0])
     assert tree_back == tree
@@ -313,12 +331,12 @@ def test_states_are_restored_bit_for_bit(tmp_path):
 
 
 def test_state_may_exceed_the_zip_limit(tmp_path, monkeypatch):
-    """2 GiB, which are 1 kB here."""
+    """The limit of 2 GiB is 1 kB here."""
     monkeypatch.setattr(zipfile, "ZIP64_LIMIT", 1000)
     path, state = tmp_path / "a.npz", {"large": torch.arange(1000)}
     header = {"identity": {}, "run": {"num_frames": 1, "counts": {}, "skipped_frames": [], "duration_s": 0.0}}
-    write_checkpoint(path, header, {"one": state})
-    assert torch.equal(read_state(path, read_header(path), "one")["large"], state["large"])
+    write_checkpoint(path, header, {"observer": state})
+    assert torch.equal(read_state(path, read_header(path), "observer")["large"], state["large"])
 
 
 @pytest.mark.parametrize(
@@ -334,50 +352,50 @@ def test_state_may_exceed_the_zip_limit(tmp_path, monkeypatch):
 def test_wrong_header_of_an_array_is_rejected(tmp_path, change, message):
     path = tmp_path / "a.npz"
     header = {"identity": {}, "run": {"num_frames": 1, "counts": {}, "skipped_frames": [], "duration_s": 0.0}}
-    write_checkpoint(path, header, {"one": {"of it": torch.arange(6).view(2, 3)}})
+    write_checkpoint(path, header, {"observer": {"tensor": torch.arange(6).view(2, 3)}})
     header = read_header(path)
-    header["states"]["one"]["dict"]["of it"]["tensor"] |= change
+    header["states"]["observer"]["dict"]["tensor"]["tensor"] |= change
     with pytest.raises(BadFileError, match=rf"a\.npz: .*{message}"):
-        read_state(path, header, "one")
+        read_state(path, header, "observer")
 
 
 def test_repeated_array_counts_repeatedly_for_memory(tmp_path, monkeypatch):
     path = tmp_path / "a.npz"
     header = {"identity": {}, "run": {"num_frames": 1, "counts": {}, "skipped_frames": [], "duration_s": 0.0}}
-    write_checkpoint(path, header, {"one": {"of it": torch.zeros(100_000)}})
+    write_checkpoint(path, header, {"observer": {"tensor": torch.zeros(100_000)}})
     header = read_header(path)
-    states = header["states"]["one"]["dict"]
-    states["others"] = {"list": 30 * [states["of it"]]}
+    states = header["states"]["observer"]["dict"]
+    states["copies"] = {"list": 30 * [states["tensor"]]}
     monkeypatch.setenv("TORCHCOVER_MAX_FILE_GB", "0.01")
     with pytest.raises(BadFileError, match=r"reading it takes 0\.0124 GB of memory, more than the 0\.01 GB"):
-        read_state(path, header, "one")
+        read_state(path, header, "observer")
 
 
 def test_damaged_checkpoint_is_named(frame_of, path):
-    measured(Drive(frame_of), path, num_frames=3)
+    evaluate(SyntheticFrames(frame_of), path, num_frames=3)
     data = bytearray(path.read_bytes())
     third = len(data) // 3
     for damage in (data[:-100], data[:third] + bytes(third) + data[2 * third :], b"PK", b""):
         path.write_bytes(damage)
         with pytest.raises(BadFileError, match=r"checkpoint\.npz: "):
-            measured(Drive(frame_of), path, num_frames=3)
+            evaluate(SyntheticFrames(frame_of), path, num_frames=3)
     np.savez(path, header=np.array("{}"))
     with pytest.raises(BadFileError, match="checkpoint format None; this torchcover reads format 3"):
-        measured(Drive(frame_of), path, num_frames=3)
+        evaluate(SyntheticFrames(frame_of), path, num_frames=3)
 
 
 def test_edited_checkpoint_is_rejected(frame_of, path):
-    measured(Drive(frame_of), path, num_frames=3)
+    evaluate(SyntheticFrames(frame_of), path, num_frames=3)
     with np.load(path) as file:
         arrays = dict(file)
     header = json.loads(str(arrays["header"]))
     header["run"]["num_frames"] = 9
     with zipfile.ZipFile(path) as archive:
-        seal = archive.comment
+        checksum = archive.comment
     for edited in (arrays | {"header": np.array(json.dumps(header))}, dict(list(arrays.items())[1:])):
         np.savez(path, **edited)
-        for comment in (b"", seal):
+        for comment in (b"", checksum):
             with zipfile.ZipFile(path, "a") as archive:
                 archive.comment = comment
             with pytest.raises(BadFileError, match="the file was edited or is damaged; start again"):
-                measured(Drive(frame_of), path, num_frames=3)
+                evaluate(SyntheticFrames(frame_of), path, num_frames=3)

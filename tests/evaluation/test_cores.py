@@ -1,4 +1,4 @@
-"""Threads that wait leave their cores to others, and a run has as many processes as help."""
+"""CPU cores: waiting threads do not keep them busy, and the number of workers is limited."""
 
 import multiprocessing
 import os
@@ -14,13 +14,13 @@ from torchcover.evaluation import cpu_cores as module
 from torchcover.evaluation import evaluate, measurement
 from torchcover.evaluation.cpu_cores import compute_num_workers, count_cores, set_threads, warn_about_spinning
 
-SAID = (*module.WAIT_VARIABLES, "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
+VARIABLES = (*module.WAIT_VARIABLES, "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
 
 
 @pytest.fixture
-def nothing_said(monkeypatch):
-    for name in SAID:
-        monkeypatch.setenv(name, "")  # what was there comes back
+def clean_environment(monkeypatch):
+    for name in VARIABLES:
+        monkeypatch.setenv(name, "")  # restored after the test
         monkeypatch.delenv(name)
     module._warn_about_spinning_once.cache_clear()
     yield monkeypatch
@@ -50,15 +50,19 @@ def test_container_limit_reduces_the_cores(tmp_path, monkeypatch, files, expecte
     assert count_cores() == expected
 
 
-@pytest.mark.parametrize("said", [{}, {"OMP_NUM_THREADS": "7"}, *({name: "active"} for name in module.WAIT_VARIABLES)])
-def test_set_threads_keeps_existing_variables(nothing_said, said):
-    for name, value in said.items():
-        nothing_said.setenv(name, value)
+@pytest.mark.parametrize(
+    "environment", [{}, {"OMP_NUM_THREADS": "7"}, *({name: "active"} for name in module.WAIT_VARIABLES)]
+)
+def test_set_threads_keeps_existing_variables(clean_environment, environment):
+    for name, value in environment.items():
+        clean_environment.setenv(name, value)
     set_threads()
-    assert {name: os.environ[name] for name in said} == said
-    assert ("OMP_WAIT_POLICY" in os.environ) == ("GOMP_SPINCOUNT" not in said and "KMP_BLOCKTIME" not in said)
+    assert {name: os.environ[name] for name in environment} == environment
+    assert ("OMP_WAIT_POLICY" in os.environ) == (
+        "GOMP_SPINCOUNT" not in environment and "KMP_BLOCKTIME" not in environment
+    )
     assert os.environ["OPENBLAS_NUM_THREADS"] == "1"
-    assert os.environ["OMP_NUM_THREADS"] == said.get("OMP_NUM_THREADS", str(count_cores()))
+    assert os.environ["OMP_NUM_THREADS"] == environment.get("OMP_NUM_THREADS", str(count_cores()))
 
 
 def test_threads_are_set_before_torch_is_imported():
@@ -67,38 +71,38 @@ def test_threads_are_set_before_torch_is_imported():
         "try: app.main()\nexcept SystemExit: pass\n"
         "assert not {'torch', 'numpy'} & sys.modules.keys(); print(os.environ['OMP_WAIT_POLICY'])"
     )
-    environment = {name: value for name, value in os.environ.items() if name not in SAID}
+    environment = {name: value for name, value in os.environ.items() if name not in VARIABLES}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "passive"
 
 
-def test_spinning_threads_warn_once(nothing_said):
-    with pytest.warns(UserWarning, match="OMP_WAIT_POLICY") as said:
+def test_spinning_threads_warn_once(clean_environment):
+    with pytest.warns(UserWarning, match="OMP_WAIT_POLICY") as warned:
         warn_about_spinning(2)
-    assert said[0].filename == __file__
+    assert warned[0].filename == __file__
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warn_about_spinning(2)
 
 
-def test_warning_points_to_the_line_of_the_user(nothing_said, monkeypatch):
+def test_warning_points_to_the_line_of_the_user(clean_environment, monkeypatch):
     monkeypatch.setattr(torch, "get_num_threads", lambda: 2)
-    with pytest.warns(UserWarning, match="OMP_WAIT_POLICY") as said:
+    with pytest.warns(UserWarning, match="OMP_WAIT_POLICY") as warned:
         evaluate("front_roof_128", "courtyard", num_frames=1, num_rays=64)
-    assert [one.filename for one in said] == [__file__]
+    assert [warning.filename for warning in warned] == [__file__]
 
 
-@pytest.mark.parametrize("said", [None, *module.WAIT_VARIABLES])
-def test_passive_threads_do_not_warn(nothing_said, said):
-    if said:
-        nothing_said.setenv(said, "0")
+@pytest.mark.parametrize("variable", [None, *module.WAIT_VARIABLES])
+def test_passive_threads_do_not_warn(clean_environment, variable):
+    if variable:
+        clean_environment.setenv(variable, "0")
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        warn_about_spinning(2 if said else 1)
+        warn_about_spinning(2 if variable else 1)
 
 
 @pytest.mark.parametrize(
-    ("count", "frames", "worlds", "expected"),
+    ("num_cores", "num_frames", "num_scenes", "expected"),
     [
         (1, 64, 11, 0),
         (2, 64, 11, 2),
@@ -109,20 +113,20 @@ def test_passive_threads_do_not_warn(nothing_said, said):
         (16, 8, 8, 0),
     ],
 )
-def test_num_workers_follows_cores_scenes_and_frames(monkeypatch, count, frames, worlds, expected):
-    monkeypatch.setattr(module, "count_cores", lambda: count)
+def test_num_workers_follows_cores_scenes_and_frames(monkeypatch, num_cores, num_frames, num_scenes, expected):
+    monkeypatch.setattr(module, "count_cores", lambda: num_cores)
     monkeypatch.setattr(multiprocessing, "get_start_method", lambda allow_none: "fork")
     monkeypatch.setattr(module, "find_memory_limit_bytes", lambda: 1e12)
-    assert compute_num_workers(frames, worlds, sends_frames=False) == expected
+    assert compute_num_workers(num_frames, num_scenes, sends_frames=False) == expected
     monkeypatch.setattr(multiprocessing, "get_start_method", lambda allow_none: "spawn")
-    assert compute_num_workers(frames, worlds, sends_frames=False) == 0
+    assert compute_num_workers(num_frames, num_scenes, sends_frames=False) == 0
 
 
 def test_num_workers_follows_memory_and_shared_memory(monkeypatch, tmp_path):
     monkeypatch.setattr(module, "count_cores", lambda: 16)
     monkeypatch.setattr(module, "SHARED_MEMORY", str(tmp_path))
     monkeypatch.setattr(multiprocessing, "get_start_method", lambda allow_none: "fork")
-    for memory, room, whole, expected in (
+    for memory_bytes, shared_bytes, sends_frames, expected in (
         (1e12, 64e6, True, 0),
         (1e12, 64e6, False, 8),
         (1e12, 512e6, True, 2),
@@ -130,33 +134,35 @@ def test_num_workers_follows_memory_and_shared_memory(monkeypatch, tmp_path):
         (2e9, 1e12, True, 3),
         (1e9, 1e12, False, 0),
     ):
-        monkeypatch.setattr(module, "find_memory_limit_bytes", lambda memory=memory: memory)
-        monkeypatch.setattr(os, "statvfs", lambda _, room=room: os.statvfs_result([1] * 4 + [int(room)] + [1] * 5))
-        assert compute_num_workers(64, 64, sends_frames=whole) == expected
+        monkeypatch.setattr(module, "find_memory_limit_bytes", lambda memory_bytes=memory_bytes: memory_bytes)
+        monkeypatch.setattr(
+            os, "statvfs", lambda _, size=shared_bytes: os.statvfs_result([1] * 4 + [int(size)] + [1] * 5)
+        )
+        assert compute_num_workers(64, 64, sends_frames=sends_frames) == expected
 
 
 def test_only_simulations_have_default_workers(monkeypatch):
-    class KnownError(Exception):
-        """The number of workers."""
+    class ReportedError(Exception):
+        """Error with the number of workers of a run."""
 
     def observe(*_, num_workers, **__):
-        raise KnownError(num_workers)
+        raise ReportedError(num_workers)
 
-    def usual(frames, worlds, *, sends_frames):
-        asked.append((frames, worlds, sends_frames))
+    def compute(num_frames, num_scenes, *, sends_frames):
+        calls.append((num_frames, num_scenes, sends_frames))
         return 2
 
-    asked = []
+    calls = []
     monkeypatch.setattr(measurement, "observe", observe)
-    monkeypatch.setattr(measurement, "compute_num_workers", usual)
+    monkeypatch.setattr(measurement, "compute_num_workers", compute)
     frames = SimulatedFrames("urban", "front_roof_32", num_frames=64)
-    for given, expected in (
+    for settings, expected in (
         ({"scenario": "urban", "num_frames": 64}, 2),
         ({"scenario": "urban", "num_frames": 9999, "metrics": "k_cover"}, 2),
         ({"scenario": "urban", "num_frames": 64, "num_workers": 0}, 0),
         ({"frames": frames}, 0),
     ):
-        with pytest.raises(KnownError) as found:
-            evaluate("front_roof_32", **given)
-        assert found.value.args == (expected,)
-    assert asked == [(64, 11, False), (measurement.MeasurementParams().max_inspected_frames, 43, True)]
+        with pytest.raises(ReportedError) as raised:
+            evaluate("front_roof_32", **settings)
+        assert raised.value.args == (expected,)
+    assert calls == [(64, 11, False), (measurement.MeasurementParams().max_inspected_frames, 43, True)]
