@@ -268,7 +268,7 @@ def save_and_print(
         out: Folder of the results.
         ranks: Processes that share the run; only rank 0 saves and prints.
         rerun_log: File for the Rerun viewer.
-        checkpoint: Checkpoint of the run; a complete run deletes it unless it is to be kept.
+        checkpoint: Checkpoint of the run; a complete run deletes it unless `keep` is set.
         file_kinds: Files in addition to `summary.json`.
         explain: Print the omissions.
     """

@@ -16,7 +16,7 @@ Document = Mapping[str, Any]
 
 
 def print_builtin(search_text: str | None) -> None:
-    """Print what is built in.
+    """Print built-in items.
 
     Args:
         search_text: None: the names of all kinds. A kind: its items with properties and first sentence of their

@@ -52,7 +52,7 @@ def with_options(parameters: Sequence[inspect.Parameter]) -> Callable[[Command],
         parameters: From `build_setting_options`, `build_criterion_options` or `get_parameters`.
 
     Returns:
-        A decorator. The command receives only those of these options that have a value.
+        A decorator. The command receives only options with a value.
     """
     added = {parameter.name for parameter in parameters}
 

@@ -43,7 +43,7 @@ class Heartbeat:
         self._ended = Event()
 
     def exchange_heartbeats(self) -> None:
-        """Send heartbeats and read those of the other ranks until this rank leaves; the last heartbeat is "left"."""
+        """Exchange heartbeats with the other ranks until this rank leaves; the last heartbeat is "left"."""
         with suppress(RuntimeError):  # the store has closed
             count = 0
             while not self._ended.wait(self._params.interval_s):

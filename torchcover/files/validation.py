@@ -4,10 +4,11 @@ import re
 from collections.abc import Callable, Sequence
 from difflib import get_close_matches
 from reprlib import Repr
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from pydantic import ValidationError
-from pydantic_core import ErrorDetails
+if TYPE_CHECKING:
+    from pydantic import ValidationError
+    from pydantic_core import ErrorDetails
 
 # Largest number of characters that a message quotes from a file.
 MAX_QUOTED = 60
@@ -46,7 +47,7 @@ KeyPath = tuple[int | str, ...]
 
 
 def explain_validation_error(
-    error: ValidationError, suggest_key: Callable[[str], str] | None = None, max_mistakes: int = 5
+    error: "ValidationError", suggest_key: Callable[[str], str] | None = None, max_mistakes: int = 5
 ) -> list[str]:
     """Explain each mistake that pydantic found in one phrase: the key, what is needed, and the value that arrived.
 
@@ -86,7 +87,7 @@ def explain_validation_error(
     return mistakes
 
 
-def _match_misspelled_keys(details: Sequence[ErrorDetails]) -> dict[KeyPath, KeyPath]:
+def _match_misspelled_keys(details: "Sequence[ErrorDetails]") -> dict[KeyPath, KeyPath]:
     """Match unknown keys with similar missing keys of the same mapping."""
     missing_keys = [detail["loc"] for detail in details if detail["type"] == "missing"]
     intended_keys: dict[KeyPath, KeyPath] = {}
@@ -101,7 +102,7 @@ def _match_misspelled_keys(details: Sequence[ErrorDetails]) -> dict[KeyPath, Key
     return intended_keys
 
 
-def _explain_mistake(detail: ErrorDetails, suggest_key: Callable[[str], str] | None) -> str:
+def _explain_mistake(detail: "ErrorDetails", suggest_key: Callable[[str], str] | None) -> str:
     """Explain one mistake without its key."""
     if detail["type"] == "value_error":
         return detail["msg"].removeprefix("Value error, ")
@@ -119,7 +120,7 @@ def _explain_mistake(detail: ErrorDetails, suggest_key: Callable[[str], str] | N
     return f"{needed} is needed; got {_shorten(detail['input'])}"
 
 
-def _is_consequence(detail: ErrorDetails) -> bool:
+def _is_consequence(detail: "ErrorDetails") -> bool:
     """Return True if a list is too short only because its items were invalid, which other mistakes report."""
     if detail["type"] != "too_short" or not isinstance(detail["input"], Sequence):
         return False
