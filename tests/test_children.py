@@ -105,7 +105,7 @@ def test_it_ends_though_its_parent_had_ended_before():
     assert done.returncode == -signal.SIGKILL
 
 
-def test_what_makes_frames_ends_though_it_is_in_the_middle_of_one(alive):
+def test_workers_end_within_a_frame(alive):
     class Drive:
         get_scene_id = int
 
@@ -160,12 +160,12 @@ class StoppingDrive:
         return Frame({"a": torch.zeros(1, 3)}, torch.zeros(1, 3), index, "f")
 
 
-def test_a_stopped_worker_is_reported_and_the_run_goes_on_with_it(stopped):
+def test_stopped_worker_is_reported_and_resumed(stopped):
     assert observe(StoppingDrive(), [], num_workers=2).num_frames == 4
     assert [message.split(" (process ")[0] for message in stopped] == ["a worker"]
 
 
-def test_a_run_with_a_stopped_worker_can_be_ended(stopped, monkeypatch):
+def test_run_with_stopped_worker_can_be_interrupted(stopped, monkeypatch):
     end = lambda message, *_, **__: (stopped.append(message), os.kill(os.getpid(), signal.SIGINT))  # noqa: E731
     monkeypatch.setattr("torchcover.files.processes.warnings.warn", end)
     with pytest.raises(KeyboardInterrupt):
@@ -184,7 +184,7 @@ def test_a_stopped_sumo_is_reported(stopped, tmp_path, monkeypatch):
     assert [message.split(" (process ")[0] for message in stopped] == ["SUMO's sumo"]
 
 
-def test_a_stopped_reader_is_reported_and_ends_after_its_time(stopped, tmp_path, monkeypatch):
+def test_stopped_reader_is_reported_and_times_out(stopped, tmp_path, monkeypatch):
     (tmp_path / "file.x").write_text("content")
     assert apart_readers.stopping(tmp_path / "file.x")["one"] == 1
     assert [message.split(" (process ")[0] for message in stopped] == ["the process that reads files"]
@@ -195,7 +195,7 @@ def test_a_stopped_reader_is_reported_and_ends_after_its_time(stopped, tmp_path,
 
 
 @pytest.mark.parametrize("pause_s", [0.0, 1.0])
-def test_a_rank_without_signs_of_life_is_reported_once(monkeypatch, pause_s):
+def test_silent_rank_is_reported_once(monkeypatch, pause_s):
     reported, params, store = [], HeartbeatParams(interval_s=0.05, timeout_s=0.5), HashStore()
     monkeypatch.setattr("torchcover.evaluation.heartbeat.warnings.warn", lambda words, *_, **__: reported.append(words))
     silent = Heartbeat(store, 1, 3, params)  # sends nothing

@@ -31,7 +31,7 @@ print(json.dumps(seen))
         "torchcover.contrib.ratio_metrics",
     ],
 )
-def test_whoever_needs_them_has_made_the_first_calls_with_one_number_each(module):
+def test_first_calls_precede_threads_and_forks(module):
     code = SAID.format(module=module)
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     made = {(name, dtype): numbers for name, dtype, numbers in json.loads(said.stdout)[:10]}

@@ -74,7 +74,7 @@ FACTORIES = {
 }  # fmt: skip
 
 
-def test_every_tensor_is_made_on_a_device_that_is_named():
+def test_tensors_are_created_on_an_explicit_device():
     """Else `torch.set_default_device` would mix devices."""
     missing = []
     for path in (ROOT / "torchcover").rglob("*.py"):
@@ -96,7 +96,7 @@ def test_what_measures_needs_nothing_that_simulates_or_draws(loaded, stage):
     assert not loaded[stage] & SIMULATING
 
 
-def test_a_name_of_the_door_to_the_data_loads_its_own_room(loaded):
+def test_data_names_load_only_their_package(loaded):
     rooms = {f"torchcover.{room}" for room in ("frames", "recordings", "simulation")}
     for name, needed in (("Frame", 1), ("Scan", 2)):
         assert len(loaded[name] & rooms) <= needed, name
@@ -105,7 +105,7 @@ def test_a_name_of_the_door_to_the_data_loads_its_own_room(loaded):
     assert {name for name in torchcover.data.__all__ if getattr(torchcover.data, name) is None} == set()
 
 
-def test_searching_imports_neither_the_metric_nor_the_tree_before_they_are_needed(loaded):
+def test_nearest_search_imports_no_metric_or_tree(loaded):
     assert not loaded["search"] & {"torchmetrics", "pykdtree", "matplotlib", "embreex", "trimesh"}
 
 

@@ -18,13 +18,13 @@ DOCS = Path(__file__).parent.parent / "docs"
 
 
 @pytest.mark.parametrize("place", run.WATCHED)
-def test_what_the_default_run_is_divided_into_is_there(place):
+def test_parts_of_the_default_run_exist(place):
     """A part that is called otherwise by now would be counted as another one."""
     owner, name = run.owner_of(place)
     assert callable(getattr(owner, name))
 
 
-def test_what_a_command_prints_takes_the_place_of_what_it_printed_before(tmp_path):
+def test_output_of_a_command_replaces_the_old(tmp_path):
     page = tmp_path / "page.md"
     commands = "```console\n$ echo '| a |' > seen\n$ cat \\\n    seen\n```\n"
     block = f"# Page\n\n{commands}\n<!-- printed -->\n{{}}<!-- /printed -->\n\nEnd.\n"
@@ -37,7 +37,7 @@ def test_what_a_command_prints_takes_the_place_of_what_it_printed_before(tmp_pat
         assert text == block.format(f"\n| a |\n\n*Printed in 0 s of processor time{of}.*\n\n")
 
 
-def test_a_command_that_fails_leaves_its_page_as_it_was(tmp_path):
+def test_failed_command_leaves_its_page_unchanged(tmp_path):
     page = tmp_path / "page.md"
     page.write_text(
         "```console\n$ false\n$ echo new\n```\n\n<!-- printed -->\nold\n<!-- /printed -->\n", encoding="utf-8"
@@ -47,7 +47,7 @@ def test_a_command_that_fails_leaves_its_page_as_it_was(tmp_path):
     assert "old" in page.read_text(encoding="utf-8")
 
 
-def test_a_page_is_as_old_as_the_changes_of_the_code_since(tmp_path, monkeypatch):
+def test_page_age_counts_later_code_changes(tmp_path, monkeypatch):
     def said(*words):
         done = subprocess.run(["git", "-c", "user.name=a", "-c", "user.email=a@b", *words], cwd=tmp_path, check=True,
                               capture_output=True, text=True)  # fmt: skip

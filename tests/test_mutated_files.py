@@ -20,7 +20,7 @@ def test_the_files_are_good_before(every, tmp_path):
 
 
 @pytest.mark.parametrize("part", range(PARTS))
-def test_a_damaged_file_is_read_or_a_bad_file_that_is_named(every, tmp_path, part):
+def test_damaged_files_are_read_or_named(every, tmp_path, part):
     outcomes = {"read": 0, "bad": 0}
     for number in range(part * FILES, (part + 1) * FILES):
         what, *_ = attempt(every[number % len(every)], mutated(every, number), tmp_path)

@@ -25,7 +25,7 @@ def test_no_two_public_classes_share_a_name():
     assert {name: files for name, files in found.items() if len(files) > 1} == {}
 
 
-def test_a_second_class_of_a_name_would_be_found(tmp_path):
+def test_repeated_class_names_are_found(tmp_path):
     for file in ("one.py", "other.py"):
         Path(tmp_path, file).write_text("class Scan: ...\nclass _Own: ...\n", encoding="utf-8")
     assert public_classes(tmp_path) == {"Scan": ["one.py", "other.py"]}

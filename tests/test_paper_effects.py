@@ -64,7 +64,7 @@ def row(coverage, rig, x, y=(-8.0, 8.0), height="ground"):
     return Here(found.numbers["radius_m"].value, found.numbers["detection_0.4m"].value)
 
 
-def test_the_hood_hides_the_ground_in_front_of_the_car_from_the_roof(coverage):
+def test_hood_occludes_ground_from_roof_sensors(coverage):
     lidar = Rig.load("front_roof_128").sensors[0]
     seen = SimulatedFrames(ROAD, "front_roof_128", num_frames=1, reference_sensor=PaperReference(8, 8))[0]
     assert seen.counts["sensor_self_hits"] > 0.005 * seen.counts["sensor_rays"]
@@ -77,7 +77,7 @@ def test_the_hood_hides_the_ground_in_front_of_the_car_from_the_roof(coverage):
 
 
 @pytest.mark.parametrize("rig", FITTED)
-def test_close_by_a_narrow_lidar_is_blinder_higher_up_because_of_what_stands_beside_its_view(coverage, rig):
+def test_narrow_lidar_misses_obstacles_outside_its_view(coverage, rig):
     """The paper's LiDAR tables have it in all 12 rows."""
     ground, obstacle = (row(coverage, rig, (0.0, 20.0), (-10.0, 10.0), height) for height in ("ground", "obstacle"))
     assert obstacle.radius_m > 1.3 * ground.radius_m
@@ -107,7 +107,7 @@ def test_the_shadow_is_larger_for_the_grille(coverage):
     assert grille.detection < roof.detection
 
 
-def test_ground_detection_of_the_grille_fades_near_19_m(coverage):
+def test_grille_ground_detection_fades_at_19_m(coverage):
     """Rows 0.24 degrees apart from 0.62 m up: at 19 m, rings on the ground are twice the ball of 0.8 m apart."""
     near, at, far = (row(coverage, "front_grille_128", x, (3.0, 7.0)).detection for x in ((8, 12), (18, 21), (26, 30)))
     assert near > 0.95
@@ -116,7 +116,7 @@ def test_ground_detection_of_the_grille_fades_near_19_m(coverage):
     assert row(coverage, "front_roof_128", (18, 21), (3.0, 7.0)).detection > 0.85
 
 
-def test_resolution_matters_on_the_ground_and_far_away_hardly_for_close_obstacles(coverage):
+def test_resolution_matters_for_ground_and_long_range(coverage):
     def detection(rig, x, height):
         return row(coverage, rig, x, (-10.0, 10.0), height).detection
 

@@ -21,7 +21,7 @@ def descriptions():
             yield path, " ".join(content["description"].split())
 
 
-def test_each_source_with_a_license_is_in_the_notices():
+def test_licensed_sources_are_in_the_notices():
     found = {(source, name) for _, text in descriptions() for source, name in SOURCE.findall(text)}
     assert len(found) >= 9
     for source, name in sorted(found):

@@ -31,7 +31,7 @@ def same(a, b):
 
 
 @pytest.mark.parametrize("scenario", [LOT, yard(WALL)])
-def test_another_rig_sees_what_it_would_see_in_frames_of_its_own(scenario):
+def test_other_rigs_score_as_in_own_frames(scenario):
     frames = SimulatedFrames(scenario, TWO, num_frames=8, frame_interval_s=0.4, seed=3)
     other = Simulator(
         scenario, {"first": rig()}, SurfaceReference((((0, 9), (-3, 3)),), num_rays=64), seed=3, frame_interval_s=0.4
@@ -54,7 +54,7 @@ def test_ideal_sensors_have_a_point_for_every_hit():
     assert ideal.resample(1, 1, {}).sensor_model == "ideal"
 
 
-def test_rays_that_change_no_objective_are_not_cast_and_change_none(monkeypatch):
+def test_omitted_rays_change_no_objective(monkeypatch):
     near = {"near": Objective(threshold_m=0.2, band="ground", region={"ahead": {"x_m": (3, 8), "y_m": (-2, 2)}})}
     some = held(objectives=near, num_scenes=1, num_rays=200)
     monkeypatch.setattr(Queries, "search_radius_m", None)
@@ -63,7 +63,7 @@ def test_rays_that_change_no_objective_are_not_cast_and_change_none(monkeypatch)
     assert len(next(some.iterate_frames(TWO)).sensor) < 0.7 * len(next(every.iterate_frames(TWO)).sensor)
 
 
-def test_numbers_are_those_of_evaluate_on_the_same_frames_to_the_last_bit():
+def test_numbers_equal_evaluate_to_the_last_bit():
     """By area and over known cells, in regions of several objectives, from frames that nobody has cut."""
     held_by = {measure: held(num_scenes=4, frames_per_scene=2, average=measure) for measure in ("area", "cells")}
     found = held_by["area"]
@@ -114,7 +114,7 @@ def test_it_makes_no_difference_who_holds_the_worlds(frames, workers):
         same(elsewhere.score(TWO), frames.score(TWO))  # nothing is left over of the error
 
 
-def test_a_world_stays_with_the_process_that_has_built_it(monkeypatch, tmp_path):
+def test_scene_stays_with_the_process_that_built_it(monkeypatch, tmp_path):
     """The k-th batch of a DataLoader is for its k-th worker."""
     built = CachedFrames._build_reference
 
@@ -144,7 +144,7 @@ def test_the_order_of_rigs_makes_no_difference(frames):
     assert share == sum(one["self_hits"] for one in counts) / sum(one["rays"] for one in counts)
 
 
-def test_what_some_worlds_do_not_show_is_about_the_others():
+def test_unobserved_scenes_do_not_contribute():
     obstacles = {"ahead": Objective(region="20m", band="obstacle"), "ground": Objective(region="20m", band="ground")}
     scenarios = [yard(WALL), yard(name="empty"), LOT]
     found = held(scenarios, obstacles, num_scenes=1, frames_per_scene=1)
@@ -186,7 +186,7 @@ def test_a_world_without_traffic_shows_each_instant_once():
         ),
     ],
 )  # fmt: skip
-def test_what_makes_no_sense_is_said_at_the_door(change, message):
+def test_invalid_settings_are_refused(change, message):
     with pytest.raises(ValueError, match=message):
         held(**change)
 
@@ -196,7 +196,7 @@ def test_rigs_that_cannot_be(frames):
         frames.score(rig(lidar(mount={"x_m": 3.0, "z_m": -1.0})))
 
 
-def test_a_rig_for_another_vehicle_is_refused_unless_the_vehicle_was_said():
+def test_rig_of_another_vehicle_needs_explicit_vehicle():
     open_lot = Scenario.model_validate({"name": "open", "bodies": [FLOOR], "ego": {"pose": {}}})
     near = {"near": Objective(region="20m", band="ground")}
     roof = rig(vehicle="renault_zoe")
@@ -205,7 +205,7 @@ def test_a_rig_for_another_vehicle_is_refused_unless_the_vehicle_was_said():
     assert len(held([open_lot], near, vehicle="renault_zoe").score(roof).estimate.value) == 1
 
 
-def test_a_process_that_was_killed_is_told_and_the_others_end_with_the_search():
+def test_killed_worker_is_reported_and_ends_the_search():
     frames = held(num_workers=9, num_scenes=2, frames_per_scene=1)
     killed, other = frames._loader._iterator._workers
 
@@ -232,7 +232,7 @@ def test_threads_make_no_difference(frames):
     same(other, frames.score(TWO))
 
 
-def test_a_recording_is_one_world_for_any_seed_and_none_of_it_is_fresh():
+def test_recording_is_one_scene_without_held_out_scenes():
     with held(
         ["tracks_table"], {"near": Objective(region="20m", band="ground")}, num_scenes=3, frame_interval_s=0.5
     ) as recorded:

@@ -17,7 +17,7 @@ LANE = {"lane": {"x_m": [-7.3, -2.0], "y_m": [-1.2, 1.6]}}
 TWO = rig(lidar(), lidar("low", mount={"x_m": 2.2, "z_m": 0.6}), name="two")
 
 
-def test_the_points_that_are_kept_are_those_in_the_regions_and_in_their_cells():
+def test_kept_points_lie_in_regions_or_their_cells():
     near = Objective(region="20m", band="obstacle"), Objective(region="20m")
     asked = Queries.from_objectives(
         {"a": near[0], "b": Objective(region=LANE, threshold_m=0.1), "c": near[1]}, OUTLINE_M
@@ -61,7 +61,7 @@ def several():
     return held(objectives=NUMBERS)
 
 
-def test_an_objective_is_any_number_of_a_result_and_knows_its_direction(several):
+def test_objective_is_any_number_with_its_direction(several):
     one, two = (several.score(each).estimate for each in (rig(), TWO))
     value = dict(zip(NUMBERS, two.value.tolist(), strict=True))
     region = several.queries.regions["20m"]
@@ -98,7 +98,7 @@ def test_an_objective_is_any_number_of_a_result_and_knows_its_direction(several)
     assert (error[[0, 1]] > 0).all()
 
 
-def test_what_a_failure_leaves_is_over_known_cells_where_evaluate_has_it_so(several):
+def test_failure_numbers_use_the_same_cells_as_evaluate(several):
     both = several, held(objectives=NUMBERS, average="cells")
     by_area, by_cells = (dict(zip(NUMBERS, of.score(TWO).estimate.value.tolist(), strict=True)) for of in both)
     region = several.queries.regions["20m"]
@@ -121,7 +121,7 @@ def test_a_number_without_any_sensor_says_so(several):
     assert titles["detection_0.4m_without_top"] == "detection within 0.4 m, without top"
 
 
-def test_numbers_that_are_by_no_choice_of_estimate_are_the_same_by_both():
+def test_numbers_without_average_are_equal_for_both_averages():
     alone = {"cells": Objective(number="cells_radius_m", region="20m")}
     for asked in (NUMBERS, alone):
         by_area, by_cells = (held(objectives=asked, average=one).score(TWO).estimate.value for one in ("area", "cells"))
@@ -130,7 +130,7 @@ def test_numbers_that_are_by_no_choice_of_estimate_are_the_same_by_both():
     assert alone["cells"].fixed_average == "cells"
 
 
-def test_what_the_second_sensor_loses_without_a_block_is_known_too(several):
+def test_second_sensor_loss_has_jackknife_values(several):
     estimate = several.score(TWO).estimate
     assert estimate.jackknife_values.shape == (3, len(NUMBERS))
     unknown = ~torch.isfinite(estimate.jackknife_values).all(dim=0)
@@ -151,7 +151,7 @@ def test_what_the_second_sensor_loses_without_a_block_is_known_too(several):
         ("radius_q0.9.1_m", "radius_q0.9_m"),
     ],
 )
-def test_a_number_that_no_result_has_is_refused_with_the_nearest(given, near):
+def test_unknown_number_is_refused_with_a_suggestion(given, near):
     asked = Queries.from_objectives({"odd": Objective(number=given, region="20m")}, OUTLINE_M)
     with pytest.raises(ValueError, match=f"objective 'odd': results have no number '{given}'; did you mean '{near}'"):
         asked.check(TWO)
@@ -172,7 +172,7 @@ def test_an_objective_that_makes_no_sense_is_refused(given, message):
         Objective(**given)
 
 
-def test_the_worst_sensor_is_the_worst_without_each_block_too():
+def test_worst_sensor_is_chosen_without_each_block():
     from torchcover.coverage.quantities import RADIUS, make_detection_quantity
     from torchcover.placement.queries import _select_worst
 

@@ -15,7 +15,11 @@ from torchcover.targets import Target, measure_visibility_at_positions
 # Ahead of an ego that is 4 m long; the last is within it, so that it has no room and is not checked.
 PLACES = [[4.5, 0.0], [6.5, 0.0], [9.0, 0.0], [0.0, 0.0]]
 CHILD = {"target": "child", "positions": {"points_m": PLACES}, "points": 1}
-CROSSING = {"name": "a", "ego": {"speed_kmh": 30}, "road_user": {"body": "adult", "speed_kmh": 5, "approach_distance_m": 2}}
+CROSSING = {
+    "name": "a",
+    "ego": {"speed_kmh": 30},
+    "road_user": {"body": "adult", "speed_kmh": 5, "approach_distance_m": 2},
+}
 ENCOUNTERS = {"name": "some", "encounters": [CROSSING, {**CROSSING, "name": "b", "ego": {"speed_kmh": 70}}]}
 SPAN = {"channels": 4, "vertical_fov_deg": [-4, 4], "columns": 361}
 LEVEL = rig(lidar(**SPAN), name="level")
@@ -51,7 +55,7 @@ def searched(lot, out=None, *, objectives=None, resume=False, num_evaluations=8,
     return run_search(PlacementSearch(SearchSpace.model_validate(content), plan), out, resume=resume)
 
 
-def test_the_number_is_the_share_of_the_places_that_are_seen_well_enough_and_has_no_error():
+def test_objective_is_the_share_of_detected_positions():
     some = held(objectives={"near": Objective(region="20m"), "child": child(), "far": Objective(region="80m")})
     without = held(objectives={"near": Objective(region="20m"), "far": Objective(region="80m")})
     empty, shares = build_flat_ground().model_copy(update={"ego": some._host_scenarios[0].ego}), []
@@ -69,7 +73,7 @@ def test_the_number_is_the_share_of_the_places_that_are_seen_well_enough_and_has
     assert shares[0] < shares[1] <= 0.75
 
 
-def test_of_encounters_those_count_that_are_kept_in_all_phases_on_the_vehicle_of_the_search():
+def test_encounters_count_if_met_at_all_offsets():
     asked = {"requirement": {"encounters": ENCOUNTERS, "braking": {}}}
     some = held(
         [LOT.model_copy(update={"ego": None})],
@@ -84,7 +88,7 @@ def test_of_encounters_those_count_that_are_kept_in_all_phases_on_the_vehicle_of
     assert some.score(of_rig).estimate.value.tolist() == [(2 - verdict.not_met_count - verdict.undecided_count) / 2]
 
 
-def test_a_search_finds_where_the_child_is_seen_and_resumed_it_finds_the_same(lot, tmp_path):
+def test_resumed_search_finds_the_same_rig(lot, tmp_path):
     searched(lot, tmp_path, num_evaluations=2)
     resumed, found = (searched(lot, out, resume=out is not None) for out in (tmp_path, None))
     values = [[one.values for one in of.search.evaluations] for of in (resumed, found)]
@@ -105,7 +109,7 @@ def test_a_search_finds_where_the_child_is_seen_and_resumed_it_finds_the_same(lo
     assert record["improvements"]["child"]["-"]["p_value"] == 0.0
 
 
-def test_what_must_not_be_worse_for_a_child_is_kept_and_changes_by_no_chance(lot):
+def test_requirement_objectives_change_without_standard_error(lot):
     """Of the ground ahead more is seen with the nose down, and of an adult far ahead with the nose up."""
     level = {"requirement": {"target": "adult", "positions": {"points_m": [[20.0, 0.0]]}, "points": 1}}
     objectives = {"near": {"region": ("front_3m", "20m"), "band": "ground"}}
@@ -149,7 +153,7 @@ def test_what_cannot_be_an_objective_is_refused(given, message):
         Objective.model_validate(given)
 
 
-def test_a_place_without_room_is_refused_with_the_start(lot):
+def test_occupied_positions_are_refused_with_the_start(lot):
     inside = child(positions={"x_m": [-0.5, 0.5], "y_m": [-0.3, 0.3]})
     with pytest.raises(ValueError, match=r"objectives.child: .* no position is free for the target"):
         searched(lot, objectives={"child": inside})

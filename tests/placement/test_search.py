@@ -43,7 +43,7 @@ def ending_after(count):
     )
 
 
-def test_the_start_comes_first_and_random_candidates_are_a_control_of_the_optimizer():
+def test_start_is_first_and_random_candidates_are_control():
     result = searched(num_evaluations=24)
     evaluations = result.search.evaluations
     assert [each.number for each in evaluations] == list(range(25))
@@ -54,7 +54,7 @@ def test_the_start_comes_first_and_random_candidates_are_a_control_of_the_optimi
     assert len(set(map(str, (each.values for each in evaluations)))) == 25
 
 
-def test_the_startup_covers_all_options_and_both_ends_of_each_range():
+def test_startup_covers_all_options_and_range_ends():
     models = ("hesai_pandar64", "ouster_os1_64", "ouster_os1_128", "velodyne_vlp16", "velodyne_hdl32e")
     of = space(free={"roof": {"model": models, "x_m": (-0.6, 0.8)}})
     startup = searched(of=of, num_evaluations=5).search.evaluations[1:]
@@ -63,7 +63,7 @@ def test_the_startup_covers_all_options_and_both_ends_of_each_range():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_the_optimizer_is_better_than_random_candidates_and_so_it_is_on_held_out_worlds(seed):
+def test_optimizer_beats_random_on_held_out_scenes(seed):
     result, random = (
         searched(num_evaluations=20, seed=seed),
         searched(num_evaluations=20, seed=seed, optimizer_params=RANDOM_ONLY),
@@ -109,7 +109,7 @@ def required(*bounds, **target):
     return {"requirements": [*regions, *child]}
 
 
-def test_what_no_candidate_keeps_ends_with_the_least_shortfall():
+def test_unmet_bounds_end_with_the_smallest_shortfall():
     """The second number of a surface likes the nose up, and is 0.4 at most."""
     result = searched(of=space(requirements=required({"min_value": 0.5})), num_evaluations=24)
     search = result.search
@@ -139,7 +139,7 @@ def needing(pitch_deg):
 
 
 @pytest.mark.parametrize(("needed_deg", "lowest", "highest"), [(5.0, 5.0, 9.0), (50.0, 12.0, 15.0)])
-def test_requirements_of_targets_are_kept_or_missed_the_least(monkeypatch, needed_deg, lowest, highest):
+def test_target_requirements_are_met_or_nearly_met(monkeypatch, needed_deg, lowest, highest):
     """The best near is 4 degrees; a child needs 5, or more than the range has."""
     monkeypatch.setattr("torchcover.placement.objective.check", needing(needed_deg))
     result = searched(of=space(requirements=required(points=5)), num_evaluations=24)
@@ -148,7 +148,7 @@ def test_requirements_of_targets_are_kept_or_missed_the_least(monkeypatch, neede
     assert bool(result.best.evaluation.shortfalls) == (needed_deg > 15)
 
 
-def test_a_child_is_looked_for_around_the_vehicle_of_the_space():
+def test_targets_stand_around_the_vehicle_of_the_space():
     for points, is_kept in ((5, True), (10**6, False)):
         search = PlacementSearch(space(requirements=required(points=points)), plan(num_evaluations=1))
         search.evaluate(search.ask())
@@ -179,7 +179,7 @@ def test_numbers_that_ended_on_their_bounds_are_named():
 
 
 @pytest.mark.parametrize("objectives", [("near",), ("near", "far")])
-def test_a_search_that_was_ended_goes_on_to_the_same_candidates(tmp_path, objectives):
+def test_resumed_search_proposes_the_same_candidates(tmp_path, objectives):
     of = space(objectives=objectives)
     whole = searched(tmp_path / "whole", of=of, num_evaluations=14)
     out = tmp_path / "ended"
@@ -197,7 +197,7 @@ def test_a_search_that_was_ended_goes_on_to_the_same_candidates(tmp_path, object
     assert contents(longer.search) == contents(searched(of=of, num_evaluations=16).search)
 
 
-def test_a_budget_that_is_too_small_takes_nothing_away(tmp_path):
+def test_too_small_budget_deletes_nothing(tmp_path):
     searched(tmp_path, num_evaluations=3)
     before = (tmp_path / JOURNAL).read_bytes()
     with pytest.raises(ValueError, match="too short for two evaluations"):
@@ -244,7 +244,7 @@ def test_a_damaged_journal_is_one_line(tmp_path):
         assert "\n" not in str(error.value)
 
 
-def test_a_journal_is_neither_written_through_links_nor_waits_for_locks(tmp_path):
+def test_journal_ignores_stale_locks_and_refuses_links(tmp_path):
     out = tmp_path / "out"
     (tmp_path / "out").mkdir()
     (out / f"{JOURNAL}.lock").symlink_to("nothing")  # a killed process leaves one; Optuna would wait for its end
@@ -300,7 +300,7 @@ def timed(budget_s, monkeypatch):
     return run_search(search, clock=clock), clock
 
 
-def test_a_budget_of_seconds_is_kept_with_the_test_and_proposes_what_a_number_of_evaluations_would(monkeypatch):
+def test_time_budget_proposes_the_same_candidates(monkeypatch):
     # 10 s for 18 frames, 1.8 s a candidate; 48 held-out frames, and three rigs there and here: 46.5 s.
     result, clock = timed(80.0, monkeypatch)
     assert 65 < clock.now < 80
@@ -309,7 +309,7 @@ def test_a_budget_of_seconds_is_kept_with_the_test_and_proposes_what_a_number_of
     assert contents(result.search) == contents(searched(num_evaluations=count).search)
 
 
-def test_a_budget_below_two_evaluations_says_what_they_take(monkeypatch):
+def test_too_short_time_budget_names_the_costs(monkeypatch):
     with pytest.raises(
         ValueError, match=r"30 s is too short for two .* 11\.8 s, .* 1\.8 s, .* 46\.5 s; give at least 62"
     ):
@@ -339,7 +339,7 @@ def only_the_start(rig):
     return np.array([0.5, 0.5])
 
 
-def test_where_no_candidate_is_possible_the_start_stays_and_the_words_say_so():
+def test_start_remains_if_all_candidates_are_infeasible():
     result = searched(num_evaluations=8, worth=only_the_start)
     assert [each.infeasible_reason for each in result.search.evaluations] == ["", *["inside the wall"] * 8]
     assert result.best.is_start
@@ -369,7 +369,7 @@ def tilted():
     return Rig.model_validate({"name": "tilted", "sensors": [lidar]})
 
 
-def test_a_start_that_is_impossible_is_compared_with_but_does_not_win():
+def test_infeasible_start_does_not_win():
     with pytest.warns(UserWarning, match="'tilted' is outside the space"):
         of = space(constraints={"max_self_hit_share": 0.2}, start=tilted())
     result = searched(of=of, num_evaluations=12)
@@ -395,7 +395,7 @@ def test_an_objective_that_is_unknown_is_refused():
         searched(num_evaluations=10, blind=True)
 
 
-def test_noise_alone_and_one_world_are_not_called_a_gain():
+def test_noise_is_not_reported_as_improvement():
     result = searched(num_evaluations=12, worth=lambda rig: np.array([0.5, 0.5]), seed=4)
     assert "gained" not in result.summary
     assert result.best.improvements[0].difference.is_significant is False
@@ -403,7 +403,7 @@ def test_noise_alone_and_one_world_are_not_called_a_gain():
     assert "no significant improvement" in searched(num_evaluations=6, num_scenes=1, num_held_out_scenes=1).summary
 
 
-def test_of_several_objectives_the_ends_of_the_front_and_a_compromise_are_tested():
+def test_pareto_ends_and_compromise_are_validated():
     result = searched(of=space(objectives=("near", "far")), num_evaluations=24)
     assert [each.role for each in result.finalists] == ["compromise", "near", "far"]
     gains = {each.role: result.improvements[each.evaluation.number] for each in result.finalists}
@@ -430,14 +430,14 @@ def test_asking_and_telling_is_what_a_run_does():
         search.tell(start, search.frames.score(start.rig))
 
 
-def test_each_choice_is_tried_once_and_the_search_ends_when_all_were():
+def test_search_ends_after_all_choices():
     of = space(free={"roof": {"model": ("hesai_pandar64", "ouster_os1_64", "ouster_os1_128")}})
     evaluations = searched(of=of, num_evaluations=50).search.evaluations
     tried = [each.values["roof.model"] for each in evaluations[1:]]
     assert sorted(tried) == ["hesai_pandar64", "ouster_os1_128", "ouster_os1_64"]
 
 
-def test_a_real_search_does_not_depend_on_the_number_of_workers(tmp_path):
+def test_search_is_independent_of_workers(tmp_path):
     (tmp_path / "lot.yaml").write_text(
         "name: lot\nego: {shape: {type: box, size_m: [4, 2, 1.5]}}\n"
         "traffic: {type: parking, duration_s: 1.0, time_step_s: 0.2, crossings_per_aisle: 0, parked_share: 0.3}\n"

@@ -29,7 +29,7 @@ def rows(path):
         return list(csv.DictReader(file))
 
 
-def test_the_rig_is_the_best_and_can_be_loaded(one):
+def test_best_rig_can_be_loaded(one):
     result, folder, _ = one
     rig = Rig.load(folder / "best.yaml")
     assert rig == result.rig
@@ -48,7 +48,7 @@ def test_the_summary_comes_last_and_lists_all_files(one):
     assert {path.name for path in folder.iterdir()} == {path.name for path in files} | {JOURNAL}
 
 
-def test_there_is_a_row_for_every_evaluation_and_its_gain_is_the_difference_of_means(one):
+def test_evaluations_have_rows_with_their_improvement(one):
     result, folder, _ = one
     table = rows(folder / "evaluations.csv")
     assert [int(row["number"]) for row in table] == list(range(17))
@@ -61,7 +61,7 @@ def test_there_is_a_row_for_every_evaluation_and_its_gain_is_the_difference_of_m
     assert int(best["number"]) == result.best.evaluation.number
 
 
-def test_a_notebook_is_told_the_sentence_and_has_a_row_for_every_evaluation(one):
+def test_notebook_has_summary_and_evaluation_rows(one):
     result, _, _ = one
     assert result.summary in repr(result)
     assert re.search(r"<strong>.*</strong>.*data:image/png;base64,", result._repr_html_())
@@ -79,7 +79,7 @@ def test_the_record_has_seeds_gains_and_counts(one):
     assert record["strategy_counts"] == result.strategy_counts
 
 
-def test_the_page_shows_the_gains_the_rigs_and_the_pictures(one):
+def test_page_shows_improvements_rigs_and_plots(one):
     result, folder, _ = one
     page = (folder / "report.html").read_text()
     first, *others = re.split(r"(?<=[.]) (?=[A-Z])", result.summary)
@@ -91,14 +91,14 @@ def test_the_page_shows_the_gains_the_rigs_and_the_pictures(one):
     assert f"{result.best.evaluation.values['roof.pitch_deg']:.3f}" in page
 
 
-def test_of_several_objectives_there_are_rigs_of_the_ends_and_a_front(tmp_path):
+def test_several_objectives_write_a_front_and_its_rigs(tmp_path):
     result = run_search(PlacementSearch(space(objectives=("near", "far")), plan(num_evaluations=16)))
     names = {path.name for path in result.save(tmp_path)}
     assert names >= {"best.yaml", "best_near.yaml", "best_far.yaml", "pareto.png"}
     assert [int(row["number"]) for row in rows(tmp_path / "pareto.csv")] == result.search.find_best()
 
 
-def test_where_nothing_can_be_there_are_files_all_the_same(tmp_path):
+def test_infeasible_search_still_writes_files(tmp_path):
     def nowhere(rig):
         if rig.name != "front_roof_32":
             raise ValueError("inside the wall")
@@ -148,13 +148,13 @@ def gain(mean, error, significant, num_scenes=16, quantity=DETECTION):
         (gain(np.nan, np.nan, None), "unknown on held-out scenes"),
     ],
 )
-def test_only_what_is_told_from_chance_is_called_a_gain(found, words):
+def test_only_significant_changes_are_called_improvements(found, words):
     assert describe_improvement(found) == words
     if np.isfinite(found.difference.value):
         assert describe_improvement(found, optimism=True).startswith(f"{words}, optimism ")
 
 
-def test_a_number_that_is_by_no_choice_of_estimate_has_one_row(tmp_path):
+def test_number_without_average_has_one_row(tmp_path):
     objectives = {"near": {"region": "20m"}, "largest": {"number": "radius_maximum_m", "region": "20m"}}
     result = run_search(PlacementSearch(space(objectives=objectives), plan(num_evaluations=16, average="cells")))
     result.save(tmp_path)

@@ -49,7 +49,7 @@ CHOSEN_BY = [Objective(threshold_m=0.3, region=["80m", "20m"]), Objective(region
 
 @pytest.mark.parametrize("measure", ["area", "cells"])
 @pytest.mark.parametrize("objective", CHOSEN_BY)
-def test_what_points_are_worth_is_what_evaluate_says_of_the_rig(objective, measure):
+def test_point_weights_reproduce_evaluate(objective, measure):
     """The OR of what sensors see, in bits, and the coverage of all of them."""
     sensors = [
         lidar("a", mount={"x_m": 2.2, "z_m": 0.6}, horizontal_fov_deg=100),
@@ -66,7 +66,7 @@ def test_what_points_are_worth_is_what_evaluate_says_of_the_rig(objective, measu
 
 
 @pytest.mark.parametrize("measure", ["area", "cells"])
-def test_worlds_that_know_nothing_of_a_part_count_for_nothing(measure):
+def test_scenes_without_a_region_do_not_count(measure):
     yard = {"name": "yard", "ego": EGO, "bodies": [FLOOR]}
     walled = {"name": "walled", "ego": EGO, "bodies": [FLOOR, WALL]}
     scenarios = [type(LOT).model_validate(one) for one in (yard, walled)]
@@ -81,7 +81,7 @@ def test_worlds_that_know_nothing_of_a_part_count_for_nothing(measure):
         compute_point_weights(one)
 
 
-def test_the_choice_is_the_rig_with_the_best_score_and_its_files_say_so(folder):
+def test_selection_is_the_best_scored_rig(folder):
     space = loaded(folder, baseline=["wide_left"])
     with held(space.scenarios, space.scored_objectives, num_scenes=2) as instants:
         found = run_selection(space, instants, test_seed=5, num_held_out_scenes=3)
@@ -119,7 +119,7 @@ def test_the_choice_is_the_rig_with_the_best_score_and_its_files_say_so(folder):
     assert json.loads((folder / "out" / "search.json").read_text())["selections"][0]["is_proven"] is True
 
 
-def test_what_must_not_be_worse_is_kept_by_the_best_of_several_objectives(folder):
+def test_best_selection_meets_not_worse_bounds(folder):
     objectives = {side: {"band": "ground", "region": f"{side}_3m", "threshold_m": 0.3} for side in ("front", "rear")}
     space = loaded(folder, objectives=objectives, baseline=["wide_left"], not_worse=["left_3m"])
     with held(space.scenarios, space.scored_objectives, num_scenes=2) as instants:
@@ -140,7 +140,7 @@ def test_what_must_not_be_worse_is_kept_by_the_best_of_several_objectives(folder
     assert {"best.yaml", "best_front.yaml", "best_rear.yaml"} < written
 
 
-def test_where_no_choice_keeps_what_is_there_the_least_bad_says_by_how_much(folder):
+def test_infeasible_bounds_report_the_smallest_shortfall(folder):
     space = loaded(
         folder, constraints={"max_sensors": 1}, baseline=["wide_front", "wide_rear"], not_worse=["front_3m", "rear_3m"]
     )
@@ -158,7 +158,7 @@ def test_where_no_choice_keeps_what_is_there_the_least_bad_says_by_how_much(fold
     assert f"meets all bounds, and this one has the smallest shortfall: {'; '.join(told)}" in found.summary
 
 
-def test_a_candidate_with_too_many_rays_on_the_vehicle_is_refused(folder):
+def test_candidates_with_many_self_hits_are_refused(folder):
     low = {"front": PLACES["front"], "flat": {"z_m": 1.51}}
     candidates, limits = {"wide": {"sensor": SENSOR, "mounts": low}}, {"max_sensors": 1, "max_self_hit_share": 0.4}
     space = loaded(folder, candidates=candidates, constraints=limits)
@@ -167,7 +167,7 @@ def test_a_candidate_with_too_many_rays_on_the_vehicle_is_refused(folder):
     assert "of its rays hit the vehicle; max_self_hit_share is 40.0%" in found.excluded["wide_flat"]
 
 
-def test_places_all_over_a_region_lie_on_its_skin(tmp_path):
+def test_mount_grid_lies_on_the_region(tmp_path):
     grid = {"region": ["roof", "hood"], "spacing_m": 0.6, "height_m": 0.2, "yaw_deg": [0, 90]}
     candidates = {"wide": {"sensor": SENSOR, "grid": grid}}
     space = loaded(tmp_path, scenario="courtyard", vehicle="suv", candidates=candidates)
@@ -213,7 +213,7 @@ def test_places_all_over_a_region_lie_on_its_skin(tmp_path):
         ({"candidates": {}}, "candidates"),
     ],
 )
-def test_what_cannot_be_chosen_is_refused_in_one_line(folder, changes, message):
+def test_invalid_selection_is_refused_in_one_line(folder, changes, message):
     with pytest.raises(ValueError, match=message) as error:
         loaded(folder, **changes)
     assert "space.yaml" in str(error.value)
@@ -238,7 +238,7 @@ def test_candidates_that_see_nothing_that_counts_are_refused(folder):
         run_selection(space, instants, test_seed=5, num_held_out_scenes=1)
 
 
-def test_of_few_fresh_worlds_there_is_no_error_and_no_gain_is_shown(folder):
+def test_few_held_out_scenes_show_no_improvement(folder):
     space = loaded(folder, baseline=["wide_left"])
     with held(space.scenarios, space.scored_objectives, num_scenes=1) as instants:
         found = run_selection(space, instants, test_seed=5, num_held_out_scenes=1)
@@ -248,7 +248,7 @@ def test_of_few_fresh_worlds_there_is_no_error_and_no_gain_is_shown(folder):
     assert json.loads((folder / "few" / "search.json").read_text())["improvements"]["around, area"]["error"] is None
 
 
-def test_the_example_has_money_for_two_but_not_for_two_wide_ones():
+def test_example_budget_excludes_two_wide_sensors():
     space = SelectionSpace.load(Path(__file__).parents[2] / "examples" / "placement" / "robot_corners.yaml")
     limits = space.build_limits(list(range(12)))
     assert len(space.sensors) == 12

@@ -59,7 +59,7 @@ def _apart(generator):
     return upper | upper.T | np.eye(COUNT, dtype=bool)
 
 
-def test_points_that_the_same_candidates_see_are_one_group_and_values_stay():
+def test_grouping_points_preserves_values():
     candidates, seen, worth = some(0)
     assert len(np.unique(candidates.observes, axis=0)) == len(candidates.observes) < POINTS
     for chosen in ((), (3,), (0, 4, 7), tuple(range(COUNT))):
@@ -72,7 +72,7 @@ def test_points_that_the_same_candidates_see_are_one_group_and_values_stay():
 
 @pytest.mark.parametrize("kind", LIMITS)
 @pytest.mark.parametrize("seed", range(4))
-def test_the_choice_is_the_best_of_all_and_the_cheapest_of_equal_ones(kind, seed):
+def test_selection_is_best_and_cheapest(kind, seed):
     candidates, seen, worth = some(seed)
     limits = LIMITS[kind](np.random.default_rng(seed))
     each = {chosen: slow_values(seen, worth, chosen)[0] for chosen in all_allowed(limits)}
@@ -87,7 +87,7 @@ def test_the_choice_is_the_best_of_all_and_the_cheapest_of_equal_ones(kind, seed
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_what_must_not_be_less_is_kept_or_lacks_the_least(seed):
+def test_lower_bounds_are_met_or_nearly_met(seed):
     candidates, seen, worth = some(seed)
     generator = np.random.default_rng(seed)
     least = np.append(-np.inf, generator.uniform(0.3, 0.9, 2))
@@ -105,7 +105,7 @@ def test_what_must_not_be_less_is_kept_or_lacks_the_least(seed):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_of_several_objectives_the_one_between_is_as_near_to_all_as_the_farthest_allows(seed):
+def test_compromise_minimizes_the_largest_distance(seed):
     candidates, seen, worth = some(seed)
     limits = SelectionLimits(2)
     between, *ends = select_for_objectives(candidates, limits, 2)
@@ -121,7 +121,7 @@ def test_of_several_objectives_the_one_between_is_as_near_to_all_as_the_farthest
     assert select_for_objectives(candidates, limits, 1) == [select_sensors(candidates, limits)]
 
 
-def test_a_solver_without_time_says_how_far_off_it_may_be():
+def test_solver_without_time_reports_its_gap():
     generator = np.random.default_rng(0)
     seen = list(generator.random((60, 3000)) < 0.05)
     coverage = CandidateCoverage.from_points([np.full(3000, 1 / 3000)], seen, np.zeros(3000, dtype=bool))
@@ -130,7 +130,7 @@ def test_a_solver_without_time_says_how_far_off_it_may_be():
     assert selection.gap > 0
 
 
-def test_random_choices_keep_to_the_limits_and_leave_no_room():
+def test_random_selections_meet_limits_and_are_maximal():
     candidates, seen, worth = some(6)
     limits = LIMITS["two for money"](np.random.default_rng(6))
     drawn = sample_selections(candidates, limits, 50, seed=1)

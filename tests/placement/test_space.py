@@ -53,7 +53,7 @@ def place(sensor):
 
 
 @pytest.mark.parametrize("path", SPACES, ids=lambda path: path.stem)
-def test_rigs_of_the_examples_come_back_from_their_files(path, tmp_path):
+def test_example_rigs_survive_saving(path, tmp_path):
     searched = SearchSpace.load(path)
     for values in drawn(searched, 1):
         rig = searched.build_rig(values, "found")
@@ -64,7 +64,7 @@ def test_rigs_of_the_examples_come_back_from_their_files(path, tmp_path):
         assert rig.vehicle == "suv"
 
 
-def test_what_is_not_free_stays_and_what_is_lies_within_its_bounds():
+def test_only_free_values_change_within_bounds():
     searched = space({"left": {"x_m": (-1.0, 0.0), "pitch_deg": (-10.0, 10.0), "roll_deg": 3.0}})
     assert [variable.name for variable in searched.variables] == ["left.x_m", "left.pitch_deg"]
     for values in drawn(searched):
@@ -76,7 +76,7 @@ def test_what_is_not_free_stays_and_what_is_lies_within_its_bounds():
         assert -10.0 <= pitch_deg <= 10.0
 
 
-def test_the_start_is_the_rig_of_its_own_values():
+def test_start_values_reproduce_the_start():
     free = {"left": {"x_m": (-1.0, 0.0), "z_above_body_m": (0.1, 0.3), "yaw_deg": (-90.0, 90.0)}}
     searched = space({**free, "right": {"mirror_of": "left"}}, constraints={"symmetric": True})
     values = searched.get_start_values()
@@ -85,7 +85,7 @@ def test_the_start_is_the_rig_of_its_own_values():
     assert searched.find_violations(PAIR) == ()
 
 
-def test_a_sensor_with_a_quaternion_keeps_it_until_an_angle_is_free():
+def test_quaternion_remains_unless_an_angle_is_free():
     half = np.sqrt(0.5)
     start = PAIR.model_copy(update={"sensors": (lidar("left", z_m=1.8, quaternion_wxyz=(half, 0.0, 0.0, half)),)})
     moved = space({"left": {"x_m": (-1.0, 0.0)}}, start).build_rig({"left.x_m": -0.5}, "moved").sensors[0]
@@ -127,7 +127,7 @@ def test_a_height_above_the_body_is_that():
         assert np.linalg.norm(nearest - below, axis=1).min() < 1e-6
 
 
-def test_a_place_on_a_region_is_as_far_from_the_skin_as_its_height():
+def test_region_mount_keeps_its_height_above_surface():
     regions = ("roof", "grille", "front_bumper", "rear_bumper", "fender_left", "mirror_right")
     searched = space({"left": {"region": regions, "height_m": (0.02, 0.06), "yaw_deg": (-30.0, 30.0)}})
     body, faced = (
@@ -277,7 +277,7 @@ MISTAKES = [
 
 @pytest.mark.filterwarnings("ignore:.*is outside the space")
 @pytest.mark.parametrize(("changed", "message"), MISTAKES)
-def test_a_space_that_cannot_be_searched_is_refused_at_the_door(changed, message, tmp_path):
+def test_invalid_spaces_are_refused(changed, message, tmp_path):
     keys = {"name": "here", "start": "front_roof_32", "scenario": "courtyard", "objectives": NEAR}
     keys["free"] = {"roof": {"pitch_deg": [-5, 5]}}
     path = tmp_path / "space.yaml"
@@ -300,7 +300,7 @@ def test_scenarios_with_different_egos_need_a_vehicle(tmp_path):
         assert SearchSpace(**keys, vehicle="bus").scenarios[1].ego_name == "bus"
 
 
-def test_a_start_outside_of_the_space_is_told_and_has_no_values_there():
+def test_start_outside_the_space_is_reported():
     with pytest.warns(UserWarning, match=r"'pair' is outside the space \(left\.x_m is -0\.5\)"):
         searched = space({"left": {"x_m": (0.0, 0.1), "yaw_deg": (-5.0, 5.0)}})
     assert searched.get_start_values() == {"left.yaw_deg": 0.0}
@@ -315,7 +315,7 @@ def test_a_space_can_be_sent_to_another_process():
     assert again.build_rig(values, "found") == searched.build_rig(values, "found")
 
 
-def test_a_rig_is_written_with_what_it_names_by_file(tmp_path):
+def test_written_rigs_contain_referenced_files(tmp_path):
     model = (EXAMPLES[0].parents[2] / "datasets" / "lidars" / "velodyne_vlp16.yaml").read_text()
     (tmp_path / "mine.yaml").write_text(model)
     (tmp_path / "there").mkdir()

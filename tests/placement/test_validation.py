@@ -13,7 +13,7 @@ WORLDS, PER_WORLD = 6, 3
 WORLD = np.repeat(np.arange(WORLDS), PER_WORLD)
 
 
-def test_gains_are_those_of_a_paired_t_test_and_have_the_direction_of_the_number():
+def test_improvements_follow_a_paired_t_test():
     generator = np.random.default_rng(0)
     one, other = generator.normal(size=(2, 18, 2))
     lower = {"lower_is_better": ["o1"]}
@@ -25,7 +25,7 @@ def test_gains_are_those_of_a_paired_t_test_and_have_the_direction_of_the_number
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_the_pareto_front_is_what_no_other_candidate_dominates_in_any_order(seed):
+def test_pareto_front_contains_all_undominated_candidates(seed):
     values = np.random.default_rng(seed).integers(0, 5, (12, 3)).astype(float)
     order, front = np.random.default_rng(seed).permutation(12), find_non_dominated(values)
     assert np.array_equal(find_non_dominated(values[order]), front[order])
@@ -40,7 +40,7 @@ def test_two_worlds_have_no_error_however_many_frames():
     assert gain[0] == pytest.approx(values.mean())
 
 
-def test_pairing_takes_out_what_a_world_does_to_all():
+def test_pairing_removes_common_scene_effects():
     generator = np.random.default_rng(1)
     city = generator.normal(0, 0.07, (400, 1))
     own = generator.normal([0.5, 0.51], 0.009, (400, 2))
@@ -50,7 +50,7 @@ def test_pairing_takes_out_what_a_world_does_to_all():
     assert (unpaired / error[0]) ** 2 > 30
 
 
-def test_a_number_that_is_by_no_choice_of_estimate_is_tested_once():
+def test_number_without_average_is_tested_once():
     low, high = rig(lidar(mount={"z_m": 1.6}), name="low"), rig(lidar(mount={"z_m": 2.4}), name="high")
     keys = {"near": "radius_m", "largest": "radius_maximum_m", "cells": "cells_radius_m"}
     objectives = {name: Objective(number=key, region="20m") for name, key in keys.items()}
@@ -60,7 +60,7 @@ def test_a_number_that_is_by_no_choice_of_estimate_is_tested_once():
     assert [(gain.objective, gain.average) for gain in found] == said
 
 
-def test_the_fresh_test_is_about_other_worlds_and_says_what_was_optimism(frames):
+def test_validation_uses_other_scenes_and_reports_optimism(frames):
     low, high = rig(lidar(mount={"z_m": 1.6}), name="low"), rig(lidar(mount={"z_m": 2.4}), name="high")
     test = validate({"higher": high}, low, frames, test_seed=1, num_scenes=8)
     found, others = test.improvements["higher"], _list_extra_objectives(frames.objectives, has_failures=False)[0]
@@ -87,7 +87,7 @@ def test_the_fresh_test_is_about_other_worlds_and_says_what_was_optimism(frames)
         held([yard()], {"far": frames.objectives["far"]}).resample(1, 4, {})
 
 
-def test_of_twenty_searches_that_change_nothing_at_most_one_says_that_something_got_worse():
+def test_null_searches_rarely_report_side_effects():
     draws, alarms = np.random.default_rng(0), 0
     for _ in range(200):
         shared = draws.normal(0.0, 1.0, (16, 4)) @ draws.normal(0.0, 1.0, (4, 33))  # regions overlap

@@ -7,7 +7,7 @@ from torchcover.placement.free_sensor import FreeChoice, FreeNumber
 
 
 @pytest.mark.parametrize(("low", "high"), [(-10.0, 15.0), (0.0, 1.0), (1.68, 1.85), (-1e6, 1e6), (0.1234567891, 0.2)])
-def test_a_number_lies_within_its_bounds_and_has_few_digits(low, high):
+def test_free_numbers_are_rounded_within_bounds(low, high):
     number = FreeNumber("roof.x_m", low, high)
     for share in [0.0, 1.0, *np.random.default_rng(0).random(200).tolist()]:
         value = number.get_value(share)

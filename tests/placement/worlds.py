@@ -16,7 +16,13 @@ LOT = Scenario.model_validate(
     {
         "name": "lot",
         "ego": EGO,
-        "traffic": {"type": "parking", "duration_s": 1.0, "time_step_s": 0.2, "crossings_per_aisle": 0, "parked_share": 0.3},
+        "traffic": {
+            "type": "parking",
+            "duration_s": 1.0,
+            "time_step_s": 0.2,
+            "crossings_per_aisle": 0,
+            "parked_share": 0.3,
+        },
     }
 )
 BAY = {"bay": {"polygon_m": [[2.5, -4.0], [9.0, -4.0], [9.0, 5.0]]}}

@@ -31,7 +31,7 @@ def lab(linear):
 
 
 @pytest.mark.parametrize("eyes", SEEING)
-def test_colours_of_plans_are_told_apart_by_all_eyes(eyes):
+def test_plan_colors_suit_color_blind_readers(eyes):
     style = files("torchcover.report.page").joinpath("page.css").read_text(encoding="utf-8")
     codes = [re.search(rf"--{name}: #([0-9a-f]{{6}})", style)[1] for name in ("unseen", "one", "two")]
     shown = np.array([[int(code[at : at + 2], 16) for at in (0, 2, 4)] for code in codes]) / 255
@@ -40,7 +40,7 @@ def test_colours_of_plans_are_told_apart_by_all_eyes(eyes):
     assert min(np.linalg.norm(one - other) for one, other in combinations(lab(seen), 2)) > 30
 
 
-def test_a_share_is_where_its_number_is_and_an_unknown_one_nowhere():
+def test_shares_are_plotted_at_their_values():
     known, unknown = Number(SHARE, 0.42, 0.01, 0.4, 0.44), Number(SHARE, float("nan"))
     text = render_detection_shares([DetectionShares("<b>", {"a": known, "<i>": unknown})])
     assert '<line x1="40.0" x2="44.0"' in text

@@ -44,7 +44,7 @@ def rig(*sensors, **options) -> Picture:
     return Picture(plot_rig(VERTICES, FACES, sensors, title=options.pop("title", "Rig"), **options))
 
 
-def test_a_sensor_sees_within_its_angles_however_it_is_turned():
+def test_field_of_view_follows_the_extrinsics():
     def direction(azimuth, elevation):
         a, e = np.deg2rad([azimuth, elevation])
         return [np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)]
@@ -95,7 +95,7 @@ def test_no_two_of_many_sensors_look_alike():
     assert len({to_rgb(entry.get_color()) for entry in legend.legend_handles}) == 21
 
 
-def test_from_the_side_the_fan_lies_about_the_pitch_and_ends_at_the_ground():
+def test_side_section_follows_pitch_down_to_ground():
     picture = rig(view(high=(-30.0, 10.0)))
     assert picture.tinted(1, 4.0, 1.1)
     assert picture.tinted(1, 4.0, 0.1)
@@ -105,7 +105,7 @@ def test_from_the_side_the_fan_lies_about_the_pitch_and_ends_at_the_ground():
     assert below == pytest.approx(picture.at(1, -1.0, -0.2))
 
 
-def test_a_full_turn_is_a_fan_to_the_front_and_one_to_the_rear():
+def test_full_turn_has_front_and_rear_sections():
     picture = rig(view(at=(0.0, 0.0, 2.0), wide=360.0, high=(-10.0, 10.0)))
     assert picture.tinted(1, 3.0, 2.0)
     assert picture.tinted(1, -3.0, 2.0)
@@ -113,7 +113,7 @@ def test_a_full_turn_is_a_fan_to_the_front_and_one_to_the_rear():
     assert [text.get_text() for text in picture.figure.axes[1].texts].count("1") == 2
 
 
-def test_the_numbers_of_many_sensors_stand_on_the_paper_however_short_the_vehicle():
+def test_sensor_numbers_stay_on_the_paper():
     sensors = [view(yaw, at=(0.0, 0.0, 0.5), name=f"s{yaw}") for yaw in np.linspace(0, 2 * np.pi, 8, endpoint=False)]
     figure = plot_rig(0.2 * VERTICES, FACES, sensors, title="Robot")
     axes = figure.axes[0]
@@ -123,14 +123,14 @@ def test_the_numbers_of_many_sensors_stand_on_the_paper_however_short_the_vehicl
     assert all(x0 < x < x1 and y0 < y < y1 for x, y in numbers_m.values())
 
 
-def test_a_sensor_that_looks_sideways_is_marked_though_it_has_no_fan():
+def test_sideways_sensor_is_marked_without_section():
     picture = rig(view(yaw=90.0), view())
     labels = [text.get_text() for text in picture.figure.axes[1].texts]
     assert labels.count("1") == 1
     assert labels.count("2") == 1
 
 
-def test_every_sensor_is_named_with_its_angles_and_nothing_is_clipped():
+def test_sensors_are_named_and_nothing_is_clipped():
     sensors = [view(yaw=30.0 * k, name=f"${k} a sensor with a long name") for k in range(9)]
     picture = rig(*sensors, title="A title that is longer than the paper is wide " * 3, subtitle="small")
     (legend,) = [axes.get_legend() for axes in picture.figure.axes if axes.get_legend()]
@@ -168,7 +168,7 @@ def scene(**options) -> Picture:
     return Picture(plot_scene((-20.0, 30.0), (-10.0, 10.0), **(given | options)))
 
 
-def test_what_stands_is_drawn_the_darker_the_higher_and_the_ground_is_not():
+def test_static_faces_are_darker_with_height():
     squares = [(box(x, 5)[:3], height) for x, height in ((10, 0.0), (15, 0.3), (20, 8.0))]
     standing = StaticFaces(np.array([corners for corners, _ in squares]), np.array([height for _, height in squares]))
     picture = scene(static_faces=standing)
@@ -179,7 +179,7 @@ def test_what_stands_is_drawn_the_darker_the_higher_and_the_ground_is_not():
     assert entries[0] == "static objects, higher ones darker"
 
 
-def test_actors_are_where_they_are_in_the_colour_of_their_category():
+def test_actors_have_category_colors():
     actors = [ActorMark("car", box(20, 5)), ActorMark("car", box(10, -5)), ActorMark("bus", box(-10, 5))]
     picture = scene(actors=[*actors, ActorMark("car", box(99, 0))])
     alone = scene(actors=actors[2:])
@@ -192,7 +192,7 @@ def test_actors_are_where_they_are_in_the_colour_of_their_category():
     assert entries[2:] == ["car (2)", "bus (1)", "ego vehicle"]
 
 
-def test_the_way_of_the_ego_is_drawn_if_it_moves():
+def test_path_of_a_moving_ego_is_plotted():
     picture = scene(path_m=np.array([[-10.0, -5.0], [25.0, -5.0]]))
     assert picture.at(0, 10.0, -5.0) == pytest.approx(to_rgb(PARAMS.path_color), abs=0.3)
     assert scene().at(0, 10.0, -5.0) == pytest.approx((1, 1, 1))
@@ -213,7 +213,7 @@ def depths(images, **options) -> Picture:
     return Picture(plot_depth_images(images, title=options.pop("title", "Depths"), **options))
 
 
-def test_a_depth_image_stands_upright_and_shows_what_has_no_depth():
+def test_depth_image_is_upright_with_marked_gaps():
     image = np.full((20, 30), 10.0)
     image[:5] = np.inf
     image[-5:] = 2.0
@@ -230,7 +230,7 @@ def test_a_depth_image_stands_upright_and_shows_what_has_no_depth():
     assert entries == ["nothing within range (22.5 % of the pixels)", "no ray: beyond the lens (10.0 % of the pixels)"]
 
 
-def test_depth_images_of_one_rig_share_their_colours_and_twice_as_far_is_one_step():
+def test_depth_images_share_a_logarithmic_scale():
     near, middle, far, all_of_them = (np.full((10, 12), value) for value in (4.0, 8.0, 16.0, 4.0))
     all_of_them[:5] = 16.0
     picture = depths({"a": near, "b": middle, "c": far, "d": all_of_them})
@@ -240,7 +240,7 @@ def test_depth_images_of_one_rig_share_their_colours_and_twice_as_far_is_one_ste
     assert picture.at(1, 5, 5) == pytest.approx(colormaps["viridis_r"](0.5)[:3], abs=0.02)
 
 
-def test_images_of_several_sizes_keep_square_pixels_and_do_not_overlap():
+def test_depth_images_keep_square_pixels():
     picture = depths({f"camera {k}": np.full((10 + 5 * k, 30), 1.0 + k) for k in range(8)})
     *views, bar = picture.figure.axes
     boxes = [axes.get_window_extent() for axes in views]
@@ -251,7 +251,7 @@ def test_images_of_several_sizes_keep_square_pixels_and_do_not_overlap():
 
 
 @pytest.mark.parametrize("image", [np.full((3, 3), np.inf), np.full((3, 3), np.nan), np.full((1, 1), 7.0)])
-def test_images_without_a_range_of_depths_are_drawn_too(image):
+def test_constant_depth_images_are_plotted(image):
     assert depths({"only": image}).figure.axes
 
 
@@ -275,13 +275,13 @@ def test_what_is_no_image_is_refused(images, message):
         (45.0, (-15.0, 15.0), 2.0, 2.0 / np.tan(np.deg2rad(30.0))),
     ],
 )
-def test_a_field_of_view_from_above_ends_on_the_ground(pitch, high, height_m, reach_m):
+def test_field_of_view_ends_on_the_ground(pitch, high, height_m, reach_m):
     sensor = view(pitch=pitch, at=(1.0, 0.0, height_m), wide=2.0, high=high)
     assert np.linalg.norm(sensor.compute_outline_m(1e4) - (1.0, 0.0), axis=1).max() == pytest.approx(reach_m, rel=0.01)
 
 
 @pytest.mark.parametrize(("pitch_deg", "roll_deg"), [(90.0, 0.0), (0.0, 90.0)])
-def test_a_tilted_lidar_is_drawn_with_its_true_field_of_view(pitch_deg, roll_deg):
+def test_tilted_lidar_has_its_true_field_of_view(pitch_deg, roll_deg):
     """On its side, it sees as far as its range along its plane, and across it no farther than its elevations allow."""
     pose = build_transform(convert_euler_to_rotation(0.0, pitch_deg, roll_deg), (1.0, 2.0, 1.5))
     view = SensorView("tilted", pose, 360.0, (-15.0, 15.0), 50.0)

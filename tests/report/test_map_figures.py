@@ -61,7 +61,7 @@ def colours(figure: Figure) -> np.ndarray:
 # One rig
 
 
-def test_there_is_a_figure_for_each_quantity_and_band(tmp_path):
+def test_each_quantity_and_band_has_a_figure(tmp_path):
     coverage = coverage_of(SQUARE, thresholds_m=(1.0,))
     keys = ("radius_m", "detection_1m")
     paths = write_figures(plot_maps({"a": coverage}, ego_outline_m=EGO), tmp_path / "new" / "maps")
@@ -74,7 +74,7 @@ def test_there_is_a_figure_for_each_quantity_and_band(tmp_path):
         assert 1000 < width < 2000
 
 
-def test_maps_show_what_was_asked_for_and_is_known_and_the_ego():
+def test_maps_show_observed_regions_and_ego():
     metric = CoverageMetric(SQUARE, regions=[Region("ahead", (0.0, 20.0), (-10.0, 10.0))])
     metric.update(torch.zeros(1, 3), torch.tensor([[x, y, 0.0] for x in (-15.5, 9.5) for y in (-3.5, 4.5)]))
     figures = dict(plot_maps({"a": metric.compute()}, ego_outline_m=EGO))
@@ -88,7 +88,7 @@ def test_maps_show_what_was_asked_for_and_is_known_and_the_ego():
     assert values.count() == 2
 
 
-def test_the_near_field_is_two_lengths_of_the_ego_to_scale_and_nothing_lies_over_it():
+def test_near_field_map_spans_two_ego_lengths():
     sensors = {"a": [SensorView("roof", np.eye(4), 90.0, (-10.0, 10.0), 8.0)]}
     coverage = blocked(16)
     near = dict(plot_maps({"a": coverage}, ego_outline_m=EGO, sensors=sensors))["near_field_radius_m"]
@@ -133,7 +133,7 @@ class Emptiness(Aggregation):
         return [Layer(Quantity("emptiness", "share of emptiness", "share", lower_is_better=True), sums["sum"] + 0.5)]
 
 
-def test_a_quantity_of_ones_own_is_drawn_without_being_known():
+def test_custom_quantities_are_plotted():
     coverage = coverage_of(SMALL, thresholds_m=(), aggregations=(Emptiness(),))
     figure = dict(plot_maps({"a": coverage}))["emptiness_all"]
     assert words(figure)[0] == "Share of emptiness, all"
@@ -150,7 +150,7 @@ def test_the_bands_of_a_quantity_share_their_colours():
 
 
 @pytest.mark.usefixtures("blank_maps")
-def test_any_band_name_becomes_a_file_in_the_folder_and_no_two_share_one(tmp_path):
+def test_band_names_become_distinct_file_names(tmp_path):
     bands = ["../up", "a/b", "a\\b", "A b", "a_b_3", "$x$", "long" * 99, "Höhe", "\n"]
     heights = {name: (float(at), at + 1.0) for at, name in enumerate(bands)}
     grid = BevGrid(x_m=(0.0, 2.0), y_m=(0.0, 1.0), cell_m=1.0, heights=heights)
@@ -173,7 +173,7 @@ def test_the_sensors_of_the_rig_are_named():
     assert {"the lidar", "ego vehicle"} <= set(legend(figure))
 
 
-def test_the_bands_of_a_quantity_lie_side_by_side_for_loggers():
+def test_band_maps_are_side_by_side():
     figures = dict(plot_band_maps(coverage_of(SQUARE)))
     assert list(figures) == ["radius_m", "detection_0.4m"]
     headings = [axes.texts[0].get_text() for axes in figures["radius_m"].axes[:2]]
@@ -184,7 +184,7 @@ def test_the_bands_of_a_quantity_lie_side_by_side_for_loggers():
 
 
 @pytest.mark.usefixtures("blank_maps")
-def test_there_is_a_difference_for_each_rig_but_the_first(pair, measure, points, tmp_path):
+def test_each_later_rig_has_a_difference_map(pair, measure, points, tmp_path):
     three = {**pair, "a/b": measure(points(40, 5))}
     paths = write_figures(plot_maps(three, ego_outline_m=EGO), tmp_path)
     places = [f"{key}_{band}" for key in ("radius_m", "detection_0.4m") for band in BANDS]
@@ -194,7 +194,7 @@ def test_there_is_a_difference_for_each_rig_but_the_first(pair, measure, points,
     assert sorted(path.name for path in paths) == sorted(expected)
 
 
-def test_a_worse_place_is_red_and_a_better_one_blue_whatever_is_measured(measure):
+def test_worse_cells_are_red_and_better_blue(measure):
     """The second rig sees at the front left only, the first at the rear right only."""
     front_left, rear_right = torch.tensor([[11.0, 4.0, 0.0]]), torch.tensor([[-4.0, -4.0, 0.0]])
     rigs = {"first": measure(rear_right, thresholds_m=(5.0,)), "second": measure(front_left, thresholds_m=(5.0,))}
@@ -210,7 +210,7 @@ def test_a_worse_place_is_red_and_a_better_one_blue_whatever_is_measured(measure
         assert blue_y.mean() < red_y.mean()
 
 
-def test_a_difference_says_which_minus_which_and_what_is_better(pair):
+def test_difference_title_names_rigs_and_direction(pair):
     differences = [words(figure) for name, figure in plot_maps(pair) if name.startswith("difference")]
     quantities = ("mean blind spot radius", "detection within 0.4 m")
     expected = [f"many minus few: {quantity}, {band}" for quantity in quantities for band in BANDS]
@@ -218,7 +218,7 @@ def test_a_difference_says_which_minus_which_and_what_is_better(pair):
     assert all(subtitle.startswith("blue: many is better, red: few is better; z ") for _, subtitle in differences)
 
 
-def test_the_difference_scale_is_symmetric_and_robust_and_turns_with_what_is_better():
+def test_difference_scale_is_symmetric_and_robust():
     differences = torch.cat([torch.linspace(-1.0, 0.5, 1000), torch.tensor([900.0, float("nan"), float("inf")])])
     scale = build_difference_scale(RADIUS, differences)
     assert scale.low == -scale.high
@@ -229,7 +229,7 @@ def test_the_difference_scale_is_symmetric_and_robust_and_turns_with_what_is_bet
     assert build_difference_scale(RADIUS, torch.zeros(9)).high > 0
 
 
-def test_what_is_not_paired_is_refused_before_anything_is_drawn(measure, points):
+def test_unpaired_coverages_are_refused(measure, points):
     with pytest.raises(ValueError, match="'a' and 'b' cannot be compared"):
         plot_maps({"a": measure(points(9, 1)), "b": measure(points(9, 1), seed=7)})
 

@@ -64,7 +64,7 @@ def draw(values: torch.Tensor, grid: BevGrid = SQUARE, **options) -> Picture:
     return Picture(plot_side_by_side({"": values}, grid, scale, title=title, **options))
 
 
-def test_a_blind_spot_at_the_front_left_is_dark_at_the_upper_right():
+def test_front_left_blind_spot_is_upper_right():
     values = flat()
     values[17:19, 35:38] = 1.0  # y = 7 to 9 m, x = 15 to 18 m
     dark = draw(values).map.sum(axis=2) < 0.8
@@ -75,7 +75,7 @@ def test_a_blind_spot_at_the_front_left_is_dark_at_the_upper_right():
 
 
 @pytest.mark.parametrize("extent", [(40, 40), (1000, 400), (160, 9), (3, 50)])
-def test_every_cell_is_drawn_as_a_whole_number_of_equal_pixels(extent):
+def test_cells_are_whole_numbers_of_pixels(extent):
     columns, rows = extent
     grid = BevGrid(x_m=(0.0, columns / 4), y_m=(0.0, rows / 4), cell_m=0.25)
     values = torch.rand(rows, columns, generator=torch.Generator().manual_seed(0))
@@ -93,7 +93,7 @@ def test_every_cell_is_drawn_as_a_whole_number_of_equal_pixels(extent):
     assert (np.diff(green[order]) <= 0).all()
 
 
-def test_cells_smaller_than_a_pixel_are_averaged_not_dropped():
+def test_cells_below_pixel_size_are_averaged():
     grid = BevGrid(x_m=(0.0, 600.0), y_m=(0.0, 6.0), cell_m=0.1)
     stripes = flat(0.0, grid)
     stripes[:, ::2] = 1.0
@@ -101,7 +101,7 @@ def test_cells_smaller_than_a_pixel_are_averaged_not_dropped():
     assert inside.std(axis=(0, 1)).max() < 0.05
 
 
-def test_unknown_cells_are_grey_and_named_with_their_share():
+def test_unobserved_cells_are_gray_with_their_share():
     values = flat()
     values[:, :10] = math.nan
     picture = draw(values)
@@ -112,7 +112,7 @@ def test_unknown_cells_are_grey_and_named_with_their_share():
     assert picture.legend[0] == "unobserved (25.0 % of the cells)"
 
 
-def test_infinite_cells_have_a_colour_of_their_own_and_leave_the_scale_alone():
+def test_infinite_cells_do_not_change_the_scale():
     values = flat(0.5)
     values[:, 20:] = math.inf
     picture = draw(values, scale=build_color_scale(RADIUS, values))
@@ -131,13 +131,13 @@ def test_values_beyond_the_colours_are_admitted():
     assert bar.get_window_extent().height < draw(flat(0.5)).bar.get_window_extent().height
 
 
-def test_rounding_is_not_taken_for_values_beyond_the_colours():
+def test_rounding_is_not_beyond_the_scale():
     values = flat(1.0).double() * (0.1 + 0.2)
     assert "beyond" not in draw(values, scale=build_color_scale(RADIUS, values)).bar.get_ylabel()
 
 
 @pytest.mark.parametrize(("yaw", "ahead"), [(0, (1, 0)), (90, (0, 1)), (180, (-1, 0)), (-90, (0, -1))])
-def test_a_positive_yaw_turns_the_arrow_to_the_left(yaw, ahead):
+def test_positive_yaw_turns_the_arrow_left(yaw, ahead):
     picture = draw(flat(), sensors=[marked("lidar", 3.0, 2.0, yaw, 90.0, math.inf)])
     reach = 10 * picture.metres_per_point  # half an arrow, in metres
     for other in ((1, 0), (0, 1), (-1, 0), (0, -1)):
@@ -145,7 +145,7 @@ def test_a_positive_yaw_turns_the_arrow_to_the_left(yaw, ahead):
         assert dark == (other == ahead)
 
 
-def test_the_field_of_view_is_drawn_around_the_yaw_up_to_the_range():
+def test_field_of_view_is_centered_on_yaw():
     picture = draw(flat(), sensors=[marked("camera", 0.0, 0.0, 90.0, 60.0, 8.0)])
 
     def is_crossed(angle_deg: float, reaches: np.ndarray) -> bool:
@@ -161,7 +161,7 @@ def test_the_field_of_view_is_drawn_around_the_yaw_up_to_the_range():
     assert not is_crossed(60.0, np.linspace(8.4, 10.0, 30))
 
 
-def test_a_field_of_view_without_range_reaches_across_the_map_without_an_arc():
+def test_unlimited_field_of_view_has_no_arc():
     picture = draw(flat(), sensors=[marked("camera", -20.0, 0.0, 0.0, 20.0, math.inf)])
     end = range(math.ceil(0.9 * picture.map.shape[1]), picture.map.shape[1] - 5)
     rows, columns = np.nonzero(picture.map[5:-5, end].sum(axis=2) < 0.5)
@@ -172,7 +172,7 @@ def test_a_field_of_view_without_range_reaches_across_the_map_without_an_arc():
     assert y_m.min() < 0.0 < y_m.max()
 
 
-def test_several_sensors_are_numbered_and_those_close_together_share_a_label():
+def test_close_sensors_share_a_label():
     at = (("a", 0.0, 0.0), ("b", 0.2, 0.0), ("c", 0.0, 180.0))
     sensors = [marked(name, x_m, 0.0, yaw, 90.0, 10.0) for name, x_m, yaw in at]
     picture = draw(flat(), sensors=[*sensors, marked("$away$", 99.0, 0.0, 0.0, 90.0, 10.0)])
@@ -192,7 +192,7 @@ def test_the_ego_is_filled_and_named():
     assert "ego vehicle" in picture.legend
 
 
-def test_nothing_is_clipped_and_the_legend_hides_no_data():
+def test_nothing_is_clipped_or_hidden():
     sensors = [marked(f"a sensor with a long name, number {n}", 0.0, 0.0, 45.0 * n, 90.0, 10.0) for n in range(8)]
     title = "A title that is much longer than this narrow map is wide, and that nobody would ever write"
     narrow = BevGrid(x_m=(-1.0, 1.0), y_m=(-20.0, 20.0), cell_m=1.0)
@@ -213,7 +213,7 @@ def test_dollars_are_no_formula():
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, 0.0, 1e-9, 1e9])
-def test_a_map_of_one_cell_or_one_value_can_be_drawn(value):
+def test_single_cell_and_constant_maps_are_plotted(value):
     grid = BevGrid(x_m=(0.0, 1.0), y_m=(0.0, 1.0), cell_m=1.0)
     values = flat(value, grid)
     picture = draw(values, grid, scale=build_color_scale(RADIUS, values))
@@ -221,7 +221,7 @@ def test_a_map_of_one_cell_or_one_value_can_be_drawn(value):
     assert unknown == f"unobserved ({100 if math.isnan(value) else 0} % of the cells)"
 
 
-def test_the_radius_scale_ends_at_the_98th_percentile_of_the_known_cells():
+def test_radius_scale_ends_at_98th_percentile():
     radius = torch.cat([torch.linspace(0.0, 1.0, 1000), torch.full((5,), 500.0), torch.tensor([math.nan, math.inf])])
     assert build_color_scale(RADIUS, radius).high == pytest.approx(0.99, abs=0.01)
 
@@ -237,7 +237,7 @@ def test_dark_means_blind_in_every_scale():
         assert picture.at(blind, 5.0).sum() < 1.0 < picture.at(-blind, 5.0).sum()
 
 
-def test_a_few_blind_cells_among_perfect_ones_still_set_the_scale():
+def test_few_blind_cells_set_the_scale():
     assert build_color_scale(RADIUS, torch.tensor([0.0] * 999 + [3.14])).high == 3.2
 
 
@@ -248,7 +248,7 @@ def test_drawing_leaves_the_global_state_of_matplotlib_alone():
     assert pyplot.get_fignums() == []
 
 
-def test_less_opaque_cells_are_nearer_to_the_grey_of_unknown_ones():
+def test_less_opaque_cells_are_grayer():
     values, opacity = flat(1.0), torch.linspace(0.0, 1.0, 40).expand(20, 40)
     picture = draw(values, opacity=opacity)
     grey, pale, full = (picture.at(x_m, 3.3) for x_m in (-19.6, 0.5, 19.5))
@@ -262,7 +262,7 @@ def test_less_opaque_cells_are_nearer_to_the_grey_of_unknown_ones():
     assert not any(entry.startswith("paler") for entry in draw(values).legend)
 
 
-def test_what_is_unknown_or_infinite_is_so_whatever_its_opacity():
+def test_opacity_does_not_hide_unobserved_or_infinite():
     values = flat(0.5)
     values[:, :10], values[:, 30:] = math.nan, math.inf
     opaque, none = torch.ones(20, 40), torch.zeros(20, 40)

@@ -50,7 +50,7 @@ def header(table: CoverageTable) -> list[str]:
     return next(csv.reader(io.StringIO(RENDERERS["csv"](table))))
 
 
-def test_a_row_has_the_mean_over_the_surface_and_how_much_of_it_there_is():
+def test_row_has_mean_and_visible_area():
     (part,) = build_page_tables(CoverageTable.from_coverages({"rig": two_cells()}, [WALL, NOTHING]))
     wall, nothing = [[cell.text for cell in row] for row in part.rows]
     assert wall[:4] == ["wall", "all", "0.25", "75.0"]
@@ -60,7 +60,7 @@ def test_a_row_has_the_mean_over_the_surface_and_how_much_of_it_there_is():
 
 
 @pytest.mark.parametrize("measure", ["area", "cells"])
-def test_a_column_says_in_words_what_it_says_in_files(measure, table, trio, regions):
+def test_column_titles_match_file_keys(measure, table, trio, regions):
     table = table if measure == "area" else CoverageTable.from_coverages({"few": trio["few"]}, regions)
     assert len({column.key for column in COLUMNS}) == len(COLUMNS)
     assert {column.key for column in COLUMNS} <= set(header(table))
@@ -81,7 +81,7 @@ def test_files_have_both_measures_each_under_its_name():
 
 
 @pytest.mark.parametrize("band_frame", ["ground", "vehicle"])
-def test_every_row_of_a_file_names_what_its_band_is_over(band_frame):
+def test_file_rows_name_the_band_frame(band_frame):
     grid = BevGrid(x_m=(0.0, 4.0), y_m=(0.0, 2.0), cell_m=1.0, band_frame=band_frame)
     metric, point = CoverageMetric(grid), torch.tensor([[0.5, 0.5, 0.0]])
     metric.update(point, point, heights_m=torch.zeros(1) if band_frame == "ground" else None)
@@ -101,7 +101,7 @@ def test_records_are_those_of_the_summary(table, surface_pair, regions):
             assert record[key] != record[f"cells_{key}"]
 
 
-def test_the_surface_adds_the_numbers_over_known_cells_and_no_other_column(table, trio, regions):
+def test_area_averages_add_only_cell_averages(table, trio, regions):
     known = CoverageTable.from_coverages({name: trio[name] for name in table.rigs}, regions)
     more = {f"cells_{key}{end}" for key in KEYS for end in ("", "_error", "_low", "_high")}
     assert [name for name in header(table) if name not in more] == header(known)
@@ -122,13 +122,13 @@ def test_without_a_region_no_measure_is_told(surface_pair):
     assert SURFACE not in RENDERERS["text"](table)
 
 
-def test_what_rigs_share_is_said_in_the_words_of_the_measure(table, trio, regions):
+def test_common_reference_note_names_the_average(table, trio, regions):
     surface, known = list_notes(table)[0], list_notes(CoverageTable.from_coverages(trio, regions))[0]
     assert surface.endswith("so that the visible surface is the same.")
     assert known.endswith("so that the same cells are observed.")
 
 
-def test_maps_are_those_of_the_measure_and_name_what_is_unknown():
+def test_maps_follow_the_average():
     figures = dict(plot_maps({"rig": two_cells()}))
     assert list(figures) == ["radius_area_m_all", "detection_area_0.4m_all"]
     for figure in figures.values():
@@ -143,5 +143,5 @@ def test_maps_are_those_of_the_measure_and_name_what_is_unknown():
     assert figures["detection_area_0.4m_all"].axes[1].get_ylabel() == "detection within 0.4 m, by area (%)"
 
 
-def test_the_bands_of_loggers_are_those_of_the_measure():
+def test_band_maps_follow_the_average():
     assert [name for name, _ in plot_band_maps(two_cells())] == ["radius_area_m", "detection_area_0.4m"]

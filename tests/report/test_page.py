@@ -190,7 +190,7 @@ def test_a_browser_has_nothing_to_complain_about(seen):
     assert seen[1] == []
 
 
-def test_the_hover_shows_the_cell_as_it_is_in_the_file(seen, named, tmp_path):
+def test_hover_shows_the_saved_cell(seen, named, tmp_path):
     found, row, column = seen[0], 7, 11  # of (3.6, 2.4)
     cells = []
     for name, coverage in zip(("few", "many"), named.values(), strict=True):
@@ -230,7 +230,7 @@ def test_a_difference_says_what_both_are(seen, named):
     assert f"blue: many is better; red: {NASTY} is better" in seen[0]["difference_legend"]
 
 
-def test_menus_offer_what_there_is_and_a_choice_stays(seen):
+def test_menus_list_all_choices_and_keep_them(seen):
     quantities, bands, rigs, views = seen[0]["menus"]
     assert quantities == [TITLE, "detection within 0.4 m, by area"]
     assert bands == ["ground, z -0.5 to 0.5 m", "obstacle, z 0.5 to 2 m"]
@@ -241,7 +241,7 @@ def test_menus_offer_what_there_is_and_a_choice_stays(seen):
     assert seen[0]["from_gallery"] == f"{TITLE}, obstacle, z 0.5 to 2 m, many"
 
 
-def test_a_map_is_moved_and_read_by_pointer_and_by_keys(seen):
+def test_map_responds_to_pointer_and_keys(seen):
     found = seen[0]
     assert found["single"]
     assert np.allclose(found["dragged"], [-1.0, -0.5], atol=0.05)
@@ -251,13 +251,13 @@ def test_a_map_is_moved_and_read_by_pointer_and_by_keys(seen):
     assert words.startswith("x ")
 
 
-def test_lengths_have_the_colours_of_the_place_that_is_looked_at(seen, named):
+def test_length_colors_follow_the_view(seen, named):
     whole, region = (ends[-1] for ends in seen[0]["ends"])
     largest = max(coverage.layers["radius_area_m"].values.nan_to_num().max().item() for coverage in named.values())
     assert 0 < region < whole <= 1.05 * largest
 
 
-def test_a_wide_table_fits_the_paper_and_breaks_no_short_heading(tmp_path):
+def test_wide_table_fits_the_paper(tmp_path):
     """Eight sensors on A4 with margins of 12 mm: 186 mm."""
     if CHROMIUM is None:
         pytest.skip("no Chromium here: nobody looks at the page")
@@ -279,7 +279,7 @@ def test_a_wide_table_fits_the_paper_and_breaks_no_short_heading(tmp_path):
     assert "<title>true,1</title>" in dom
 
 
-def test_the_map_draws_the_true_field_of_view_of_a_tilted_sensor(named, tmp_path):
+def test_page_map_shows_the_tilted_field_of_view(named, tmp_path):
     """Points of all lines and arcs, in metres, of a LiDAR on its side, a camera that looks down, and a level LiDAR."""
     if CHROMIUM is None:
         pytest.skip("no Chromium here: nobody looks at the page")
@@ -319,12 +319,12 @@ def test_the_map_draws_the_true_field_of_view_of_a_tilted_sensor(named, tmp_path
     assert sizes_m[2] == pytest.approx([50.0, 50.0])
 
 
-def test_two_fingers_zoom_and_pointers_that_are_lost_let_go(seen):
+def test_two_fingers_zoom_and_lost_pointers_release(seen):
     assert seen[0]["pinched"] == pytest.approx(2.0)
     assert seen[0]["let_go"]
 
 
-def test_what_was_not_looked_at_longest_is_forgotten_within_a_budget_of_memory(seen):
+def test_oldest_views_leave_the_memory_budget(seen):
     assert seen[0]["remembered"] == [["a", "c"], 120e6]
 
 
@@ -335,7 +335,7 @@ def test_names_are_text(seen):
     assert found["bold"] == 0
 
 
-def test_a_page_is_one_file_that_asks_for_nothing(named):
+def test_page_is_one_file_without_requests(named):
     text = render_page(page_of(named))
     without_names = text.replace("http-equiv", "")
     assert re.findall(r"(?:src|href)=|https?:|url\((?!#)|@import", without_names) == []
@@ -420,7 +420,7 @@ def test_no_page_has_more_than_half_a_megabyte(rigs):
         assert len(render_page(Page("rig", "lead", maps=noisy(rigs), **given))) < 0.5e6
 
 
-def test_cells_taken_together_have_their_mean_by_weight_and_the_page_says_so():
+def test_merged_cells_have_weighted_means():
     whole = noisy(1)[0]
     known = replace(whole, values=np.where(np.arange(800) < 700, whole.values, np.nan))
     (same,), _, silence = fit_maps([known], max_chars=10**7)

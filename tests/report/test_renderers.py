@@ -67,7 +67,7 @@ def as_field(value: object) -> str:
     return "" if value is None else str(float(value) if value in ("Infinity", "-Infinity") else value)
 
 
-def test_csv_reads_back_as_json_and_json_as_the_table(table):
+def test_csv_and_json_match_the_table(table):
     rows = json_of(table)["rows"]
     assert csv_rows(table) == [{name: as_field(value) for name, value in row.items()} for row in rows]
     for record, row in zip(rows, [row for rows in table.rows.values() for row in rows], strict=True):
@@ -90,13 +90,13 @@ def test_csv_reads_back_as_json_and_json_as_the_table(table):
             assert record[f"{key}_best"] is (key in row.leading_keys)
 
 
-def test_text_and_markdown_have_the_same_cells_and_they_are_those_of_the_parts(table):
+def test_text_and_markdown_have_equal_cells(table):
     parts = [[cell.text for cell in row] for part in build_page_tables(table) for row in part.rows]
     assert text_cells(table) == parts
     assert markdown_cells(table) == [[cell.replace("  ", " ") for cell in row] for row in parts]
 
 
-def test_what_is_marked_in_text_is_bold_in_markdown(trio, regions):
+def test_marked_cells_are_bold_in_markdown(trio, regions):
     table = CoverageTable.from_coverages(trio, regions)
     signs = re.findall(r"│ +([*!]) ", RENDERERS["text"](table))
     bold = re.findall(r"\*\*[^*]+\*\*", RENDERERS["markdown"](table))
@@ -111,7 +111,7 @@ def test_no_renderer_calls_anything_nan(table):
         assert "nan" not in render(table).lower()
 
 
-def test_the_columns_are_the_same_for_one_rig_and_for_several_which_have_more(trio, regions):
+def test_several_rigs_only_add_columns(trio, regions):
     one, three = (list(csv_rows(CoverageTable.from_coverages(of, regions))[0]) for of in ({"few": trio["few"]}, trio))
     assert three[: len(one)] == one
     assert one[:5] == ["rig", "region", "band", "radius_m", "radius_m_error"]
@@ -155,7 +155,7 @@ def test_infinity_survives_json_and_is_not_unknown(blind, regions):
     assert content["rows"][2]["radius_m"] is None
 
 
-def test_names_that_look_like_markup_stay_what_they_are(trio, regions):
+def test_markup_in_names_is_escaped(trio, regions):
     names = ["a|b", "[bold]:car:[/bold]", "_x_*y* `z` <b> &amp; \\"]
     table = CoverageTable.from_coverages(dict(zip(names, trio.values(), strict=True)), regions)
     text, markdown = RENDERERS["text"](table), RENDERERS["markdown"](table)
@@ -168,18 +168,18 @@ def test_names_that_look_like_markup_stay_what_they_are(trio, regions):
     assert [row["rig"] for row in csv_rows(table)[::4]] == names
 
 
-def test_names_without_special_signs_are_left_alone_in_markdown(trio, regions):
+def test_plain_names_are_unchanged_in_markdown(trio, regions):
     table = CoverageTable.from_coverages({"front_roof_128": trio["few"], "it's 5 < 6 & more": trio["many"]}, regions)
     assert "| front_roof_128 | it's 5 < 6 & more |" in RENDERERS["markdown"](table)
 
 
-def test_the_notes_of_the_caller_are_in_what_a_reader_reads(trio, regions):
+def test_notes_of_the_caller_are_rendered(trio, regions):
     table = CoverageTable.from_coverages(trio, regions, ["Reference sensor: a cat."])
     assert "Reference sensor: a cat." in RENDERERS["text"](table)
     assert "* Reference sensor: a cat." in RENDERERS["markdown"](table)
 
 
-def test_a_renderer_of_ones_own_needs_no_more_than_what_is_public(trio, regions):
+def test_custom_renderer_needs_only_public_names(trio, regions):
     def as_html(table: CoverageTable) -> str:
         cells = ("<td>{}</td>".format(f"<b>{cell.text}</b>" if cell.mark else cell.text) for cell in cells_of(table))
         legend = [f"{BOLD_MARKS[mark]}: {meaning}" for mark, meaning in explain_marks(table).items()]
@@ -197,5 +197,5 @@ def test_a_renderer_of_ones_own_needs_no_more_than_what_is_public(trio, regions)
 
 
 @pytest.mark.parametrize(("steps", "explained"), [(4, False), (24, True)])
-def test_the_mark_of_chance_is_explained_where_there_are_errors(trios, regions, steps, explained):
+def test_significance_mark_is_explained_with_errors(trios, regions, steps, explained):
     assert ("significant" in explain_marks(CoverageTable.from_coverages(trios(steps), regions))) is explained

@@ -38,7 +38,7 @@ def side_by_side(grid: BevGrid, arrays: dict[str, torch.Tensor], **options) -> F
     return plot_side_by_side(arrays, grid, build_color_scale(RADIUS, torch.ones(2)), title="Title", **options)
 
 
-def test_the_same_value_has_the_same_colour_in_every_panel():
+def test_equal_values_have_equal_colors():
     values = torch.full(GRID.shape[1:], 0.5)
     figure = side_by_side(GRID, {"a": values, "b": values * torch.linspace(0.0, 2.0, 20)})
     first, second = panel(figure, 0), panel(figure, 1)
@@ -48,7 +48,7 @@ def test_the_same_value_has_the_same_colour_in_every_panel():
     assert len(figure.axes) == 3  # two maps, one colour bar
 
 
-def test_long_maps_lie_below_each_other_and_square_ones_beside_each_other():
+def test_long_maps_stack_and_square_maps_align():
     long = BevGrid(x_m=(0.0, 50.0), y_m=(-10.0, 10.0), cell_m=1.0)
     for grid, stacked in ((long, True), (SQUARE, False)):
         for names in ("ab", "abc"):
@@ -62,7 +62,7 @@ def test_long_maps_lie_below_each_other_and_square_ones_beside_each_other():
 
 @pytest.mark.parametrize("count", [2, 3, 5])
 @pytest.mark.parametrize("grid", [GRID, AROUND, BevGrid(x_m=(0.0, 200.0), y_m=(-40.0, 40.0), cell_m=0.5)])
-def test_every_panel_has_whole_pixels_for_each_cell_and_overlaps_no_other(count, grid):
+def test_panels_have_whole_pixels_without_overlap(count, grid):
     generator = torch.Generator().manual_seed(0)
     values = torch.rand(grid.shape[1:], generator=generator)
     figure = side_by_side(grid, {f"rig {k}": values for k in range(count)}, subtitle="where")
@@ -82,7 +82,7 @@ def test_every_panel_has_whole_pixels_for_each_cell_and_overlaps_no_other(count,
         assert (edge == 1.0).all()
 
 
-def test_every_panel_is_headed_and_the_legend_says_everything_once():
+def test_panels_have_headings_and_one_legend():
     sensor = SensorView("lidar", np.eye(4), 90.0, (-9.0, 9.0), 5.0)
     arrays = {"$a": torch.zeros(GRID.shape[1:]), "b": torch.full(GRID.shape[1:], math.inf)}
     figure = side_by_side(GRID, arrays, ego_outline_m=EGO, sensors={"$a": [sensor], "b": [sensor]})

@@ -59,7 +59,7 @@ def cut(points: np.ndarray, sides: np.ndarray, y: int, x: int, side: int) -> Non
         sides[y : y + side, x : x + side] = side
 
 
-def test_squares_are_cut_where_every_quarter_has_points_enough_or_none(coverage, sides):
+def test_squares_split_only_with_enough_points(coverage, sides):
     expected = np.zeros(GRID.shape, dtype=int)
     for band in range(2):
         for y in range(0, GRID.shape[1], 8):
@@ -70,7 +70,7 @@ def test_squares_are_cut_where_every_quarter_has_points_enough_or_none(coverage,
 
 
 @pytest.mark.parametrize(("cell_m", "largest"), [(0.25, 8), (0.3, 4), (1.0, 2), (2.0, 1), (5.0, 1)])
-def test_no_square_is_larger_than_two_metres_unless_the_cell_is(cell_m, largest):
+def test_squares_are_at_most_two_meters(cell_m, largest):
     points = torch.zeros(1, 20, 20, dtype=torch.int64)
     points[0, 9, 9] = 1
     square = compute_square_sides(points, cell_m) == largest
@@ -79,14 +79,14 @@ def test_no_square_is_larger_than_two_metres_unless_the_cell_is(cell_m, largest)
     assert square[0, 9, 9]
 
 
-def test_where_points_are_many_a_cell_has_its_own_ratio(coverage, sides):
+def test_dense_cells_keep_their_own_ratio(coverage, sides):
     alone = (sides == 1) & (coverage.point_counts > 0)
     assert int(alone.sum()) > 40
     for found, key in zip(compute_ratios(coverage.area_sums, sides), list(coverage.layers)[3:], strict=True):
         assert torch.equal(found[alone], coverage.layers[key].values[alone])
 
 
-def test_a_square_has_the_ratio_of_the_sums_of_its_cells(coverage, sides):
+def test_square_has_the_ratio_of_sums(coverage, sides):
     m2, *sums = coverage.area_sums.sum_blocks().numpy()
     sums = np.stack(sums)
     found = compute_ratios(coverage.area_sums, sides).numpy()
@@ -96,7 +96,7 @@ def test_a_square_has_the_ratio_of_the_sums_of_its_cells(coverage, sides):
         np.testing.assert_allclose(found[:, band, y, x], expected, rtol=1e-12)
 
 
-def test_what_is_drawn_weighs_as_much_as_the_region_has(coverage, sides):
+def test_map_weights_equal_the_region(coverage, sides):
     m2 = sum_over_squares(coverage.area_sums.sum_blocks()[0], sides)
     each = m2 / sum_over_squares(torch.ones_like(m2), sides)
     for band, height in enumerate(GRID.heights):
@@ -106,7 +106,7 @@ def test_what_is_drawn_weighs_as_much_as_the_region_has(coverage, sides):
         torch.testing.assert_close(weighted, coverage.estimate(ALL, height).value, rtol=1e-12, atol=0)
 
 
-def test_a_place_without_a_square_metre_is_unknown_and_has_no_opacity(coverage, sides):
+def test_cells_without_area_are_transparent(coverage, sides):
     seen = sum_over_squares(coverage.area_sums.sum_blocks()[0], sides) > 0
     assert 0 < int(seen.sum()) < seen.numel()
     assert torch.equal(compute_ratios(coverage.area_sums, sides).isfinite(), seen.expand(3, -1, -1, -1))
@@ -126,14 +126,14 @@ def sums_of(m2: torch.Tensor) -> BlockSums:
     return listed_of(m2, torch.zeros(1, m2.numel()))
 
 
-def test_opacity_grows_with_the_surface_up_to_that_of_open_ground():
+def test_opacity_grows_with_visible_area():
     m2 = torch.tensor([0.0, 1e-9, 0.01, 0.1, 10 * CELL_M**2, 50.0]).double()[None, None]
     one = torch.ones(m2.shape, dtype=torch.int64)
     nothing, *rising, full, more = compute_opacity(sums_of(m2), 10, one, CELL_M).flatten().tolist()
     assert nothing == 0 < MapParams.min_opacity < rising[0] < rising[1] < rising[2] < full == more == 1
 
 
-def test_open_ground_is_opaque_in_squares_that_the_grid_cuts_off_too():
+def test_open_ground_is_opaque_at_grid_edges():
     ground = torch.full((1, 5, 5), 10 * CELL_M**2).double()
     for side in (1, 2, 4, 8):
         opacity = compute_opacity(sums_of(ground), 10, torch.full((1, 5, 5), side), CELL_M)
@@ -153,7 +153,7 @@ def test_infinity_stays_in_its_square():
 
 
 @pytest.mark.parametrize(("cell", "drawn_m"), [(0.25, 0.25), (0.15, 0.15), (0.125, 0.25), (0.05, 0.2)])
-def test_small_cells_are_drawn_in_squares_with_the_same_numbers(cell, drawn_m):
+def test_small_cells_are_merged_without_change(cell, drawn_m):
     """Neither side of the grid is a whole number of squares; a region's ratio is that of its squares."""
     grid = BevGrid(
         x_m=(0.0, 46 * cell), y_m=(0.0, 25 * cell), cell_m=cell, heights={"low": (0.0, 1.0), "high": (1.0, 2.0)}

@@ -38,7 +38,7 @@ def test_one_rig_has_neither_marks_nor_differences(trio, regions):
         assert not row.differences
 
 
-def test_the_order_of_the_rigs_changes_no_number_and_no_mark(trio, regions):
+def test_rig_order_changes_no_number(trio, regions):
     expected = CoverageTable.from_coverages(trio, regions)
     for order in permutations(trio):
         table = CoverageTable.from_coverages({rig: trio[rig] for rig in order}, regions)
@@ -49,7 +49,7 @@ def test_the_order_of_the_rigs_changes_no_number_and_no_mark(trio, regions):
                 assert row.leading_keys == same.leading_keys
 
 
-def test_a_rig_against_itself_differs_nowhere_and_none_is_marked(measure, points, regions):
+def test_equal_rigs_have_no_marks(measure, points, regions):
     one = measure(points(50, 1), thresholds_m=(0.4, 1.0))
     table = CoverageTable.from_coverages({"a": one, "b": one}, regions)
     for rows in table.rows.values():
@@ -75,7 +75,7 @@ def test_two_blind_rigs_are_equal_not_unknown(blind, regions):
     assert not any(row.leading_keys for row in rows.values())
 
 
-def test_the_best_is_marked_where_its_lead_over_the_next_is_more_than_chance(trio, regions):
+def test_only_significant_leads_are_marked(trio, regions):
     table = CoverageTable.from_coverages(trio, regions)
     for rows in table.rows_by_region[:2]:
         for key in ("radius_m", "detection_0.4m"):
@@ -97,7 +97,7 @@ def test_remarks_are_made_of_what_did_happen_only(blind, trios, regions):
     assert names(CoverageTable.from_coverages({"few": trios(5)["few"]}, ()), "few") == {"no_region", "too_few_blocks"}
 
 
-def test_there_is_nothing_to_remark_where_every_cell_is_known():
+def test_fully_observed_tables_have_no_notes():
     grid = BevGrid(x_m=(0.0, 4.0), y_m=(0.0, 2.0), cell_m=1.0, heights={"ground": (-0.5, 0.5)})
     metric = CoverageMetric(grid)
     metric.update(torch.zeros(1, 3), torch.cartesian_prod(torch.arange(4) + 0.5, torch.arange(2) + 0.5, torch.zeros(1)))

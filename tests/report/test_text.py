@@ -61,7 +61,7 @@ def cells_of(text: str, region: str) -> list[str]:
     return [cell.strip() for cell in line.strip("│").split("│")]
 
 
-def test_a_row_shows_metres_percent_and_the_share_of_known_cells():
+def test_row_shows_meters_percent_and_observed_share():
     assert cells_of(text_of(one_cell_known(), NEAR, FAR), "near") == ["near", "ground", "0.40", "50.0", "100", "25.0"]
 
 
@@ -103,7 +103,7 @@ def test_without_regions_the_table_says_so():
     assert "No region" in text_of(one_cell_known())
 
 
-def test_every_number_has_its_interval_with_the_digits_of_its_error():
+def test_intervals_have_the_digits_of_the_error():
     coverage = over_steps(64)
     (row,) = coverage.summary([NEAR])
     near, within = row.numbers["radius_m"], row.numbers["detection_0.4m"]
@@ -128,7 +128,7 @@ def test_brackets_are_explained_where_there_are_any(differ):
     assert ("Brackets" in text) == differ
 
 
-def test_a_region_that_one_block_alone_has_probed_has_a_number_without_error():
+def test_single_block_region_has_no_error():
     coverage = metric(num_blocks=16)
     for index in range(16):
         x = 2.5 if index == 3 else 0.5
@@ -140,7 +140,7 @@ def test_a_region_that_one_block_alone_has_probed_has_a_number_without_error():
 
 
 @pytest.mark.parametrize(("steps", "blocks", "needed"), [(1, "1 block", 11), (7, "7 blocks", 9)])
-def test_too_few_steps_for_an_error_are_told_once_and_never_as_0(steps, blocks, needed):
+def test_too_few_frames_are_reported_once(steps, blocks, needed):
     text = text_of(over_steps(steps), NEAR)
     assert "[" not in text
     assert text.count(f"Not enough frames for confidence intervals: got {blocks}, about {needed} are needed.") == 1
@@ -161,7 +161,7 @@ def test_notes_about_one_rig_name_it(blind, regions):
     assert "seeing:" not in text
 
 
-def test_from_too_few_steps_no_difference_is_called_significant(trios, regions):
+def test_few_frames_give_no_significant_difference(trios, regions):
     text = printed(trios(5), regions)
     assert "[" not in text
     assert (
@@ -179,7 +179,7 @@ def test_the_parts_of_the_table_have_equal_columns(pair, regions):
 
 
 @pytest.mark.parametrize("rigs", [2, 5, 9])
-def test_on_a_narrow_terminal_names_fold_but_numbers_stay_whole(pair, regions, rigs):
+def test_narrow_terminal_folds_only_names(pair, regions, rigs):
     one, other = pair.values()
     named = {f"rig_number_{at}_with_a_long_name": (one, other)[at % 2] for at in range(rigs)}
     narrowest = compute_min_width(build_rich_tables(CoverageTable.from_coverages(named, regions)), list(named))
@@ -188,7 +188,7 @@ def test_on_a_narrow_terminal_names_fold_but_numbers_stay_whole(pair, regions, r
 
 
 @pytest.mark.parametrize("steps", [5, 24])
-def test_on_a_narrow_terminal_numbers_with_errors_stay_whole(trios, regions, steps):
+def test_narrow_terminal_keeps_intervals_whole(trios, regions, steps):
     names = ("a_rig_with_quite_a_long_name", "another_rig_with_a_long_name", "and_one_more_of_those")
     named = dict(zip(names, trios(steps).values(), strict=True))
     narrowest = compute_min_width(build_rich_tables(CoverageTable.from_coverages(named, regions), 1), names)
@@ -206,7 +206,7 @@ def assert_whole(named, regions, narrowest, pattern, more_than) -> None:
 
 
 @pytest.mark.parametrize("rigs", [1, 3])
-def test_in_a_file_names_are_whole_however_narrow_it_says_it_is(trio, regions, rigs):
+def test_files_keep_names_whole(trio, regions, rigs):
     named = {f"rig_number_{at}_with_a_long_name": coverage for at, coverage in enumerate(list(trio.values())[:rigs])}
     text = printed(named, regions, 20, terminal=False)
     assert "mean blind spot" in text
@@ -215,7 +215,7 @@ def test_in_a_file_names_are_whole_however_narrow_it_says_it_is(trio, regions, r
 
 
 @pytest.mark.parametrize("rigs", [1, 3, 5])
-def test_tables_of_words_are_folded_to_eighty_columns_where_the_width_is_not_known(capsys, rigs):
+def test_text_tables_fold_to_eighty_columns(capsys, rigs):
     names, met = [f"rig_number_{at}" for at in range(rigs)], "child from behind a parked car: hatchback"
     times = [[f"{1.5 + speed / 100 + at:.2f} to 9.{speed}, too late" for at in range(rigs)] for speed in (10, 20, 30)]
     rows = [[TextCell(text) for text in (met, str(10 * k), "0.73", *of)] for k, of in enumerate(times, 1)]
@@ -231,7 +231,7 @@ def test_tables_of_words_are_folded_to_eighty_columns_where_the_width_is_not_kno
     assert words.count("late") == 3 * rigs
 
 
-def test_a_table_of_words_that_fits_is_not_folded(capsys):
+def test_fitting_text_table_is_not_folded(capsys):
     print_page_tables(
         [PageTable("", ("a b", "c"), [[TextCell("one two"), TextCell("3")], [TextCell("one two"), TextCell("4")]])]
     )
@@ -239,7 +239,7 @@ def test_a_table_of_words_that_fits_is_not_folded(capsys):
     assert (printed.count("one two"), len(printed.splitlines()[0])) == (2, 15)
 
 
-def test_with_many_sensors_each_has_a_row_and_eighty_columns_are_enough():
+def test_many_sensors_have_rows_within_eighty_columns():
     sensors = [f"sensor_number_{at}" for at in range(8)]
     coverage = metric(thresholds_m=(0.4,), num_blocks=16, sensor_names=sensors)
     for index in range(16):

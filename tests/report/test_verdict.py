@@ -31,7 +31,7 @@ def with_bodies(table, shares, best=None, places=30):
     return replace(table, target_rows=bodies)
 
 
-def test_of_one_rig_the_farthest_region_ahead_is_told_with_its_interval(trio):
+def test_one_rig_reports_the_farthest_forward_region(trio):
     (sentence,) = summarize_findings(CoverageTable.from_coverages({"few": trio["few"]}, AHEAD))
     assert sentence.startswith("Detected to 12 m ahead (a point within 0.4 m): of 120 observed cells of ground ")
     table = CoverageTable.from_coverages({"few": trio["few"]}, AHEAD)
@@ -40,7 +40,7 @@ def test_of_one_rig_the_farthest_region_ahead_is_told_with_its_interval(trio):
     assert told == [round(100 * row.summary.numbers[table.mean_quantities[1].key].value) for row in rows]
 
 
-def test_of_several_only_who_leads_by_more_than_chance_is_told(trio):
+def test_several_rigs_report_only_significant_leaders(trio):
     table = CoverageTable.from_coverages({name: trio[name] for name in ("few", "many")}, AHEAD)
     (sentence,) = summarize_findings(table)
     assert re.search(
@@ -105,7 +105,7 @@ def test_bodies_come_first(trio, shares, best, sentence):
     assert sentence in first
 
 
-def test_few_places_that_all_say_the_same_are_no_answer(trio):
+def test_few_agreeing_positions_are_not_reported(trio):
     table = CoverageTable.from_coverages({"many": trio["many"]}, AHEAD)
     for places, told in ((29, False), (30, True)):
         words = " ".join(summarize_findings(with_bodies(table, {"many": 1.0}, places=places)))
@@ -118,7 +118,7 @@ def test_few_places_that_all_say_the_same_are_no_answer(trio):
     (lambda index: 40 * (index < 3), 16, "No single point of failure: no failure of a sensor changes a number significantly by 10 % or more"),
     (lambda index: 30 + index % 2, 4, "Largest effect of a failure: without roof, detection within 0.01 m in "),
 ])  # fmt: skip
-def test_a_single_point_of_failure_costs_a_tenth_or_more_beyond_chance(alone, blocks, sentence):
+def test_single_point_of_failure_loses_a_tenth_significantly(alone, blocks, sentence):
     """So many of 100 points does the roof see alone; sixty others are seen by both sensors."""
     grid = BevGrid(x_m=(-8.0, 12.0), y_m=(-5.0, 5.0), cell_m=1.0)
     metric = CoverageMetric(

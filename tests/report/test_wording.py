@@ -26,14 +26,14 @@ NUMBERS = st.tuples(
 
 
 @given(st.floats(0.0, 1.0))
-def test_only_nothing_is_0_percent_and_only_all_is_100(share):
+def test_only_exact_shares_are_0_or_100(share):
     assert (format_percent(share) in ("0", "0.0")) == (share == 0.0)
     assert (format_percent(share) in ("100", "100.0")) == (share == 1.0)
     assert abs(float(format_percent(share).strip("<>")) - 100 * share) <= 0.1
 
 
 @given(st.floats(0.0, 1e3), st.floats(1e-11, 1e2))
-def test_a_number_and_its_ends_have_the_decimals_of_its_error(value, error):
+def test_numbers_have_the_decimals_of_their_error(value, error):
     words = format_number(Number(RADIUS, value, error, value - 3 * error, value + 3 * error))
     shown = [float(end) for end in re.fullmatch(r"[<>]?(\S+)  \[(\S+), (\S+)\]", words).groups()]
     (decimals,) = {len(number.partition(".")[2]) for number in re.findall(r"[\d.]+", words)}
@@ -45,14 +45,14 @@ def test_a_number_and_its_ends_have_the_decimals_of_its_error(value, error):
 
 
 @given(st.floats(0.0, 1.0))
-def test_with_a_tiny_error_only_nothing_is_0_percent_and_only_all_is_100(share):
+def test_tiny_errors_keep_shares_off_0_and_100(share):
     words = format_number(Number(SHARE, share, 1e-9))
     assert (words == "0.000") == (share == 0.0)
     assert (words == "100.000") == (share == 1.0)
 
 
 @given(st.floats(-2.0, 2.0), st.floats(1e-9, 1.0))
-def test_a_difference_has_a_sign_and_none_is_minus_nothing(difference, error):
+def test_differences_have_a_sign_but_no_minus_zero(difference, error):
     words = format_difference(Difference(RADIUS, difference, error))
     assert words[0] == ("-" if float(words) < 0 else "+" if float(words) else "0")
     if float(words):
@@ -60,12 +60,12 @@ def test_a_difference_has_a_sign_and_none_is_minus_nothing(difference, error):
 
 
 @given(NUMBERS, NUMBERS, st.sampled_from([RADIUS, SHARE]))
-def test_two_numbers_are_equal_if_and_only_if_they_look_the_same(a, b, quantity):
+def test_equal_numbers_look_the_same(a, b, quantity):
     look_the_same = format_number(Number(quantity, *a)) == format_number(Number(quantity, *b))
     assert (round_number(*a, quantity.unit) == round_number(*b, quantity.unit)) is look_the_same
 
 
-def test_without_an_error_or_an_interval_there_is_a_number_alone():
+def test_number_without_error_stands_alone():
     shares = [format_number(Number(SHARE, *number)) for number in ((1.0, math.nan), (0.0, 0.0), (0.5, 1e-17))]
     assert shares == ["100", "0", "50.0"]
     assert format_number(Number(RADIUS, 0.2, 0.013)) == "0.200"
@@ -76,7 +76,7 @@ def test_without_an_error_or_an_interval_there_is_a_number_alone():
     assert format_error(math.nan, "m") == "unknown"
 
 
-def test_infinity_and_the_unknown_have_neither_digits_nor_intervals():
+def test_infinite_and_missing_numbers_have_no_interval():
     assert format_number(Number(RADIUS, math.inf)) == format_value(math.inf, "m") == "infinite"
     assert format_difference(Difference(SHARE, math.inf, 1.0)) == "+infinite"
     assert format_difference(Difference(RADIUS, -math.inf)) == "-infinite"

@@ -26,7 +26,7 @@ def test_it_has_a_line_for_each_setting():
     assert figure.legends[0].get_title().get_text() == "rays"
 
 
-def test_lines_look_different_and_more_than_there_are_markers_are_drawn_too():
+def test_lines_differ_beyond_the_number_of_markers():
     drawn = lines(plot_work_precision(panel("abcdefghij"), title=""))
     assert len({(line.get_color(), line.get_marker()) for line in drawn.values()}) == 10
 
