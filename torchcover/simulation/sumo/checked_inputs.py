@@ -51,6 +51,7 @@ def copy_checked(path: Path, target_path: Path, kind: Literal["network", "routes
     with target_path.open("w", encoding="utf-8") as copy:
 
         def start_element(name: str, names_and_values: list[str]) -> None:
+            # Attributes are checked and copied as the parser understands them.
             attributes = list(zip(names_and_values[::2], names_and_values[1::2], strict=True))
             attributes = [(key, value) for key, value in attributes if not is_ignored(key)]
             check_attribute_count(name, len(names_and_values) // 2)
@@ -67,7 +68,14 @@ def copy_checked(path: Path, target_path: Path, kind: Literal["network", "routes
 
 
 def is_ignored(key: str) -> bool:
-    """Test whether an attribute changes no motion: pictures of SUMO's windows, and files of emission models."""
+    """Test whether an attribute changes no motion.
+
+    Args:
+        key: Name of the attribute.
+
+    Returns:
+        True for pictures of SUMO's windows and files of emission models.
+    """
     return key in ("imgFile", "osgFile", "emissionClass")
 
 

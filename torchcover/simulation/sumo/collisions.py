@@ -7,7 +7,7 @@ import shapely
 
 from torchcover.geometry.arrays import Bools
 from torchcover.simulation.sumo.motion import Motion
-from torchcover.simulation.sumo.paths import do_rectangles_overlap
+from torchcover.simulation.sumo.paths import find_overlapping_rectangles
 
 
 def drop_colliding_users(motions: Sequence[Motion]) -> list[Motion]:
@@ -24,6 +24,7 @@ def drop_colliding_users(motions: Sequence[Motion]) -> list[Motion]:
     counts = overlaps.sum(axis=1)
     counts[0] = -1
     stays = np.ones(len(motions), dtype=bool)
+    # Road users with few overlaps decide first, beginning with the ego vehicle.
     for index in np.argsort(counts, kind="stable").tolist():
         if stays[index]:
             stays[overlaps[index]] = False
@@ -63,6 +64,7 @@ def find_overlapping_users(
             start = begin - part_first_frames[part]
             chunk = all_poses[max(start, 0) : max(start + chunk_frames, 0)]
             poses[max(-start, 0) :, part][: len(chunk)] = chunk
+        # Only bodies whose bounding boxes overlap within these frames are compared.
         present = np.flatnonzero(np.isfinite(poses[..., 0]).any(axis=0))
         positions_m = poses[:, present, :2]
         lower_m = np.fmin.reduce(positions_m) - radii_m[present]
@@ -70,7 +72,7 @@ def find_overlapping_users(
         boxes = shapely.box(*lower_m.T, *upper_m.T)
         pairs = present[shapely.STRtree(boxes).query(boxes)]
         first, second = pairs[:, users[pairs[0]] < users[pairs[1]]]
-        is_overlapping = do_rectangles_overlap(poses[:, first], sizes_m[first], poses[:, second], sizes_m[second])
+        is_overlapping = find_overlapping_rectangles(poses[:, first], sizes_m[first], poses[:, second], sizes_m[second])
         is_same_level = np.abs(poses[:, first, 3] - poses[:, second, 3]) < min_level_distance_m
         is_colliding = (is_overlapping & is_same_level).any(axis=0)
         first_users, second_users = users[first[is_colliding]], users[second[is_colliding]]

@@ -12,7 +12,7 @@ from torchcover.simulation.sumo.xml_stream import pair_attributes, parse_xml_str
 from torchcover.simulation.traffic.assemble import HORIZON_M
 from torchcover.simulation.traffic.fleet import CATEGORIES, EGO, Fleet, VehicleType
 
-# SUMO's default lengths by vehicle class; all others have that of a car.
+# SUMO's default lengths by vehicle class; other classes have the length of a car.
 CAR_LENGTH_M = 5.0
 DEFAULT_LENGTHS_M = {
     "pedestrian": 0.215, "bicycle": 1.6, "scooter": 1.2, "moped": 2.1, "motorcycle": 2.2, "truck": 7.1,
@@ -50,10 +50,21 @@ def get_vehicle_type(name: str, known_types: Mapping[str, VehicleType]) -> Vehic
 
 @guard_reader("routes of SUMO")
 def read_vehicle_types(path: Path) -> dict[str, VehicleType]:
-    """Read the vehicle types that a file of routes declares."""
+    """Read the vehicle types that a file of routes declares.
+
+    Args:
+        path: The file.
+
+    Returns:
+        Types by their names.
+
+    Raises:
+        BadFileError: It is not XML, or a length is not positive.
+    """
     types: dict[str, VehicleType] = {}
 
     def start_element(name: str, names_and_values: list[str]) -> None:
+        """Store the type if the tag declares one."""
         attributes = pair_attributes(names_and_values)
         if name != "vType" or "id" not in attributes:
             return
@@ -106,11 +117,12 @@ def select_road_users(
         ego = _find_ego(users, floating_car_data, ego_id, duration_s)
     else:
         ego = _sample_ego(users, floating_car_data, ego_type, duration_s, generator)
-    nearby = [user for user in users if user is not ego and comes_near(user.track, ego.track)]
+    nearby = [user for user in users if user is not ego and is_ever_near(user.track, ego.track)]
     return ego._replace(kind=EGO, part_sizes_m=fleet.get_sizes_m(EGO)), nearby
 
 
 def _format_window(data: FloatingCarData, duration_s: float) -> str:
+    """Format the times between which the ego vehicle must be present."""
     return f"from t = {data.begin_s:g} to {data.begin_s + duration_s:g} s"
 
 
@@ -122,6 +134,7 @@ def _find_ego(users: Sequence[RoadUser], data: FloatingCarData, ego_id: str, dur
             return user
     if not tracks:
         raise ValueError(f"ego_id: no vehicle {ego_id!r} up to t = {data.last_time_s:g} s, where the data end")
+    # The message proposes the duration of the first track with this name.
     present_s = float(tracks[0].track.times_s[-1])
     end_s = data.begin_s + present_s
     raise ValueError(
@@ -154,6 +167,7 @@ def _sample_ego(
             "duration_s or begin_s"
         )
     weights = []
+    # A vehicle that stands has a small probability, too, so that the sum is never 0.
     for user in candidates:
         steps_m = np.linalg.norm(np.diff(user.track.front_positions_m[:, :2], axis=0), axis=1)
         weights.append(steps_m.sum() + 1e-3)
@@ -161,10 +175,17 @@ def _sample_ego(
     return candidates[int(generator.choice(len(candidates), p=shares / shares.sum()))]
 
 
-def comes_near(track: SumoTrack, ego_track: SumoTrack) -> bool:
-    """Test whether a road user ever comes within the range of sensors of the ego vehicle."""
+def is_ever_near(track: SumoTrack, ego_track: SumoTrack) -> bool:
+    """Test whether a road user ever comes within `HORIZON_M` of the ego vehicle.
+
+    Args:
+        track: Track of the road user.
+        ego_track: Track of the ego vehicle.
+    """
     ego_m = ego_track.front_positions_m[:, :2]
+    # Road users that are always present share their times.
     if track.times_s is not ego_track.times_s:
-        columns_m = [np.interp(track.times_s, ego_track.times_s, axis_m, np.nan, np.nan) for axis_m in ego_m.T]
-        ego_m = np.stack(columns_m, axis=1)
+        x_m = np.interp(track.times_s, ego_track.times_s, ego_m[:, 0], np.nan, np.nan)
+        y_m = np.interp(track.times_s, ego_track.times_s, ego_m[:, 1], np.nan, np.nan)
+        ego_m = np.column_stack([x_m, y_m])
     return bool((np.linalg.norm(track.front_positions_m[:, :2] - ego_m, axis=1) < HORIZON_M).any())

@@ -38,7 +38,11 @@ class SumoTrack(NamedTuple):
     slope_deg: Float64
 
     def is_present_for(self, duration_s: float) -> bool:
-        """Test whether the track lasts from the start of the window for a duration."""
+        """Test whether the track lasts from the start of the window on.
+
+        Args:
+            duration_s: Duration for which the road user must be present.
+        """
         return bool(self.times_s[0] <= TIME_SLACK_S and self.times_s[-1] >= duration_s - TIME_SLACK_S)
 
 
@@ -92,7 +96,12 @@ class FloatingCarDataParser:
         self.has_more_digits = True
 
     def start_element(self, name: str, attributes: list[str]) -> None:
-        """Process a start tag from `parse_xml_stream`."""
+        """Process a start tag from `parse_xml_stream`.
+
+        Args:
+            name: Name of the element.
+            attributes: Names and values of its attributes, in turn.
+        """
         if name == "vehicle":
             self._vehicles.append(attributes)
         elif name == "person":
@@ -143,6 +152,7 @@ class FloatingCarDataParser:
         """Parse the values of all attributes that the rows share."""
         if not rows:
             return {"id": (), "x": (), "y": (), "angle": ()}
+        # Usually all rows have the same attributes; then their values are transposed without a dict for each row.
         names = rows[0][::2]
         if any(row[::2] != names for row in rows):
             dicts = [dict(zip(row[::2], row[1::2], strict=True)) for row in rows]
@@ -159,6 +169,7 @@ class FloatingCarDataParser:
         return dict(zip(names, values, strict=True))
 
     def _store_rows(self, columns: dict[str, tuple[str, ...]], is_person: bool) -> None:
+        """Store the rows of the vehicles or of the people of a time step."""
         num_rows = len(columns["id"])
         if not num_rows:
             return
@@ -270,6 +281,7 @@ def _iterate_tracks(parser: FloatingCarDataParser) -> Iterator[SumoTrack]:
         raise ValueError(f"{int((~is_finite).any(axis=1).sum())} of {len(rows)} positions are NaN or infinite")
     check_meters(rows[:, :2], speed_mps, times_s, parser.has_more_digits)
     median_step_s = float(np.median(np.diff(times_s))) if len(times_s) > 1 else 0.0
+    # The rows of each road user, in the order of time.
     order = np.argsort(row_indices, kind="stable")
     ends = np.cumsum(np.bincount(row_indices, minlength=len(parser.type_names))).tolist()
     for (is_person, name), index in parser.indices.items():

@@ -65,6 +65,7 @@ def fill_height_field(sums_m: Float64, weights: Float64, num_smoothings: int = 4
     means_m: Float64 = sums_m / np.where(has_weight, weights, 1.0)
     if has_weight.all() or min(means_m.shape) < 2:
         return means_m if has_weight.any() else np.zeros_like(means_m)
+    # The coarser grid has cells of twice the size.
     rows, columns = means_m.shape
     coarse = []
     for grid in (sums_m, weights):
@@ -105,7 +106,7 @@ def compute_tilts_deg(ground: Ground, positions_m: Float64, yaw_deg: Float64, si
 
 
 class Sidewalks:
-    """All sidewalks and medians: areas that are neither for vehicles nor crossings.
+    """Sidewalks and medians: areas that are neither for vehicles nor crossings.
 
     Args:
         vicinity: Part of a network.
@@ -120,6 +121,7 @@ class Sidewalks:
         half_sliver_m = 0.1  # half of the width below which parts of an area vanish: no sidewalk is as narrow
         gap_m, crossing_gap_m = 0.3, 1.3  # gaps between sidewalks, and before crossings, that networks leave
         self._ground = ground
+        # Erosion and dilation remove slivers where outlines nearly meet.
         raised = shapely.union_all([*vicinity.build_surfaces("sidewalk", "corner"), *vicinity.median_polygons])
         driven = shapely.union_all(vicinity.build_surfaces("road", "turn", "bay", "shoulder", "crossing"))
         narrowed = shapely.buffer(shapely.difference(raised, driven), -half_sliver_m, join_style="mitre")
@@ -137,19 +139,34 @@ class Sidewalks:
         return [build_sidewalk(outline, self._ground.compute_heights_m) for outline in outlines]
 
     def is_inside(self, positions_m: Float64) -> Bools:
-        """Test which positions (N, 2) are on a sidewalk or median."""
+        """Test which positions are on a sidewalk or median.
+
+        Args:
+            positions_m: (N, 2) positions.
+
+        Returns:
+            (N,) True inside of `polygons` or on their edges.
+        """
         is_inside = np.zeros(len(positions_m), dtype=bool)
         is_inside[self._tree.query(shapely.points(positions_m), predicate="intersects")[0]] = True
         return is_inside
 
 
 def build_bridges(vicinity: Vicinity) -> list[Mesh]:
-    """Build the decks of bridges: slabs below lanes that are above other lanes, and two samples farther."""
+    """Build the decks of bridges: slabs below lanes that are above other lanes.
+
+    Args:
+        vicinity: Part of a network.
+
+    Returns:
+        One mesh for each part of a lane, which extends two samples beyond the lane below.
+    """
     meshes = []
     for lane_index in sorted(vicinity.bridge_lane_indices):
         if vicinity.lanes[lane_index].use == "corner":
             continue
         samples = np.flatnonzero(vicinity.lane_indices == lane_index)
+        # Bounds of the sections above another lane.
         is_above = np.concatenate([[False], vicinity.on_bridge_mask[samples], [False]])
         changes = np.flatnonzero(np.diff(is_above.astype(np.int8)))
         for first, end in changes.reshape(-1, 2).tolist():
@@ -182,6 +199,7 @@ def build_deck(line_m: Float64, width_m: float, thickness_m: float = 0.8) -> Mes
             next_corner = (corner + 1) % 4
             faces.append([start + corner, end + corner, end + next_corner])
             faces.append([start + corner, end + next_corner, start + next_corner])
+    # Both ends are closed.
     faces += [[0, 1, 2], [0, 2, 3], [last + 2, last + 1, last], [last + 3, last + 2, last]]
     return Mesh(vertices_m, np.array(faces)).assign_material("road")
 
@@ -227,6 +245,7 @@ class BodyPlacer:
         """
         columns = np.concatenate(self._place(motion, *motion.parts[0]), axis=1).T
         x_m, y_m, z_m, yaw_deg, pitch_deg, roll_deg = (np.interp(times_s, motion.times_s, column) for column in columns)
+        # Acceleration and unevenness depend on the distance along the path.
         distances_m = np.concatenate([[0.0], np.cumsum(np.hypot(np.diff(x_m), np.diff(y_m)))])
         speeds_mps = np.gradient(distances_m, times_s)
         angles_deg = compute_attitude_deg(times_s, distances_m, speeds_mps, yaw_deg, generator)
@@ -238,7 +257,7 @@ class BodyPlacer:
         min_bridge_height_m = 0.4  # height above the ground from which a road user is on a bridge
         curb_step_poses = 2  # poses before and after a curb over which a pedestrian steps up or down
         centers_m, yaw_deg, track = poses[:, :2], np.rad2deg(poses[:, 2]), motion.road_user.track
-        # Heights of the simulation are those of the front of the vehicle.
+        # The simulation gives the height of the front of the vehicle.
         half_length_m = 0.0 if track.is_pedestrian else motion.road_user.part_sizes_m[0][0] / 2
         behind_front_m = half_length_m + np.linalg.norm(centers_m - motion.poses[:, :2], axis=1)
         heights_m = self._ground.compute_heights_m(centers_m)
@@ -285,6 +304,7 @@ def place_parked_vehicles(
             if is_occupied and fleet.get_width_m(kind) < lane.width_m:
                 poses_by_kind[kind].append(line.compute_poses(start_m + length_m / 2))
             start_m += length_m
+    # Heights and tilts are computed for all cars of a kind together.
     corners_m = [np.empty((0, 4, 2))]
     for kind, kind_poses in poses_by_kind.items():
         poses = np.array(kind_poses).reshape(-1, 3)
@@ -294,6 +314,7 @@ def place_parked_vehicles(
         tilts_deg = compute_tilts_deg(ground, positions_m, yaw_deg, size_m)
         radian_poses = np.column_stack([positions_m, np.deg2rad(yaw_deg)])
         corners_m.append(compute_rectangle_corners_m(radian_poses, np.tile(size_m, (len(poses), 1))))
-        for pose, height_m, tilt_deg in zip(poses.tolist(), heights_m.tolist(), tilts_deg.tolist(), strict=True):
-            fleet.add_parked_vehicle(kind, tuple(pose), height_m, tuple(tilt_deg))
+        rows = np.column_stack([poses, heights_m, tilts_deg])
+        for x_m, y_m, yaw, height_m, pitch, roll in rows.tolist():
+            fleet.add_parked_vehicle(kind, (x_m, y_m, yaw), height_m, (pitch, roll))
     return np.asarray(shapely.polygons(np.concatenate(corners_m)))

@@ -120,7 +120,7 @@ class Motion(NamedTuple):
 
     @property
     def is_plausible(self) -> bool:
-        """Whether a pedestrian walks as fast as people can, or a vehicle stays off the curbs."""
+        """True for a pedestrian that walks as fast as people can, or a vehicle that stays off the curbs."""
         if self.road_user.track.is_pedestrian:
             steps_m = compute_lengths_m(np.diff(self.poses, axis=0))
             return bool((steps_m < PARAMS.max_walking_mps * np.diff(self.times_s)).all())
@@ -149,6 +149,7 @@ def compute_motions(
     users: list[RoadUser] = []
     times_by_user: list[Float64] = []
     for user in road_users:
+        # Times within the track, with a tolerance at both ends.
         bounds_s = user.track.times_s[[0, -1]] + [-TIME_SLACK_S, TIME_SLACK_S]
         first, end = np.searchsorted(times_s, bounds_s).tolist()
         if end - first > 1:
@@ -174,7 +175,17 @@ def compute_motions(
 def compute_lead_path(
     user: RoadUser, times_s: Float64, origin_m: Float64, walkable_area: shapely.Geometry | None
 ) -> Float64:
-    """Compute the path (K, 2) of the leading point of a road user at K even times."""
+    """Compute the path of the leading point of a road user.
+
+    Args:
+        user: Road user.
+        times_s: (K,) even times.
+        origin_m: (2,) position that is subtracted from all positions.
+        walkable_area: Area that pedestrians do not leave; None without one.
+
+    Returns:
+        (K, 2) positions.
+    """
     track, time_step_s = user.track, times_s[1] - times_s[0]
     path_m = track.front_positions_m[:, :2]
     if track.is_pedestrian:
@@ -182,24 +193,29 @@ def compute_lead_path(
     even_m = interpolate_path(times_s, track.times_s, path_m - origin_m)
     if track.is_pedestrian and walkable_area is not None and not walkable_area.is_empty:
         even_m = follow_edges(
-            even_m,
-            time_step_s,
-            walkable_area,
-            PARAMS.edge_distance_m,
-            PARAMS.max_edge_offset_m,
-            PARAMS.max_edge_mps,
+            even_m, time_step_s, walkable_area, PARAMS.edge_distance_m, PARAMS.max_edge_offset_m, PARAMS.max_edge_mps
         )
+    # Between two positions of the track there may be several poses.
     half_window_s = max(PARAMS.smoothing_s, float(np.median(np.diff(track.times_s))))
     smooth_m = smooth_positions(even_m, int(np.ceil(half_window_s / time_step_s)))
     distance_m = 0.0
     if not track.is_pedestrian:
+        # The simulation knows the front and the length of the vehicle with its trailer.
         center_offset_m = HITCHES[user.kind].center_offset_m if user.kind in HITCHES else 0.0
         distance_m = max(user.length_m / 2 - (user.lead_offset_m + center_offset_m), 0.0)
     return shift_path_back(smooth_m, distance_m, np.deg2rad(track.yaw_deg[0]), PARAMS.corner_m)
 
 
 def compute_poses(users: Sequence[RoadUser], paths_m: Sequence[Float64]) -> list[Float64]:
-    """Compute the poses (K, 3) of each road user from the path (K, 2) of its leading point."""
+    """Compute the poses of road users.
+
+    Args:
+        users: Road users.
+        paths_m: Path (K, 2) of the leading point of each one; K may differ.
+
+    Returns:
+        (K, 3) x, y and unwrapped heading in radians of each one.
+    """
     lead_m = stack_paths(paths_m)
     initial_yaw_rad = np.deg2rad([user.track.yaw_deg[0] for user in users])
     rod_lengths_m = np.array([user.trailing_distance_m for user in users])
@@ -211,7 +227,15 @@ def compute_poses(users: Sequence[RoadUser], paths_m: Sequence[Float64]) -> list
 
 
 def compute_trailers(users: Sequence[RoadUser], poses: Sequence[Float64]) -> dict[int, Float64]:
-    """Compute the poses (K, 3) of trailers by the indices of their vehicles."""
+    """Compute the poses of trailers.
+
+    Args:
+        users: Road users.
+        poses: Poses (K, 3) of each one.
+
+    Returns:
+        Poses (K, 3) by the indices of the towing vehicles.
+    """
     towing = [index for index, user in enumerate(users) if user.kind in HITCHES]
     trailers = compute_trailer_poses([users[index].kind for index in towing], [poses[index] for index in towing])
     return dict(zip(towing, trailers, strict=True))
@@ -273,8 +297,10 @@ def avoid_obstacles(
     frames_by_user: dict[int, Int64] = {}
     for index, (user, path_m) in enumerate(zip(users, paths_m, strict=True)):
         if not user.track.is_pedestrian:
+            # The first pose in each section of the path is checked.
             sections = (compute_arc_lengths_m(path_m) / PARAMS.check_spacing_m).astype(np.int64)
             frames_by_user[index] = np.flatnonzero(np.diff(sections, prepend=-1))
+    # Each round measures the overlaps, and all but the last shift the paths of vehicles with overlaps.
     for swing in range(PARAMS.max_swings + 1):
         checks = _collect_checks(users, frames_by_user, poses, compute_trailers(users, poses))
         evasions_m = measure_evasions_m(obstacles, checks.poses, checks.sizes_m)
@@ -306,5 +332,6 @@ def _compute_swing_m(
     centers_m = arc_lengths_m[checks.frames[selection]] - trailer_lag_m
     reach_m = PARAMS.swing_m + PARAMS.swing_lengths * user.part_sizes_m[0][0]
     distances = np.abs(arc_lengths_m[:, None] - centers_m) / reach_m
+    # Each overlap needs a smooth bump; of several in one direction, the largest counts.
     bumps_m = wanted_m * np.where(distances < 1, (1 + np.cos(np.pi * distances)) / 2, 0.0)
     return np.asarray(bumps_m.max(axis=1).clip(min=0.0) + bumps_m.min(axis=1).clip(max=0.0))

@@ -40,7 +40,11 @@ class NetworkLane(NamedTuple):
     disallowed_classes: frozenset[str]
 
     def is_allowed(self, vehicle_class: str) -> bool:
-        """Test whether vehicles of a class may use the lane."""
+        """Test whether vehicles of a class may use the lane.
+
+        Args:
+            vehicle_class: Vehicle class in SUMO's vocabulary, such as "bicycle".
+        """
         names = {"all", vehicle_class}
         return not names & self.disallowed_classes and bool(names & self.allowed_classes)
 
@@ -59,7 +63,14 @@ class Network(NamedTuple):
     connections: tuple[tuple[int, int], ...]
 
     def find_successors(self, vehicle_class: str) -> dict[str, tuple[str, ...]]:
-        """Find for each edge that a vehicle class may use the edges to which it leads, sorted by name."""
+        """Find the edges to which edges lead.
+
+        Args:
+            vehicle_class: Vehicle class for which edges count.
+
+        Returns:
+            Names of the following edges by the name of the edge, both sorted; empty at a dead end.
+        """
         is_road = [lane.use == "road" and lane.is_allowed(vehicle_class) for lane in self.lanes]
         successors: dict[str, set[str]] = {}
         for lane, is_usable in zip(self.lanes, is_road, strict=True):
@@ -86,11 +97,13 @@ def read_network(path: Path) -> Network:
 
 @lru_cache(maxsize=1)
 def _read_version(path: Path, _version: tuple[int, int] | None) -> Network:
+    """Read a network unless this version (size and time of change) is cached."""
     return _read_network(path)
 
 
 @guard_reader("a road network of SUMO")
 def _read_network(path: Path) -> Network:
+    """Read a network; errors name the file."""
     memory_per_byte = 5  # size of a network in memory, relative to its file
     check_memory(memory_per_byte * path.stat().st_size)
     parser = NetworkParser()
@@ -98,7 +111,7 @@ def _read_network(path: Path) -> Network:
     lanes = tuple(parser.lanes.values())
     if not any(lane.use == "road" for lane in lanes):
         raise ValueError(f"a network with a street for vehicles is needed; it has {len(lanes)} lanes, none of which is")
-    indices = {lane_id: index for index, lane_id in enumerate(parser.lanes)}
+    indices = dict(zip(parser.lanes, range(len(lanes)), strict=True))
     connections = []
     for source, target in parser.connections:
         if source in indices and target in indices:
@@ -147,7 +160,18 @@ class NetworkParser:
 
 
 def parse_lane(edge: XmlAttributes, item: XmlAttributes) -> NetworkLane | None:
-    """Parse the attributes of an edge and a lane; None for lanes that are not needed."""
+    """Parse a lane.
+
+    Args:
+        edge: Attributes of its edge.
+        item: Attributes of the lane.
+
+    Returns:
+        The lane; None for medians, tracks of trains and lanes without length.
+
+    Raises:
+        ValueError: A width, number or shape is not valid.
+    """
     name = item.get("id", "")
     default_width_m = 3.2  # SUMO's default
     width_m, speed_mps = parse_number(item, "width", default_width_m), parse_number(item, "speed", 0.0)
@@ -156,6 +180,7 @@ def parse_lane(edge: XmlAttributes, item: XmlAttributes) -> NetworkLane | None:
     line_m = parse_shape(item.get("shape", ""))
     if not np.isfinite(line_m).all():
         raise ValueError(f"lane {name!r}: its shape has NaN or infinite numbers")
+    # Repeated positions have no direction.
     if len(line_m):
         steps_m = np.linalg.norm(np.diff(line_m[:, :2], axis=0), axis=1)
         line_m = line_m[np.concatenate([[True], steps_m > SAME_POSITION_M])]
@@ -170,7 +195,17 @@ def parse_lane(edge: XmlAttributes, item: XmlAttributes) -> NetworkLane | None:
 def find_lane_use(
     edge_function: str, lane_type: str, allowed: frozenset[str], disallowed: frozenset[str]
 ) -> LaneUse | None:
-    """Find the use of a lane from the attributes of its edge and itself; None for medians and tracks of trains."""
+    """Find the use of a lane.
+
+    Args:
+        edge_function: Attribute "function" of its edge.
+        lane_type: Attribute "type" of the lane.
+        allowed: Vehicle classes that may use it, or "all".
+        disallowed: Vehicle classes that may not use it, or "all".
+
+    Returns:
+        The use; None for medians and tracks of trains.
+    """
     if edge_function == "walkingarea":
         return "corner"
     if edge_function == "crossing":
@@ -190,7 +225,17 @@ def find_lane_use(
 
 
 def parse_shape(text: str) -> Float64:
-    """Parse positions "x,y x,y,z ..." to (K, 3); z is 0 where it is missing."""
+    """Parse the shape of a lane or junction.
+
+    Args:
+        text: Positions "x,y x,y,z ..."; a missing z is 0.
+
+    Returns:
+        (K, 3) positions in meters.
+
+    Raises:
+        ValueError: A position has not two or three numbers.
+    """
     positions_m = []
     for position_text in text.split():
         position_m = [float(number) for number in position_text.split(",")]
@@ -201,7 +246,16 @@ def parse_shape(text: str) -> Float64:
 
 
 def parse_number(item: XmlAttributes, key: str, default: float) -> float:
-    """Parse a number of a lane; the default if it is missing."""
+    """Parse a number of a lane.
+
+    Args:
+        item: Attributes of the lane.
+        key: Name of the attribute.
+        default: Result if the attribute is missing.
+
+    Raises:
+        ValueError: It is not a number.
+    """
     text = item.get(key)
     try:
         return default if text is None else float(text)

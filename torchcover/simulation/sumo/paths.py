@@ -13,12 +13,28 @@ def compute_lengths_m(vectors_m: Float64) -> Float64:
 
 
 def compute_arc_lengths_m(path_m: Float64) -> Float64:
-    """Compute the arc lengths (K,) of a path (K, 2) up to each position."""
+    """Compute the arc length of a path up to each position.
+
+    Args:
+        path_m: (K, 2) path.
+
+    Returns:
+        (K,) arc lengths in meters, from 0.
+    """
     return np.concatenate([[0.0], compute_lengths_m(np.diff(path_m, axis=0)).cumsum()])
 
 
 def interpolate_path(at: Float64, parameters: Float64, path_m: Float64) -> Float64:
-    """Interpolate positions (N, 2) at parameters (N,) of a path (K, 2) with ascending parameters (K,)."""
+    """Interpolate positions on a path.
+
+    Args:
+        at: (N,) queried parameters, such as times.
+        parameters: (K,) ascending parameters of the path.
+        path_m: (K, 2) path.
+
+    Returns:
+        (N, 2) positions; the first or last one of the path outside of its parameters.
+    """
     return np.stack([np.interp(at, parameters, axis_m) for axis_m in path_m.T], axis=1)
 
 
@@ -55,6 +71,7 @@ def shift_path_back(
     extended_m, extended_lengths_m = np.concatenate([start_m, path_m]), np.concatenate([[-distance_m], arc_lengths_m])
     num_positions = 2 + int((arc_lengths_m[-1] + distance_m) / spacing_m)
     even_lengths_m = np.linspace(-distance_m, arc_lengths_m[-1], num_positions)
+    # Smoothing needs even distances; standing vehicles would otherwise have many positions in one place.
     even_m = interpolate_path(even_lengths_m, extended_lengths_m, extended_m)
     rounded_m = smooth_positions(even_m, round(corner_m / spacing_m))
     return interpolate_path(arc_lengths_m - distance_m, even_lengths_m, rounded_m)
@@ -142,8 +159,10 @@ def compute_rectangle_corners_m(poses: Float64, sizes_m: Float64) -> Float64:
     return np.asarray(poses[:, None, :2] + forward_m[..., None] * forward + left_m[..., None] * left)
 
 
-def do_rectangles_overlap(poses: Float64, sizes_m: Float64, other_poses: Float64, other_sizes_m: Float64) -> Bools:
-    """Test which of K pairs of rectangles overlap at T times: no axis of either separates them.
+def find_overlapping_rectangles(
+    poses: Float64, sizes_m: Float64, other_poses: Float64, other_sizes_m: Float64
+) -> Bools:
+    """Find which of K pairs of rectangles overlap at T times: no axis of either separates them.
 
     Args:
         poses: (T, K, 3 or more) x, y and heading in radians of the first rectangles; NaN where they are absent.

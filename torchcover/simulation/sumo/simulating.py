@@ -71,6 +71,7 @@ def stream_output(
         )
         assert process.stdout is not None  # because of PIPE
         assert process.stderr is not None
+        # A second thread empties the pipe of messages, so that the program never waits for it.
         messages = bytearray()
         reader = Thread(target=_read_last_messages, args=(process.stderr, messages), daemon=True)
         reader.start()
@@ -101,6 +102,7 @@ def _read_last_messages(pipe: IO[bytes], messages: bytearray) -> None:
 
 
 def _explain_failure(program: str, status: int, messages: bytearray, max_cpu_s: float) -> str:
+    """Explain why a program failed, from its exit status and the end of its messages."""
     if status == -signal.SIGXCPU:
         return f"SUMO's {program} took more than {max_cpu_s:g} s of processor time; is the file damaged?"
     if status == -signal.SIGXFSZ:
@@ -113,7 +115,14 @@ def _explain_failure(program: str, status: int, messages: bytearray, max_cpu_s: 
 
 
 def extract_errors(lines: Sequence[str]) -> str:
-    """Extract the text after "Error:" as one line; indented lines continue the line before."""
+    """Extract the errors from the messages of a program.
+
+    Args:
+        lines: Messages; a line that is indented continues the line before.
+
+    Returns:
+        The text after each "Error:" in one line, or the last message without one; at most 500 characters.
+    """
     errors: list[str] = []
     is_error = False
     for line in lines:
@@ -160,7 +169,7 @@ def simulate(
     """
     time_step_s = 0.2
     lane_change_s = 3.0  # SUMO's default is an instantaneous change
-    margin_m = 50.0  # positions are those of the fronts of long vehicles
+    margin_m = 50.0  # the radius is measured between the fronts of long vehicles
     options = ["--time-to-teleport", "-1", "--ignore-route-errors"] if is_sampled else []
     if around_vehicle is not None:
         options += ["--device.fcd.explicit", around_vehicle, "--person-device.fcd.explicit", around_vehicle]
@@ -244,6 +253,7 @@ def convert_opendrive(path: Path, folder: Path, *, omit_missing_links: bool) -> 
 
 
 def _describe_missing_links(missing_links: Sequence[MissingLink]) -> str:
+    """Describe the first missing links, and how to go on without them."""
     descriptions = "; ".join(missing.description for missing in missing_links[:NUM_LISTED])
     if len(missing_links) > NUM_LISTED:
         descriptions += f"; and {len(missing_links) - NUM_LISTED} more"
@@ -269,6 +279,7 @@ def check_losses(root: ElementTree.Element) -> None:
             "right-hand traffic; convert the road with netconvert --lefthand and give the .net.xml"
         )
     losses = []
+    # Profiles whose polynomials are all 0 change nothing.
     for name in ("superelevation", "crossfall", "shape"):
         num_banked = 0
         for profile in root.findall(f"road/lateralProfile/{name}"):

@@ -118,6 +118,7 @@ class RandomStreets(Document):
             "--default.junctions.radius", str(TOWN.corner_radius_m), "--junctions.internal-link-detail", "12",
         )  # fmt: skip
         network = parse_xml(network_file)
+        # netconvert computes the speed of a turn from its average curvature.
         for lane in network.iterfind("edge[@function='internal']/lane"):
             line_m = np.array([text.split(",")[:2] for text in lane.get("shape", "").split()], dtype=np.float64)
             lane.set("speed", f"{min(self.speed_limit_mps, compute_turning_speed_mps(line_m)):.2f}")
@@ -132,11 +133,13 @@ class RandomStreets(Document):
         generator: np.random.Generator,
     ) -> str:
         """Format the edges of bent streets for netconvert."""
+        # Both directions of a street have the same centerline.
         edges_by_street: dict[StreetEnds, list[tuple[str, str, str]]] = {}
         for edge in edges:
             name, start, end = edge.get("id", ""), edge.get("from", ""), edge.get("to", "")
             edges_by_street.setdefault((min(start, end), max(start, end)), []).append((name, start, end))
         lines: dict[StreetEnds, shapely.LineString] = {}
+        # The plan of netgenerate knows no widths: streets that come too close to earlier ones are left out.
         for ends in edges_by_street:
             start_m, end_m = np.array(nodes_m[ends[0]]), np.array(nodes_m[ends[1]])
             line = shapely.LineString(self._sample_bend(start_m, end_m, generator))
@@ -189,6 +192,7 @@ class RandomStreets(Document):
 
 
 def _format_nodes(nodes_m: Mapping[str, tuple[float, float]], hills: Hills) -> str:
+    """Format the nodes with their heights for netconvert."""
     heights_m = hills.compute_heights_m(np.array(list(nodes_m.values())))
     rows = []
     for (name, (x, y)), z in zip(nodes_m.items(), heights_m, strict=True):
@@ -211,7 +215,14 @@ def compute_turning_speed_mps(line_m: Float64) -> float:
 
 
 def remove_dead_ends(streets: list[StreetEnds]) -> list[StreetEnds]:
-    """Remove streets that do not continue at both ends, repeatedly; all streets are kept if none would remain."""
+    """Remove streets that do not continue at both ends, repeatedly.
+
+    Args:
+        streets: Ends of the streets.
+
+    Returns:
+        The remaining streets; all of them if none would remain.
+    """
     remaining = streets
     while True:
         counts: Counter[str] = Counter()
@@ -303,10 +314,11 @@ def write_routes(
     num_agents = sum(count for _, _, count in groups)
     if num_agents > TRAFFIC.max_agents:
         raise ValueError(
-            f"traffic of about {num_agents:,.0f} vehicles and people; at most {TRAFFIC.max_agents:,} are sampled: lower "
-            "the numbers per kilometer, or take a piece of the network"
+            f"traffic of about {num_agents:,.0f} vehicles and people; at most {TRAFFIC.max_agents:,} are sampled: "
+            "lower the numbers per kilometer, or take a piece of the network"
         )
     rows = [_format_vehicle_type(kind, category, fleet) for kind, category in {**CATEGORIES, EGO_TYPE: "car"}.items()]
+    # Vehicles and people start at random positions, and walk in either direction.
     for weights, sampler, count in groups:
         is_walking = weights is PEDESTRIAN_WEIGHTS
         max_speed_mps = TRAFFIC.max_speed_factor * max(sampler.max_speed_mps, TRAFFIC.min_speed_mps)
@@ -355,14 +367,13 @@ class RouteSampler:
         successors = network.find_successors(vehicle_class)
         if use == "sidewalk":
             walkable = {lane.edge_id for lane in network.lanes if lane.use == use}
-            successors = {
-                edge: tuple(sorted(walkable & set(following)))
-                for edge, following in successors.items()
-                if edge in walkable
-            }
+            for edge in successors.keys() - walkable:
+                del successors[edge]
+            for edge, following in successors.items():
+                successors[edge] = tuple(sorted(walkable & set(following)))
         self._successors = successors
         self._edges = list(successors)
-        self._indices = {edge: index for index, edge in enumerate(self._edges)}
+        self._indices = dict(zip(self._edges, range(len(self._edges)), strict=True))
         self._lengths_m = np.zeros(len(self._edges))
         self.start_lengths_m = np.zeros(len(self._edges))
         self.max_speed_mps = 0.0

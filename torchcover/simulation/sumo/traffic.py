@@ -57,6 +57,7 @@ def find_visible_sides(
     shapely.prepare(bridges)
 
     def is_visible(positions_m: Float64) -> Bools:
+        """Test which positions (N, 2) are visible and not next to a bridge."""
         return np.asarray(vicinity.is_visible(positions_m) & ~shapely.contains_xy(bridges, *positions_m.T))
 
     offsets_m = (curb_offset_m, facade_offset_m)
@@ -98,6 +99,7 @@ class SumoTraffic(ProceduralTraffic):
 
     @model_validator(mode="after")
     def _check_sources(self) -> Self:
+        """Check that network and traffic are given once, or sampled."""
         if self.random is None:
             if self.net is None or not (self.routes or self.fcd):
                 raise ValueError("give a net and its routes, a net and its fcd, or random (which may have a net, too)")
@@ -121,6 +123,7 @@ class SumoTraffic(ProceduralTraffic):
             find_sumo_home()
 
     def _build(self, fleet: Fleet, times_s: Float64, generator: np.random.Generator) -> SceneParts:
+        """Build static scenery, ego vehicle and actors."""
         duration_s = float(times_s[-1])
         vicinity, ego, users, origin_m = self._select_road_users(fleet, duration_s, generator)
         ground = build_ground(vicinity)
@@ -136,13 +139,13 @@ class SumoTraffic(ProceduralTraffic):
         bridge_area = vicinity.build_bridge_area(3.0)
         obstacles = shapely.difference(np.concatenate([sidewalks.polygons, parked]), bridge_area)
         motions = compute_motions([ego, *users], duration_s, origin_m, obstacles, sidewalks.walkable_area)
-        shown = drop_colliding_users(motions)
-        fleet.omitted_count = len(motions) - len(shown)
-        self._warn_of_omissions(motions, shown, len(users))
+        remaining = drop_colliding_users(motions)
+        fleet.omitted_count = len(motions) - len(remaining)
+        self._warn_of_omissions(motions, remaining, len(users))
         placer = BodyPlacer(ground, sidewalks)
-        ego_actor = placer.build_ego(shown[0], times_s, fleet.meshes[EGO], generator)
+        ego_actor = placer.build_ego(remaining[0], times_s, fleet.meshes[EGO], generator)
         scenery = Scenery(static_meshes, tuple(range(1 + len(raised))))
-        return scenery, ego_actor, placer.build_actors(shown[1:], fleet, duration_s)
+        return scenery, ego_actor, placer.build_actors(remaining[1:], fleet, duration_s)
 
     def _select_road_users(
         self, fleet: Fleet, duration_s: float, generator: np.random.Generator
@@ -176,16 +179,17 @@ class SumoTraffic(ProceduralTraffic):
             )
         return vicinity, ego, users, origin_m
 
-    def _warn_of_omissions(self, motions: Sequence[Motion], shown: Sequence[Motion], num_users: int) -> None:
+    def _warn_of_omissions(self, motions: Sequence[Motion], remaining: Sequence[Motion], num_users: int) -> None:
         """Warn of omitted road users; of sampled traffic, some may be missing."""
+        # Sampled traffic is only a density, of which a few road users may be missing.
         max_omitted_share = 0.0 if self.random is None else 0.15
-        num_omitted = len(motions) - len(shown)
+        num_omitted = len(motions) - len(remaining)
         if num_omitted > max_omitted_share * num_users:
-            shown_names = {motion.road_user.track.name for motion in shown}
-            missing = sorted({motion.road_user.track.name for motion in motions} - shown_names)
+            remaining_names = {motion.road_user.track.name for motion in remaining}
+            missing = sorted({motion.road_user.track.name for motion in motions} - remaining_names)
             warnings.warn(
-                f"{num_omitted} of {num_users} road users of the simulation are left out: they overlap others or curbs, "
-                f"or are faster than people can be ({', '.join(repr(name) for name in missing[:3])})",
+                f"{num_omitted} of {num_users} road users of the simulation are left out: they overlap others or "
+                f"curbs, or are faster than people can be ({', '.join(repr(name) for name in missing[:3])})",
                 stacklevel=3,
             )
 
@@ -214,7 +218,7 @@ class SumoTraffic(ProceduralTraffic):
         data = parse_floating_car_data(chunks, TimeWindow(begin_s, duration_s, self.ego_id))
         if not np.isfinite(data.last_time_s):
             raise ValueError(
-                f"the simulation ends before t = {begin_s:g} s, where the run begins: all vehicles have arrived, or none "
-                "departs; change begin_s, or the routes"
+                f"the simulation ends before t = {begin_s:g} s, where the run begins: all vehicles have arrived, or "
+                "none departs; change begin_s, or the routes"
             )
         return data

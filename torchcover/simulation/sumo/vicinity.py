@@ -94,7 +94,14 @@ class Vicinity:
         return np.asarray(nearby[shapely.dwithin(boxes, self.ego_path, HORIZON_M + margin_m)])
 
     def is_visible(self, positions_m: Float64) -> Bools:
-        """Test which positions (N, 2) may be visible from the path."""
+        """Test which positions may be visible from the path.
+
+        Args:
+            positions_m: (N, 2) positions.
+
+        Returns:
+            (N,) True within `HORIZON_M` and a margin.
+        """
         max_distance_m = HORIZON_M + self.params.margin_m
         return np.asarray(shapely.dwithin(shapely.points(positions_m), self.ego_path, max_distance_m))
 
@@ -120,7 +127,11 @@ class Vicinity:
         return frozenset(self.lane_indices[self.on_bridge_mask].tolist())
 
     def build_bridge_area(self, margin_m: float) -> shapely.Geometry:
-        """Build the area within a distance from the centerlines of lanes on bridges."""
+        """Build the area of bridges in the ground plane.
+
+        Args:
+            margin_m: Distance from the centerlines of lanes on bridges.
+        """
         lines = build_lines([self.lanes[index].line_m[:, :2] for index in sorted(self.bridge_lane_indices)])
         return shapely.union_all(shapely.buffer(lines, margin_m))
 
@@ -137,6 +148,7 @@ class Vicinity:
         carriageways = [*self.build_surfaces("road", "turn", "shoulder")]
         carriageways += [build_polygon(outline_m) for outline_m in self.junctions]
         driven = shapely.union_all(carriageways)
+        # Closing by half of the largest width fills the gaps between carriageways.
         half_m = params.max_median_m / 2
         closed = shapely.buffer(shapely.buffer(driven, half_m, quad_segs=2), -half_m, quad_segs=2)
         other_surfaces = shapely.union_all(self.build_surfaces("bay", "sidewalk", "corner", "crossing"))
@@ -155,6 +167,7 @@ class Vicinity:
         cells = (offsets_m / self.params.bridge_cell_m).astype(np.int64) + 1
         lowest_m = np.full(cells.max(axis=0) + 2, np.inf)
         np.minimum.at(lowest_m, tuple(cells.T), self.lane_points_m[:, 2])
+        # A lane may cross another one near the edge of a square: neighboring squares count, too.
         for axis in (0, 1):
             lowest_m = np.minimum.reduce([lowest_m, np.roll(lowest_m, 1, axis), np.roll(lowest_m, -1, axis)])
         max_ground_m = lowest_m[tuple(cells.T)] + self.params.bridge_clearance_m
@@ -162,7 +175,14 @@ class Vicinity:
 
 
 def build_lines(lines_m: Sequence[Float64]) -> NDArray[np.object_]:
-    """Build N line strings from positions (K, 2 or 3) each."""
+    """Build line strings.
+
+    Args:
+        lines_m: N arrays (K, 2 or 3) of positions.
+
+    Returns:
+        (N,) line strings.
+    """
     if not lines_m:
         return np.empty(0, dtype=object)
     counts = [len(line_m) for line_m in lines_m]
@@ -170,7 +190,15 @@ def build_lines(lines_m: Sequence[Float64]) -> NDArray[np.object_]:
 
 
 def build_polygons(lanes: Sequence[NetworkLane], outlines_m: Sequence[Float64]) -> NDArray[np.object_]:
-    """Build polygons in the ground plane of lanes except corners, and of outlines."""
+    """Build polygons in the ground plane.
+
+    Args:
+        lanes: Lanes; corners are skipped.
+        outlines_m: Outlines (K, 2 or 3) of further areas.
+
+    Returns:
+        Polygons of the lanes, then of the outlines.
+    """
     strips = [lane for lane in lanes if lane.use != "corner"]
     lines = build_lines([lane.line_m[:, :2] for lane in strips])
     half_widths_m = [lane.width_m / 2 for lane in strips]

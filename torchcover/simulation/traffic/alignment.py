@@ -130,7 +130,7 @@ class Alignment:
 
     @cached_property
     def is_straight(self) -> bool:
-        """Whether the curvature is 0 everywhere."""
+        """True if the curvature is 0 everywhere."""
         return not self.curvatures_per_m.any()
 
     def compute_headings_rad(self, stations_m: ArrayLike) -> Float64:

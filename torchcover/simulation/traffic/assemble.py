@@ -338,7 +338,8 @@ def build_nearby_actors(
             positions_m[~is_walking, :, 2] += heights_and_tilts[..., 0]
             angles_deg[~is_walking, :, 1:] = heights_and_tilts[..., 1:]
         is_present = ~np.isnan(positions_m[..., 0])
-        is_always_present = is_present.all(axis=1)
+        is_always_present: Bools = np.asarray(is_present.all(axis=1))
+        # Trailers come after their towing vehicles and are named after them.
         names: dict[int, str] = {}
         for row, body in enumerate(bodies.tolist()):
             if np.count_nonzero(is_present[row]) < 2:
@@ -419,7 +420,16 @@ def compute_attitude_deg(
 
 
 def smooth_exponentially(times_s: Float64, values: Float64, time_constant_s: float) -> Float64:
-    """Smooth values (T,) by a first-order low-pass filter that is exact for each step."""
+    """Smooth values by a first-order low-pass filter that is exact for each step.
+
+    Args:
+        times_s: (T,) ascending times.
+        values: (T,) values.
+        time_constant_s: Time constant of the filter.
+
+    Returns:
+        (T,) smoothed values; the first one is unchanged.
+    """
     weights = 1.0 - np.exp(-np.diff(times_s) / time_constant_s)
     smoothed = values.copy()
     for index, weight in enumerate(weights):

@@ -64,7 +64,7 @@ CITY = CityParams()
 
 
 class Frontage(NamedTuple):
-    """One side of a street between two stations, behind the curb.
+    """Side of a street between two stations, behind the curb.
 
     Args:
         span_m: First and last station.
@@ -147,6 +147,7 @@ class CityBuilder(NamedTuple):
                 aprons += end_aprons
                 curb_m = curb_m if frontage.side == 1 - 2 * end else curb_m[::-1]
                 sides += build_cross_street_sides(curb_m, sidewalk_m, zone)
+        # Aprons fill the areas between blocks and cross streets, and narrow gaps.
         streets, streets_with_sidewalks = self._build_street_areas()
         blocks_area = shapely.union_all(outlines)
         sidewalks = shapely.union_all([*outlines, *aprons], grid_size=CITY.grid_m)
@@ -225,6 +226,7 @@ class CityBuilder(NamedTuple):
         for street, span_m in zip(self.streets.cross_streets, spans_m, strict=True):
             stations_m = span_m if street.is_straight else np.arange(-length_m, length_m, spacing_m)
             centerlines_m.append(street.compute_poses(stations_m, 0.0)[:, :2])
+        # The curb offsets are in the same order: main street, cross streets.
         lines = [shapely.LineString(line_m) for line_m in centerlines_m]
         lines = shapely.simplify(lines, CITY.tolerance_m / 4)
         curb_offsets_m = [self.streets.cross_section.curb_offset_m, *self.streets.cross_curb_offsets_m.tolist()]
@@ -280,6 +282,7 @@ class CityBuilder(NamedTuple):
             return face_m[1:], [] if is_built else [build_strip(face_m, inside_m)]
         middle_m = float(self.streets.junction_stations_m[index])
         half_m = float(self.streets.main_street.junction_half_lengths_m[index])
+        # From the corner of the block along the turn, back along the street that goes straight on, to the face.
         turn_stations_m = np.linspace(corner_m, middle_m, 17)
         turn_curb_m = site.street.compute_poses(turn_stations_m, frontage.side * curb_offset_m)[:, :2]
         stations_m = np.linspace(-half_m, half_m + CITY.corner_m, 97)
@@ -334,6 +337,7 @@ class CityBuilder(NamedTuple):
 
     def _park_cars(self, frontages: list[tuple[BuildingSite, Frontage]]) -> None:
         """Park cars along all frontages."""
+        # Heights and tilts are computed for all cars together.
         kinds: list[str] = []
         poses: list[Float64] = []
         for site, frontage in frontages:
@@ -360,19 +364,39 @@ def find_narrow_gaps(sidewalks: shapely.Geometry, streets: shapely.Geometry) -> 
 
 
 def build_strip(line_m: Float64, left_m: float) -> shapely.Geometry:
-    """Build the area between a line (K, 2) and its parallel at an offset to the left."""
+    """Build the area between a line and its parallel.
+
+    Args:
+        line_m: (K, 2) line.
+        left_m: Offset of the parallel to the left.
+    """
     return shapely.buffer(shapely.LineString(line_m), left_m, single_sided=True, join_style="mitre")
 
 
 def build_cross_street_sides(curb_m: Float64, sidewalk_width_m: float, zone: Zone) -> list[StreetSide]:
-    """Build the lines at the curb and behind the sidewalk of a cross street, given its curb (2, 2)."""
+    """Build the lines at the curb and behind the sidewalk of a cross street.
+
+    Args:
+        curb_m: (2, 2) curb, with the street on its left.
+        sidewalk_width_m: Width of the sidewalk.
+        zone: Zone behind the sidewalk.
+    """
     ahead = (curb_m[1] - curb_m[0]) / np.linalg.norm(curb_m[1] - curb_m[0])
     facade_m = curb_m + sidewalk_width_m * np.array([ahead[1], -ahead[0]])
     return [StreetSide("curb", curb_m), StreetSide(zone, facade_m)]
 
 
 def sample_street_side_m(street: Alignment, span_m: Bounds, left_m: float) -> Float64:
-    """Sample positions (K, 2) parallel to a street, in the direction that has the street on the left."""
+    """Sample a line parallel to a street, in the direction that has the street on the left.
+
+    Args:
+        street: Alignment of the street.
+        span_m: First and last station.
+        left_m: Offset to the left of the street.
+
+    Returns:
+        (K, 2) positions in meters.
+    """
     num_segments = 1 if street.is_straight else int(np.ceil((span_m[1] - span_m[0]) / CITY.street_spacing_m))
     line_m: Float64 = street.compute_poses(np.linspace(*span_m, num_segments + 1), left_m)[:, :2]
     return line_m if left_m < 0 else line_m[::-1]

@@ -61,9 +61,8 @@ def compute_trailer_poses(
     if not kinds:
         return []
     hitches = [HITCHES[kind] for kind in kinds]
-    hitch_paths_m = []
-    for hitch, poses in zip(hitches, front_poses, strict=True):
-        hitch_paths_m.append(hitch.compute_hitch_positions_m(poses))
+    pairs = zip(hitches, front_poses, strict=True)
+    hitch_paths_m = [hitch.compute_hitch_positions_m(poses) for hitch, poses in pairs]
     if initial_yaw_rad is None:
         initial_yaw_rad = [poses[0, 2] for poses in front_poses]
     axle_distances_m = np.array([hitch.hitch_to_axle_m for hitch in hitches])
@@ -98,6 +97,7 @@ def compute_tractrix_yaw_rad(lead_positions_m: Float64, rod_lengths_m: Float64, 
     steps_m = np.diff(lead_positions_m, axis=0)
     directions_rad = np.arctan2(steps_m[..., 1], steps_m[..., 0])
     decays = np.exp(-np.hypot(steps_m[..., 0], steps_m[..., 1]) / rod_lengths_m)
+    # Headings are integrated, so that they never jump by a full turn.
     yaw_rad = np.empty(lead_positions_m.shape[:2])
     yaw_rad[0] = initial_yaw_rad
     for index, (direction_rad, decay) in enumerate(zip(directions_rad, decays, strict=True)):
@@ -107,7 +107,15 @@ def compute_tractrix_yaw_rad(lead_positions_m: Float64, rod_lengths_m: Float64, 
 
 
 def move_forward(poses: Float64, distance_m: float) -> Float64:
-    """Move poses (T, 3) of x, y and heading in radians forward along their headings."""
+    """Move poses forward along their headings.
+
+    Args:
+        poses: (T, 3) x, y and heading in radians.
+        distance_m: Distance; negative for backwards.
+
+    Returns:
+        (T, 3) poses.
+    """
     yaw_rad = poses[:, 2]
     return poses + distance_m * np.stack([np.cos(yaw_rad), np.sin(yaw_rad), np.zeros(len(yaw_rad))], axis=1)
 
@@ -188,6 +196,7 @@ def load_bodies() -> Mapping[str, Mesh]:
     for kind in KIND_CATEGORIES:
         if kind not in ("truck", "trailer"):
             meshes[kind] = Vehicle.load("child_120cm" if kind == "child" else kind).build_mesh()
+    # The built-in truck is one vehicle, which is divided into tractor and trailer.
     for kind in ("truck", "trailer"):
         parts = tuple(part for part in truck.parts if part.name.startswith("trailer") == (kind == "trailer"))
         meshes[kind] = truck.model_copy(update={"parts": parts}).build_mesh()
@@ -232,6 +241,7 @@ class Fleet:
         return self._lengths_m[kind]
 
     def _compute_length_m(self, kind: str) -> float:
+        """Compute the length of a body with its trailer, from bumper to bumper."""
         part_lengths_m = [length_m for length_m, _ in self.get_sizes_m(kind)]
         if kind not in HITCHES:
             return part_lengths_m[0]
@@ -343,7 +353,7 @@ class Fleet:
             body = self.sample_kind(weights)
             kind = BODY_KINDS[body]
             driver = self.sample_driver(drivers[kind][1], heavy_speed_spread if kind in HEAVY_KINDS else speed_spread)
-            # The gap at full speed: nobody has to brake at the start.
+            # The gap at full speed, so that no driver must brake at the start.
             gap_m = float(driver.standstill_gap_m + driver.headway_s * driver.desired_speed_mps)
             length_m = self.get_length_m(body)
             rear_m += gap_m + self._generator.exponential(max(1000.0 / density_per_km - gap_m - length_m, 0.1))
@@ -363,7 +373,15 @@ def get_part_kinds(kind: str) -> tuple[str, ...]:
 
 @lru_cache(maxsize=64)
 def list_bodies(kinds: tuple[str, ...], weights: tuple[float, ...]) -> tuple[list[str], list[float]]:
-    """List the bodies of kinds with the cumulative share of each body; bodies of a kind share its weight equally."""
+    """List the bodies of kinds and their frequencies.
+
+    Args:
+        kinds: Kinds.
+        weights: Weight of each kind, which its bodies share equally.
+
+    Returns:
+        Bodies, and the cumulative share of each one, up to 1.
+    """
     bodies: list[str] = []
     shares: list[float] = []
     for kind, weight in zip(kinds, np.array(weights) / np.sum(weights), strict=True):
@@ -381,8 +399,7 @@ def _is_blocked(agent: Agent, passages: Sequence[JunctionPassage], gap_m: float,
     next_passage = bisect_right(passages, rear_m, key=lambda passage: passage.exit_m)
     if next_passage < len(passages) and front_m > passages[next_passage].stop_line_m - gap_m:
         return True
-    for neighbor in neighbors:
-        min_distance_m = (agent.length_m + neighbor.length_m) / 2 + gap_m
-        if abs(agent.lane_position_m - neighbor.lane_position_m) < min_distance_m:
-            return True
-    return False
+    return any(
+        abs(agent.lane_position_m - neighbor.lane_position_m) < (agent.length_m + neighbor.length_m) / 2 + gap_m
+        for neighbor in neighbors
+    )

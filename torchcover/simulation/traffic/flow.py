@@ -7,7 +7,6 @@ not let anyone drive into vehicles that are held up on the junction.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -119,10 +118,9 @@ class JunctionPassageTable(NamedTuple):
     def from_lanes(cls, passages_by_lane: Sequence[tuple[JunctionPassage, ...]]) -> "JunctionPassageTable":
         """Build the table from the passages of each lane, in order."""
         passages: list[JunctionPassage] = []
-        first_passages = []
         for lane_passages in passages_by_lane:
-            first_passages.append(len(passages))
             passages += [*lane_passages, JunctionPassage(np.inf, np.inf, 0, 0)]
+        first_passages = np.cumsum([0, *(len(lane_passages) + 1 for lane_passages in passages_by_lane[:-1])])
         junctions = np.array([passage.junction_index for passage in passages])
         phases = np.array([passage.phase for passage in passages])
         return cls(
@@ -131,7 +129,7 @@ class JunctionPassageTable(NamedTuple):
             phase_indices=2 * junctions + phases,
             conflicting_phase_indices=2 * junctions + 1 - phases,
             min_green_s=np.array([passage.min_green_s for passage in passages]),
-            first_passages=np.array(first_passages),
+            first_passages=first_passages,
         )
 
     def find_next(self, lane_index: int, rear_positions_m: Float64) -> Int64:
@@ -256,11 +254,10 @@ class LaneSimulation:
         """
         positions_m, speeds_mps = np.empty((2, len(times_s), len(self.lane_positions_m)))
         is_occupied = np.empty((len(times_s), len(self._signals.offset_s), 2), dtype=bool)
-        starts_s, durations_s = [float(times_s[0]) - warm_up_s], [warm_up_s]
-        for frame_s, next_frame_s in pairwise(times_s):
-            starts_s.append(float(frame_s))
-            durations_s.append(float(next_frame_s - frame_s))
+        starts_s = [float(times_s[0]) - warm_up_s, *times_s[:-1].tolist()]
+        durations_s = [warm_up_s, *np.diff(times_s).tolist()]
         step_counts = [int(np.ceil(duration_s / MAX_STEP_S - 1e-9)) for duration_s in durations_s]
+        # Signals depend on the time alone: their state at all steps is computed at once.
         step_times_s = []
         for start_s, duration_s, count in zip(starts_s, durations_s, step_counts, strict=True):
             step_times_s += [start_s + step * duration_s / count for step in range(count)]
@@ -278,6 +275,7 @@ class LaneSimulation:
         return ~(remaining_s[:, self._passages.phase_indices] > self._passages.min_green_s)
 
     def _advance(self, has_red: Bools, step_s: float) -> None:
+        """Simulate one step with the given red passages (K,)."""
         driver, speed_mps = self._driver, self.speeds_mps
         leader_m, leader_mps = self._compute_leader_positions_m(), speed_mps.take(self._leader)
         gap_m = self._compute_gaps_m(leader_m)
@@ -326,7 +324,7 @@ class LaneSimulation:
         return gap_m
 
     def _update_junctions(self) -> None:
-        """Update distances to stop lines (N,), agents on or committed to a junction (N,), and occupied phases (2 J,)."""
+        """Update distances to stop lines (N,), agents committed to a junction (N,), and occupied phases (2 J,)."""
         self._distance_to_line_m = self._stop_line_m - self.lane_positions_m
         self._distance_to_line_m -= self._half_length_m
         self._is_committed = self.speeds_mps**2 > 2 * self._params.max_braking_mps2 * self._distance_to_line_m
@@ -354,6 +352,7 @@ class SpeedLimitTable:
     def __init__(self, lanes: Sequence[Lane], lane_indices: Int64) -> None:
         no_limit = np.array([np.inf])
         tables = [no_limit if lane.speed_limits_mps is None else lane.speed_limits_mps for lane in lanes]
+        # Tables of all lanes in one array; positions beyond the ends use the first or last entry of the lane.
         first_entries = np.cumsum([0, *(len(table) for table in tables)])
         self._limits_mps = np.concatenate(tables)
         self._has_limits = any(lane.speed_limits_mps is not None for lane in lanes)
@@ -390,6 +389,11 @@ def check_traffic_memory(num_agents: float, num_frames: int) -> None:
 
 def find_leaders(lanes: Sequence[Lane], lane_indices: Int64, lane_positions_m: Float64) -> tuple[Int64, Float64]:
     """Find the agent ahead of each of N agents on the same lane.
+
+    Args:
+        lanes: Lanes.
+        lane_indices: (N,) lane of each agent.
+        lane_positions_m: (N,) positions along the lanes.
 
     Returns:
         (N,) indices of the agents ahead, and (N,) offsets of their positions in meters: the length of a loop if the

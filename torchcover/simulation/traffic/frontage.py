@@ -54,7 +54,7 @@ class RoadsideKind(NamedTuple):
 
 
 BEHIND: tuple[Zone, ...] = ("built", "open")
-# Sizes of small objects are those of usual products; densities agree with recorded sweeps in the share of directions
+# Small objects have the sizes of usual products; densities agree with recorded sweeps in the share of directions
 # in which the view ends (docs/measured/streets.md).
 KINDS: Mapping[str, RoadsideKind] = {
     "house": RoadsideKind("house", ("built",), 1.0, (0.0, 5.0), (9.0, 24.0), (0.1, 4.0), (9.0, 15.0), (5.0, 24.0)),
@@ -90,6 +90,7 @@ HOUSES = ("house", "back_house")
 
 
 def _check_density_factors(factors: float | Mapping[str, float]) -> float | Mapping[str, float]:
+    """Check that factors are for known kinds and in the range of the densities that fit along a street."""
     max_factor = 4.0
     by_kind = factors if isinstance(factors, Mapping) else {"tree": factors}
     available = [kind for kind in KINDS if kind not in HOUSES]
@@ -239,7 +240,7 @@ class SideLines:
         directions /= np.maximum(lengths_m, TINY_M)[:, None]
         lengths_m[self._last] = 0.0
         self._arc_lengths_m = np.cumsum(lengths_m) - lengths_m
-        # At a corner, the normal is halfway between those of both segments.
+        # At a corner, the normal is the mean of the normals of both segments.
         is_first = np.isin(np.arange(len(directions)), self._first)[:, None]
         forward = directions + np.where(is_first, directions, np.roll(directions, 1, 0))
         forward /= np.maximum(np.linalg.norm(forward, axis=1, keepdims=True), TINY_M)
@@ -265,7 +266,14 @@ class SideLines:
 def sample_pieces(
     kind: RoadsideKind, lines: SideLines, density_factor: float, generator: np.random.Generator
 ) -> RoadsidePieces:
-    """Sample the pieces of a kind along the sides of its zones."""
+    """Sample the pieces of a kind along the sides of its zones.
+
+    Args:
+        kind: Kind of objects.
+        lines: Sides of streets.
+        density_factor: Factor on the usual density; 0 for no objects.
+        generator: Random generator.
+    """
     has_kind = np.array([zone in kind.zones for zone in lines.zones], dtype=bool)
     has_kind[has_kind] = generator.random(np.count_nonzero(has_kind)) < kind.side_share
     line_indices = np.flatnonzero(has_kind)
@@ -273,6 +281,7 @@ def sample_pieces(
         return RoadsidePieces(np.empty((0, 4, 2)), np.empty(0), np.empty(0, dtype=np.int64))
     line_m = lines.length_m[line_indices]
     gap_bounds_m = (kind.gap_m[0] / density_factor, kind.gap_m[1] / density_factor)
+    # Enough runs for the longest line are sampled for all lines.
     shape = len(line_indices), int(line_m.max() / (kind.run_m[0] + gap_bounds_m[0])) + 1
     run_m, gap_m = generator.uniform(*kind.run_m, shape), generator.uniform(*gap_bounds_m, shape)
     # The start of a line is anywhere in a gap.
@@ -285,6 +294,7 @@ def sample_pieces(
     depth_m = generator.uniform(*kind.depth_m, len(rows))
     height_m = generator.uniform(*kind.height_m, len(rows))
     start_m, piece_m, runs = start_m[fits], run_m, np.arange(len(rows))
+    # Runs are divided: walls into equal segments, other kinds into pieces with gaps.
     if kind.piece_m is not None:
         is_wall = kind.piece_m == WALL_SEGMENT_M
         counts = np.maximum((run_m / (kind.piece_m + kind.piece_gap_m)).astype(np.int64) + is_wall, 1)
@@ -347,6 +357,7 @@ def find_free_pieces(
     kinds_and_runs = np.stack([kind_indices[candidates], pieces.runs[candidates]])
     groups = np.unique(kinds_and_runs, axis=1, return_inverse=True)[1]
     later, earlier = candidates[find_overlapping_pairs(outlines_m[candidates], groups)]
+    # A piece yields only to pieces that stay.
     order = np.lexsort((earlier, later))
     for later_piece, earlier_piece in zip(later[order].tolist(), earlier[order].tolist(), strict=True):
         if is_free[earlier_piece]:
@@ -355,7 +366,15 @@ def find_free_pieces(
 
 
 def find_overlapping_pairs(outlines_m: Float64, groups: Int64) -> Int64:
-    """Find pairs (2, P) of convex outlines (N, 4, 2) of different groups that no edge of either separates."""
+    """Find pairs of outlines of different groups that overlap: no edge of either separates them.
+
+    Args:
+        outlines_m: (N, 4, 2) convex outlines.
+        groups: (N,) group of each outline.
+
+    Returns:
+        (2, P) indices of the later and of the earlier outline of each pair.
+    """
     # Diagonals have the same bounds as boxes and are created faster.
     diagonals = shapely.linestrings(np.stack([outlines_m.min(axis=1), outlines_m.max(axis=1)], axis=1))
     pairs = shapely.STRtree(diagonals).query(diagonals)

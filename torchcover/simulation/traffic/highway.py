@@ -104,9 +104,12 @@ class HighwayTraffic(ProceduralTraffic):
     hill_height_std_m: float = Field(default=3.0, ge=0.0, le=10.0)
 
     def _build(self, fleet: Fleet, times_s: Float64, generator: np.random.Generator) -> SceneParts:
+        """Build static scenery, ego vehicle and actors."""
+        # The layout has its own generator, so that traffic settings do not change it.
         (layout_generator,) = generator.spawn(1)
         hills = Hills(self.hill_height_std_m, layout_generator, PARAMS.hill_wavelengths_m, PARAMS.max_grade)
         median, auxiliary_lanes = self._sample_median(layout_generator), []
+        # The auxiliary lane begins where the vehicle ahead of the ego vehicle is at a random time of the run.
         for _ in range(2):
             ride_s = PARAMS.warm_up_s + layout_generator.uniform(0.0, 0.8) * self.duration_s
             begin_m = PARAMS.leader_speed_mps * ride_s
@@ -119,6 +122,7 @@ class HighwayTraffic(ProceduralTraffic):
         is_heavy = np.array([BODY_KINDS.get(agent.kind) in HEAVY_KINDS for agent in agents])
         is_next_to_exit = np.array([agent.lane_index % LANES == SIDE_LANE - 1 for agent in agents])
         is_exiting = (generator.random(len(agents)) < PARAMS.exit_share) & is_next_to_exit
+        # The ego vehicle stays on the motorway.
         is_exiting[0] = False
         stations_m = np.arange(median.stations_m[0], median.stations_m[-1], PARAMS.curvature_spacing_m)
         heights_m = hills.compute_heights_m(median.compute_poses(stations_m, 0.0)[:, :2])
@@ -134,6 +138,7 @@ class HighwayTraffic(ProceduralTraffic):
 
     @property
     def _simulated_s(self) -> float:
+        """Duration of the simulation with the warm-up."""
         return self.duration_s + self.time_step_s + PARAMS.warm_up_s
 
     def _sample_median(self, generator: np.random.Generator) -> Alignment:
@@ -145,6 +150,7 @@ class HighwayTraffic(ProceduralTraffic):
         wavelength_m = generator.uniform(*PARAMS.bend_wavelengths_m)
         phases = 2 * np.pi * (stations_m / wavelength_m + generator.random())
         curvatures_per_m = amplitude_rad * 2 * np.pi / wavelength_m * np.cos(phases)
+        # An alignment is straight outside of its stations.
         curvatures_per_m[[0, -1]] = 0.0
         return Alignment(stations_m, curvatures_per_m, (first_m, 0.0, float(amplitude_rad * np.sin(phases[0]))))
 
@@ -233,7 +239,16 @@ def compute_nearby_trajectories(
 def compute_lane_offsets_m(
     stations_m: Float64, lane_index: int, auxiliary_lanes: list[AuxiliaryLane]
 ) -> tuple[Float64 | float, Float64 | float]:
-    """Compute the distance (T,) of a lane from the median, and its derivative (T,) along the direction of travel."""
+    """Compute the distance of a lane from the median.
+
+    Args:
+        stations_m: (T,) stations.
+        lane_index: Index of the lane, see `LaneChangeSimulation`.
+        auxiliary_lanes: Auxiliary lane of each direction.
+
+    Returns:
+        (T,) distances in meters, and (T,) their derivatives along the direction of travel.
+    """
     center_m = MOTORWAY.lane_centers_m[lane_index % LANES]
     if lane_index % LANES != SIDE_LANE:
         return center_m, 0.0

@@ -40,7 +40,7 @@ class Hills:
 
     @property
     def is_flat(self) -> bool:
-        """Whether the ground is a plane."""
+        """True if the ground is a plane."""
         return bool(self._amplitude_m == 0.0)
 
     def compute_heights_m(self, positions_m: Float64) -> Float64:

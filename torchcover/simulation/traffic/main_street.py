@@ -145,6 +145,7 @@ class _CurvatureProfile:
 
 
 def _keeps_clear_of_itself(street: Alignment, half_length_m: float, params: MainStreetParams) -> bool:
+    """Test whether stretches of a street that are not neighbors keep their distance."""
     stations_m = np.arange(-half_length_m, half_length_m, 20.0)
     positions_m = street.compute_poses(stations_m, 0.0)[:, :2]
     is_no_neighbor = np.abs(stations_m[:, None] - stations_m) > params.neighbor_m

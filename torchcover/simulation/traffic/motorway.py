@@ -106,7 +106,12 @@ class AuxiliaryLane(NamedTuple):
         return offset_m, np.copysign(slope, stations - self.end_m)
 
     def is_inside(self, stations_m: ArrayLike, left_m: ArrayLike) -> Bools:
-        """Test whether objects that reach up to an offset (...) from the median fit between the road and the ramp."""
+        """Test whether objects fit between the road and the ramp.
+
+        Args:
+            stations_m: (...) stations.
+            left_m: (...) offsets from the median up to which the objects reach.
+        """
         return np.asarray(self.compute_offsets_m(stations_m)[0] > np.asarray(left_m) - MOTORWAY.edge_m + 1.0)
 
     def find_clear_offsets_m(self, stations_m: ArrayLike, left_m: ArrayLike, width_m: float = 0.5) -> Float64:
@@ -163,7 +168,12 @@ def build_roadside(
 
 
 def build_prisms(outlines_m: Float64, z_m: Bounds) -> Mesh:
-    """Build metal prisms over N convex counterclockwise outlines (N, K, 2), between two heights."""
+    """Build metal prisms.
+
+    Args:
+        outlines_m: (N, K, 2) convex counterclockwise outlines.
+        z_m: Bottom and top.
+    """
     num_prisms, num_corners, _ = outlines_m.shape
     vertices_m = np.empty((num_prisms, 2, num_corners, 3))
     vertices_m[..., :2] = outlines_m[:, None]
@@ -228,7 +238,16 @@ def build_delineators(auxiliary_lanes: AuxiliaryLanes, span_m: Bounds) -> list[M
 def build_structures(
     auxiliary_lanes: AuxiliaryLanes, span_m: Bounds, generator: np.random.Generator
 ) -> tuple[list[Mesh], list[float]]:
-    """Build sign gantries and bridges, in turn; also return the stations of the bridges."""
+    """Build sign gantries and bridges, in turn.
+
+    Args:
+        auxiliary_lanes: Auxiliary lanes by side.
+        span_m: First and last station.
+        generator: Random generator.
+
+    Returns:
+        Meshes, and the stations of the bridges.
+    """
     clearance_m = MOTORWAY.clearance_m
     meshes, bridges_m = [], []
     station_m, is_bridge = span_m[0] + generator.uniform(100.0, 300.0), bool(generator.random() < 0.5)
@@ -269,7 +288,14 @@ def build_noise_barriers(auxiliary_lanes: AuxiliaryLanes, span_m: Bounds, genera
 def build_roadside_trees(
     auxiliary_lanes: AuxiliaryLanes, span_m: Bounds, bridges_m: list[float], generator: np.random.Generator
 ) -> list[Mesh]:
-    """Build trees along both sides, except near bridges."""
+    """Build trees along both sides.
+
+    Args:
+        auxiliary_lanes: Auxiliary lanes by side.
+        span_m: First and last station.
+        bridges_m: Stations of bridges, near which no trees stand.
+        generator: Random generator.
+    """
     meshes = []
     for side, lane in auxiliary_lanes.items():
         x_m = span_m[0] + np.cumsum(generator.uniform(7.0, 25.0, int((span_m[1] - span_m[0]) / 16.0)))

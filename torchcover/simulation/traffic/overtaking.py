@@ -8,7 +8,6 @@ agents behind in either lane keep their distance, and the agent keeps its distan
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -131,7 +130,7 @@ class LaneChangeSimulation:
         self._auxiliary_spans_m, self._slope_profile = auxiliary_spans_m, slope_profile
         is_truck = np.array([BODY_KINDS.get(agent.kind) in ("truck", "lorry") for agent in agents], dtype=bool)
         self._trucks = np.flatnonzero(is_truck)
-        # Positions along the second direction, and slopes, are those of the first with the opposite sign.
+        # In the second direction, positions and slopes have the opposite sign.
         self._truck_directions = np.where(self.lane_indices[self._trucks] < LANES, 1.0, -1.0)
         self._change_duration_s = generator.uniform(*params.duration_s, num_agents)
         self._variation_rad_per_s = 2 * np.pi / generator.uniform(*params.variation_period_s, num_agents)
@@ -156,7 +155,7 @@ class LaneChangeSimulation:
             warm_up_s: Duration that is simulated before the first frame.
         """
         positions_m, speeds_mps = np.empty((2, len(times_s), len(self.lane_positions_m)))
-        durations_s = [warm_up_s, *(after_s - before_s for before_s, after_s in pairwise(times_s.tolist()))]
+        durations_s = [warm_up_s, *np.diff(times_s).tolist()]
         for frame_index, duration_s in enumerate(durations_s):
             num_steps = int(np.ceil(duration_s / MAX_STEP_S - 1e-9))
             for _ in range(num_steps):
@@ -165,6 +164,7 @@ class LaneChangeSimulation:
         return TrafficHistory(positions_m, speeds_mps, np.zeros((len(times_s), 0, 2), dtype=bool))
 
     def _advance(self, step_s: float) -> None:
+        """Simulate one step."""
         num_agents, speed_mps = len(self.lane_positions_m), self.speeds_mps
         gap_m, member_speed_mps = self._compute_gaps_m(), speed_mps.take(self._members)
         closing_mps = member_speed_mps - speed_mps.take(self._leader)
@@ -176,6 +176,7 @@ class LaneChangeSimulation:
         acceleration_mps2 = compute_acceleration_mps2(
             self._driver, speed_mps, gap_ratio[:num_agents], self._desired_mps
         )
+        # Laden trucks are limited by their power.
         stations_m = self._truck_directions * self.lane_positions_m[self._trucks]
         slope = self._truck_directions * np.interp(stations_m, *self._slope_profile)
         max_truck_mps2 = compute_max_truck_acceleration_mps2(speed_mps[self._trucks], slope)
@@ -224,6 +225,7 @@ class LaneChangeSimulation:
         self._member_drivers = self._select_drivers(members)
 
     def _select_drivers(self, agents: Int64) -> Driver:
+        """Select the parameters of drivers (K,)."""
         return Driver(*(getattr(self._driver, name)[agents] for name in Driver.__dataclass_fields__))
 
     def _compute_gaps_m(self) -> Float64:
@@ -290,6 +292,7 @@ class LaneChangeSimulation:
         new_follower, has_new_follower = self._look_up_queue(queue_index - 1, lane + sides)
         old_follower, has_old_follower = self._look_up_queue(self._rank[agents] - 1, lane)
         old_leader, has_old_leader = self._leader[agents], self._leader_offset_m[agents] == 0.0
+        # Accelerations without and with the change, of the agent and of both followers.
         before_mps2 = self._acceleration_mps2[agents]
         after_mps2, has_room = self._follow(agents, new_leader, has_new_leader)
         follower_mps2, follower_has_room = self._follow(new_follower, agents, has_new_follower)
@@ -307,6 +310,7 @@ class LaneChangeSimulation:
         gain_mps2 -= np.where(would_be_passed, slower_mps2, before_mps2)
         bias_mps2 = np.where(would_pass_on_right, 0.0, sides * params.keep_right_mps2)
         gain_mps2 += params.politeness * others_gain_mps2 + bias_mps2 - params.min_gain_mps2
+        # Entering and exiting only need a safe gap.
         is_mandatory = np.maximum(lane, lane + sides) % LANES == SIDE_LANE
         gain_mps2 += np.where(is_mandatory, params.mandatory_gain_mps2, 0.0)
         is_follower_safe = ~has_new_follower | (follower_has_room & (follower_mps2 > -params.max_braking_mps2))

@@ -127,7 +127,7 @@ class ParkingLotBuilder:
         self._crossing_columns: dict[int, list[int]] = {}
         for side in (1, -1):
             columns = generator.choice(LOT.num_stalls, size=settings.crossings_per_aisle, replace=False)
-            self._crossing_columns[side] = sorted(set(columns.tolist()))
+            self._crossing_columns[side] = sorted(columns.tolist())
 
     def build_footpaths(self) -> list[Footpath]:
         """Build two footpaths across the aisle at each crossing."""
@@ -150,19 +150,10 @@ class ParkingLotBuilder:
         half_length_m = LOT.bollard_x_m + 14.0
         lot = shapely.box(-half_length_m, -LOT.edge_m - 8.0, half_length_m, LOT.building_y_m)
         roadside_offsets_m = (0.2, 2.5)
-        sides = find_street_sides(
-            lot, roadside_offsets_m, _mark_all_visible, self._settings.built_share, self._generator
-        )
+        built_share, density = self._settings.built_share, self._settings.roadside_density
+        sides = find_street_sides(lot, roadside_offsets_m, _mark_all_visible, built_share, self._generator)
         occupied = [lot, market.buffer(2.0)]  # tree crowns keep off the market
-        roadside = place_scenery(
-            sides,
-            occupied,
-            occupied,
-            (),
-            _compute_flat_heights_m,
-            self._settings.roadside_density,
-            self._generator,
-        )
+        roadside = place_scenery(sides, occupied, occupied, (), _compute_flat_heights_m, density, self._generator)
         low_meshes = merge_by_kind(low_obstacles, self._build_bollards())
         high_meshes = merge_by_kind(island_trees, surroundings, *roadside)
         return Scenery((ground, *low_meshes, *curbs, *high_meshes), (0, 3))
@@ -181,6 +172,7 @@ class ParkingLotBuilder:
 
     def _fill_stall(self, x_m: float, head_y_m: float, inwards: int) -> list[Mesh]:
         """Park a car in a stall, nose or tail first; otherwise return a shopping trolley or nothing."""
+        # Cars are a little oblique and off the middle.
         uniform = self._generator.uniform
         if self._generator.random() < self._settings.parked_share:
             kind = self._fleet.sample_kind({"suv": 3.0, "sedan": 3.0, "hatchback": 4.0})
@@ -233,10 +225,12 @@ class ParkingLotBuilder:
 
 
 def _mark_all_visible(positions_m: Float64) -> Bools:
+    """Mark all positions (N, 2) as visible."""
     return np.ones(len(positions_m), dtype=bool)
 
 
 def _compute_flat_heights_m(positions_m: Float64) -> Float64:
+    """Return height 0 at positions (N, 2)."""
     return np.zeros(len(positions_m))
 
 
@@ -261,6 +255,7 @@ class ParkingTraffic(ProceduralTraffic):
     roadside_density: RoadsideDensity = 1.0
 
     def _build(self, fleet: Fleet, times_s: Float64, generator: np.random.Generator) -> SceneParts:
+        """Build static scenery, ego vehicle and actors."""
         loop_width_m = 2 * (LOT.inner_edge_m + LOT.aisle_m / 2)
         lanes = [Lane(build_rounded_rectangle(LOT.loop_length_m, loop_width_m, LOT.corner_radius_m))]
         agents = self._create_agents(lanes[0].centerline.length_m, fleet, generator)
@@ -309,6 +304,7 @@ def simulate_pedestrians(
         traversal_s = path.length_m / float(PEDESTRIAN.desired_speed_mps * generator.uniform(0.8, 1.1))
         can_start = np.ones(len(times_s), dtype=bool)
         if index < len(crossing_paths):
+            # Pedestrians start when the aisle stays free for the whole way.
             distances_m = np.linalg.norm(cars.positions_m[..., :2] - (path.start_m + path.end_m) / 2, axis=2)
             is_blocked = (distances_m < LOT.clear_distance_m).any(axis=1)
             can_start = is_free_for(is_blocked, traversal_s, frame_interval_s)

@@ -187,6 +187,7 @@ def copy_shape(shape: Mesh, outlines_m: Float64, bottom_m: Float64, base_m: Floa
         heights_m: (N,) heights.
     """
     x, y, z = shape.vertices_m.T
+    # Bilinear coordinates of the vertices in the outline.
     weights = np.stack([(1 - x) * (1 - y), x * (1 - y), x * y, (1 - x) * y], axis=1)
     num_copies = len(outlines_m)
     positions_m = np.einsum("vc,ncd->nvd", weights, outlines_m)
@@ -202,7 +203,11 @@ def copy_shape(shape: Mesh, outlines_m: Float64, bottom_m: Float64, base_m: Floa
 
 @cache
 def build_unit_shape(name: str) -> Mesh:
-    """Build a shape in the unit cube, with the street beyond y = 1."""
+    """Build a shape in the unit cube, with the street beyond y = 1.
+
+    Args:
+        name: Shape of a kind of roadside objects; "bicycle" for all unknown names.
+    """
     box = build_box_from_bounds((0.0, 1.0), (0.0, 1.0), (0.0, 1.0))
     if name == "house":
         return box
@@ -221,12 +226,7 @@ def build_unit_shape(name: str) -> Mesh:
         return build_round_shape([0.0, 0.4, 0.8, 1.0], [0.7, 1.0, 0.9, 0.4]).assign_material("vegetation")
     if name == "sign":
         post = build_box_from_bounds((0.0, 1.0), (0.45, 0.55), (0.0, 0.75)).assign_material("metal")
-        return merge_meshes(
-            [
-                post,
-                build_box_from_bounds((0.2, 0.8), (0.0, 1.0), (0.755, 1.0)).assign_material("sign"),
-            ]
-        )
+        return merge_meshes([post, build_box_from_bounds((0.2, 0.8), (0.0, 1.0), (0.755, 1.0)).assign_material("sign")])
     return merge_meshes(
         [
             build_wheel(0.0),
@@ -238,13 +238,22 @@ def build_unit_shape(name: str) -> Mesh:
 
 
 def build_round_shape(levels: Sequence[float], diameters: Sequence[float]) -> Mesh:
-    """Build a shape with six sides around the vertical axis of the unit cube, from its diameters at given levels."""
+    """Build a shape with six sides around the vertical axis of the unit cube.
+
+    Args:
+        levels: Ascending z.
+        diameters: Diameter at each level.
+    """
     ring = 0.5 * compute_circle_points(6)
     return build_prism([np.array([0.5, 0.5]) + diameter * ring for diameter in diameters], levels)
 
 
 def build_wheel(x: float) -> Mesh:
-    """Build a wheel of a bicycle in the unit cube, from an x on."""
+    """Build a wheel of a bicycle in the unit cube.
+
+    Args:
+        x: Smallest x of the wheel.
+    """
     ring = 0.5 * compute_circle_points(6)
     outline = np.array([x, 0.0]) + np.array([0.4, 0.65]) * (ring / np.array([1.0, np.sqrt(0.75)]) + 0.5)
     disc = build_prism([outline, outline], [0.46, 0.54])

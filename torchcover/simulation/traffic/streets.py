@@ -140,6 +140,7 @@ class StreetPlan:
             start_pose, end_pose = self.main_alignment.compute_poses([station_m - half_m, station_m + half_m], 0.0)
             (x, y, yaw_deg), (end_x, end_y, end_yaw_deg) = start_pose, end_pose
             yaw, angle = np.deg2rad([yaw_deg, end_yaw_deg - yaw_deg])
+            # The tangents of the turn meet in a corner; the other turn starts on the first one, equally far beyond it.
             corner_distance_m = np.hypot(end_x - x, end_y - y) / 2 / np.cos(angle / 2)
             start = x + 2 * corner_distance_m * np.cos(yaw), y + 2 * corner_distance_m * np.sin(yaw), yaw + np.pi
             knots_m = self.main_alignment.stations_m
@@ -172,11 +173,9 @@ class StreetPlan:
 
     def build_traffic_lanes(self) -> list[Lane]:
         """Build the lanes of the main street: eastbound from the median outwards, then westbound."""
-        lanes = []
-        for direction in (1, -1):
-            for index in range(self.cross_section.lanes_per_direction):
-                lanes.append(self._build_main_lane((index + 0.5) * self.cross_section.lane_width_m, direction))
-        return lanes
+        indices = np.arange(self.cross_section.lanes_per_direction)
+        offsets_m = ((indices + 0.5) * self.cross_section.lane_width_m).tolist()
+        return [self._build_main_lane(offset_m, direction) for direction in (1, -1) for offset_m in offsets_m]
 
     def build_bicycle_lanes(self) -> list[Lane]:
         """Build the bicycle lanes of the main street: eastbound, westbound."""
@@ -226,7 +225,14 @@ class StreetPlan:
 
 
 def compute_speed_limits_mps(path: OffsetPath) -> Float64:
-    """Compute the speeds (K,) at which a lane can be driven, every `SPEED_LIMIT_SPACING_M`: in curves and before."""
+    """Compute the speeds at which a lane can be driven, in curves and before them.
+
+    Args:
+        path: Centerline of the lane.
+
+    Returns:
+        (K,) speeds in m/s, every `SPEED_LIMIT_SPACING_M`.
+    """
     distances_m = np.arange(0.0, path.length_m, SPEED_LIMIT_SPACING_M)
     curvature_per_m = path.street.compute_curvatures_per_m(path.convert_distances_to_stations_m(distances_m))
     curvature_per_m = np.abs(curvature_per_m / (1.0 - curvature_per_m * path.left_m))

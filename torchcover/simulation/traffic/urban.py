@@ -125,6 +125,7 @@ class UrbanTraffic(ProceduralTraffic):
     hill_height_std_m: float = Field(default=1.0, ge=0.0, le=2.0)
 
     def _build(self, fleet: Fleet, times_s: Float64, generator: np.random.Generator) -> SceneParts:
+        """Build static scenery, ego vehicle and actors."""
         # The layout has its own generator, so that traffic settings do not change it.
         (layout_generator,) = generator.spawn(1)
         hills = Hills(self.hill_height_std_m, layout_generator)
@@ -142,6 +143,7 @@ class UrbanTraffic(ProceduralTraffic):
             flow = LaneSimulation(lanes, agents, streets.signals).run(times_s, PARAMS.warm_up_s)
             if is_usually_following(agents, flow):
                 break
+        # Only agents that come near the ego vehicle become actors.
         nearby = find_nearby_agents(lanes, agents, flow.lane_positions_m)
         lane_positions_m, agents = flow.lane_positions_m[:, nearby], [agents[index] for index in nearby]
         ego_path = lanes[agents[0].lane_index].centerline
@@ -211,6 +213,7 @@ class UrbanTraffic(ProceduralTraffic):
         return lanes, select_relevant_agents(lanes, agents, simulated_s)
 
     def _create_ego_and_leader(self, streets: StreetPlan, fleet: Fleet, generator: np.random.Generator) -> list[Agent]:
+        """Create the ego vehicle in the middle of a lane of the main street, and a slower vehicle ahead of it."""
         lane, middle_m = int(generator.integers(streets.cross_section.lanes_per_direction)), streets.half_length_m
         kind = fleet.sample_kind({"suv": 1.0, "sedan": 2.0, "hatchback": 2.0, "van": 1.0})
         half_gap_m = PARAMS.leader_gap_m / 2
@@ -248,7 +251,12 @@ def select_relevant_agents(lanes: Sequence[Lane], agents: Sequence[Agent], durat
 
 
 def is_usually_following(agents: Sequence[Agent], flow: TrafficHistory) -> bool:
-    """Test whether the first agent follows another vehicle on its lane in most frames."""
+    """Test whether the first agent usually follows another vehicle on its lane.
+
+    Args:
+        agents: N agents.
+        flow: Simulation.
+    """
     lane_indices = np.array([agent.lane_index for agent in agents])
     neighbors = 1 + np.flatnonzero(lane_indices[1:] == lane_indices[0])
     distances_m = flow.lane_positions_m[:, neighbors] - flow.lane_positions_m[:, :1]
@@ -325,6 +333,7 @@ def remove_bodies_off_streets(
         min_m[index], max_m[index] = np.sort(path.convert_stations_to_distances_m(spans_by_street[id(path.street)]))
     is_outside = (lane_positions_m < min_m) | (lane_positions_m > max_m)
     bodies.positions_m[:, : len(agents)][is_outside] = np.nan
+    # Trailers disappear with their towing vehicles.
     towing_x_m = bodies.positions_m[:, list(bodies.towing_indices), 0]
     bodies.positions_m[:, len(agents) :][np.isnan(towing_x_m)] = np.nan
 
