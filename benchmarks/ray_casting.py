@@ -14,6 +14,7 @@ from embreex.rtcore_scene import EmbreeScene
 from benchmarks import compare, table
 from torchcover.data import SimulatedFrames
 from torchcover.evaluation.cpu_cores import set_threads
+from torchcover.geometry import invert
 from torchcover.simulation import PaperReference, Rig, Scenario, SensorNoise
 from torchcover.simulation.instant import SensorScan
 from torchcover.simulation.raycaster import cast_from_vehicle
@@ -59,7 +60,7 @@ def row(what, off, on):
 def bare_scene(world):
     """The same triangles in embreex, without torchcover."""
     scene = EmbreeScene(robust=True)
-    for mesh in (world.ego.mesh, *world.static):
+    for mesh in (world.ego.mesh, *world.static_meshes):
         TriangleMesh(scene, mesh.vertices_m.astype(np.float32), mesh.faces.astype(np.int32))
     scene.run(np.zeros((1, 3), np.float32), np.ones((1, 3), np.float32))
     return scene
@@ -109,7 +110,7 @@ def show_ray_casting():
 
 def rays_that_pass_by(scene):
     """65,536 reference rays: without this, each is cast at each body in range."""
-    reference, instant = PaperReference(rows=256, columns=256), scene.at(STEP, within_m=RANGE_M)
+    reference, instant = PaperReference(rows=256, columns=256), scene.get_snapshot(STEP, RANGE_M)
     generator = np.random.default_rng(0)
     pose = reference.sample_pose(scene.ego_box, generator)
     tiles = split_into_tiles(reference.compute_directions())
@@ -125,28 +126,30 @@ def at_every_body(instant, pose, tiles):
     for tile in tiles:
         directions = rotate(pose[:3, :3], tile.directions)
         limit_m = np.full(directions.shape[1], RANGE_M, dtype=np.float32)
-        hits = cast_from_vehicle(instant.static, instant.static_T_vehicle, pose[:3, 3], directions, limit_m)
-        moving = instant.moving
-        for caster, part_T_vehicle, body in zip(moving.casters, moving.part_T_vehicle, moving.body, strict=True):
-            nearer = cast_from_vehicle(caster, part_T_vehicle, pose[:3, 3], directions, hits.range_m)
+        hits = cast_from_vehicle(instant.static_caster, instant.static_T_vehicle, pose[:3, 3], directions, limit_m)
+        moving = instant.moving_bodies
+        for caster, vehicle_T_part, body in zip(
+            moving.casters, moving.vehicle_T_part, moving.body_indices, strict=True
+        ):
+            nearer = cast_from_vehicle(caster, invert(vehicle_T_part), pose[:3, 3], directions, hits.range_m)
             hits.range_m[:] = nearer.range_m
             hits.body_indices[nearer.body_indices >= 0] = body
-        seen = (hits.body_indices >= 0) & (hits.body_indices != instant.ego)
+        seen = (hits.body_indices >= 0) & (hits.body_indices != instant.ego_index)
         found.append((directions * hits.range_m + pose[:3, 3].astype(np.float32)[:, None])[:, seen].T)
-        self_hits += int((hits.body_indices == instant.ego).sum())
+        self_hits += int((hits.body_indices == instant.ego_index).sum())
     points = np.concatenate(found)
     return SensorScan(points, np.arange(len(points)), np.empty(0, dtype=np.float32), 0, self_hits)
 
 
 def ego_again(scene, sensor):
     """A sensor fixed to the ego need not be cast at it at every step."""
-    instant, mounted = scene.at(STEP, within_m=RANGE_M), MountedSensor(sensor, scene, sensor.max_range_m)
+    instant, mounted = scene.get_snapshot(STEP, RANGE_M), MountedSensor(sensor, scene, sensor.max_range_m)
     return afresh(instant, sensor, mounted.tiles), lambda: mounted.scan(instant, SensorNoise(None))
 
 
 def scan_again(scene, sensor):
     """Where nothing moves one scan serves for all steps."""
-    instant, mounted = scene.at(0), MountedSensor(sensor, scene, sensor.max_range_m)
+    instant, mounted = scene.get_snapshot(0), MountedSensor(sensor, scene, sensor.max_range_m)
     return afresh(instant, sensor, mounted.tiles), lambda: mounted.scan(instant, SensorNoise(None))
 
 
@@ -157,10 +160,10 @@ def afresh(instant, sensor, tiles):
 
 def world_again(scene, sensor):
     """The meshes are at hand; what is left out is to give them to the ray caster at every step."""
-    tiles, world = split_into_tiles(sensor.compute_directions()), scene.world
+    tiles, world = split_into_tiles(sensor.compute_directions()), scene.scene
 
     def step(built):
-        return afresh(built.at(STEP, within_m=RANGE_M), sensor, tiles)()
+        return afresh(built.get_snapshot(STEP, RANGE_M), sensor, tiles)()
 
     return lambda: step(SceneGeometry(world)), lambda: step(scene)
 

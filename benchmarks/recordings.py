@@ -204,7 +204,7 @@ def tables(cases, truths, found, spent_s, movers_of):
 
 def found_movers(recording, reference, frame):
     """How far off in m/s is each vehicle that moves and has enough points; inf for one that is not found."""
-    instant = recording.frames[0]
+    instant = recording.key_frames[0]
     time_s, loose_m, apart_s = recording.times_s[instant], [], []
     vehicle_T_local = invert(reference.sweeps.compute_local_T_vehicle(recording, instant))
     for (_, index), (points_m, told) in reference.classify_points(recording, instant).items():
