@@ -37,30 +37,30 @@ class Shard(NamedTuple):
 
 
 class FrameDeduplicator:
-    """Filter of frames that this or another process already counts, without communication between processes.
+    """Filter that removes repeated frames within and between processes, without communication.
 
-    A `torch.utils.data.DistributedSampler` deals out the same number of samples to every process and fills the last
-    round with the first samples again. The position of a sample in the whole deal tells, whatever the order of the
-    samples: from `len(dataset)` on it is a repetition. This covers samplers that deal out in the same way: those that
-    Lightning, MMEngine and OpenPCDet put in. Where the number of samples is told at the end only, as by MMEngine, the
-    last frame of a process is held back until then: no other can be a repetition. It needs batches in order
-    (`DataLoader(in_order=True)`, the default) with one frame for each sample.
+    A `torch.utils.data.DistributedSampler` gives every process the same number of samples and repeats the first samples
+    to fill the last round. The overall position of a sample identifies repetitions in any order of samples: positions
+    from `len(dataset)` on. Other samplers with this scheme, those of Lightning, MMEngine and OpenPCDet, are covered as
+    well. If the number of samples is known only at the end, as in MMEngine, the last frame of each process, the only
+    possible repetition, is held back until then. Batches must be in order (`DataLoader(in_order=True)`, the default),
+    with one frame per sample.
 
-    Within a process a frame that comes again before all are forgotten is recognised by its index, name and numbers of
-    points, and counted once; one with neither index nor name is a new one. That covers samplers that repeat samples on
-    purpose, and epochs that were resumed. A frame that a sampler of another kind gives to two processes is counted
-    twice.
+    Within a process, a repeated frame is recognized by its index, name and numbers of points, and counted once; a frame
+    with neither index nor name is new. This covers samplers that repeat samples on purpose, and resumed epochs. A frame
+    that a sampler of another kind gives to two processes is counted twice.
 
-    The memory is one number for each frame that was counted.
+    Memory is one integer per counted frame.
 
     Example:
         >>> import torch
         >>> frames = [Frame({"rig": torch.zeros(5, 3)}, torch.zeros(9, 3), index=k, name="a") for k in (0, 1, 0)]
-        >>> once = FrameDeduplicator()
-        >>> [frame.index for frame in once.select_new(frames)]
+        >>> deduplicator = FrameDeduplicator()
+        >>> [frame.index for frame in deduplicator.select_new(frames)]
         [0, 1]
-        >>> once.start_epoch()
-        >>> [frame.index for frame in once.select_new(frames[:2], Shard(process_index=1, num_processes=2, num_samples=3))]
+        >>> deduplicator.start_epoch()
+        >>> shard = Shard(process_index=1, num_processes=2, num_samples=3)
+        >>> [frame.index for frame in deduplicator.select_new(frames[:2], shard)]
         [0]
     """
 
@@ -68,10 +68,10 @@ class FrameDeduplicator:
         self.start_epoch()
 
     def start_epoch(self, *, clear_history: bool = True) -> None:
-        """Begin with the first positions of the loaders again.
+        """Reset the positions of all loaders.
 
         Args:
-            clear_history: Whether frames that were counted in earlier epochs are to be counted again.
+            clear_history: Count frames of earlier epochs again.
         """
         if clear_history:
             self._counted: set[int] = set()
@@ -82,30 +82,35 @@ class FrameDeduplicator:
         """Select the frames of the next batch that count.
 
         Args:
-            frames: One for each sample of the batch, in order.
-            shard: How the loader's samples are dealt out, see `find_shard`; None if this process gets all of them. As
-                long as their number is not known, the last frame waits for the next call; a call without frames, but
-                with the number, gives it back.
-            loader_index: Number of the loader, if there are several: equal frames of two loaders are different ones.
+            frames: Frame of each sample of the batch, in order.
+            shard: Distribution of the samples of the loader, see `find_shard`; None if this process gets all samples.
+                While their number is unknown, the last frame is held back until the next call; a call without frames
+                and with the number releases it.
+            loader_index: Index of the loader; equal frames of two loaders are different frames.
 
         Returns:
-            Some or all of the frames, in order.
+            Frames that count, in order.
         """
         frames = [*self._held_back.pop(loader_index, ()), *frames]
         if shard is not None and shard.num_samples is None:
             frames, self._held_back[loader_index] = frames[:-1], frames[-1:]
-        first = self._position.get(loader_index, 0)
-        self._position[loader_index] = first + len(frames)
-        dealt = [frame for position, frame in enumerate(frames, first) if not (shard and shard.is_padding(position))]
-        return [frame for frame in dealt if self._is_new(frame, loader_index)]
+        start = self._position.get(loader_index, 0)
+        self._position[loader_index] = start + len(frames)
+        new_frames = []
+        for position, frame in enumerate(frames, start):
+            is_padding = shard is not None and shard.is_padding(position)
+            if not is_padding and self._is_new(frame, loader_index):
+                new_frames.append(frame)
+        return new_frames
 
-    def _is_new(self, frame: Frame, loader: int) -> bool:
+    def _is_new(self, frame: Frame, loader_index: int) -> bool:
+        """Return whether a frame has not been counted yet, and remember it."""
         if frame.index == UNKNOWN_INDEX and not frame.name:
             return True
-        identity = _hash_frame(frame, loader)
-        seen = identity in self._counted
-        self._counted.add(identity)
-        return not seen
+        frame_hash = _hash_frame(frame, loader_index)
+        is_counted = frame_hash in self._counted
+        self._counted.add(frame_hash)
+        return not is_counted
 
     def state_dict(self) -> dict[str, Any]:
         """Return the frames that all processes have counted, as plain numbers for `load_state_dict`.
@@ -114,9 +119,9 @@ class FrameDeduplicator:
         """
         counted = self._counted
         if is_distributed():
-            of_process: list[set[int]] = [set()] * torch.distributed.get_world_size()
-            torch.distributed.all_gather_object(of_process, self._counted)
-            counted = set().union(*of_process)
+            counted_by_process: list[set[int]] = [set()] * torch.distributed.get_world_size()
+            torch.distributed.all_gather_object(counted_by_process, self._counted)
+            counted = set().union(*counted_by_process)
         return {"counted": sorted(counted), "position": dict(self._position)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -154,9 +159,9 @@ def is_distributed() -> bool:
     return torch.distributed.is_available() and torch.distributed.is_initialized()
 
 
-def _hash_frame(frame: Frame, loader: int) -> int:
-    # Two datasets side by side have frames of the same index, and of the same name if only their seed differs. Flips
-    # and rotations change coordinates, but no number of points.
-    sizes = [len(frame.reference), *(len(cloud) for cloud in frame.clouds.values())]
-    text = repr((loader, frame.index, frame.name, sizes))
+def _hash_frame(frame: Frame, loader_index: int) -> int:
+    # Concatenated datasets have frames with equal indices, and with equal names if only the seeds differ. Augmentation
+    # by flips and rotations changes coordinates, but not the numbers of points.
+    point_counts = [len(frame.reference), *(len(cloud) for cloud in frame.clouds.values())]
+    text = repr((loader_index, frame.index, frame.name, point_counts))
     return int.from_bytes(hashlib.blake2b(text.encode(), digest_size=7).digest(), "big")

@@ -1,6 +1,7 @@
-"""Maps, pictures and rows of results, for whichever logger takes them."""
+"""Logging of maps, figures and tables of results with different loggers."""
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from html import escape
 from typing import Any
 
@@ -12,67 +13,73 @@ from numpy.typing import NDArray
 from torchcover.coverage import Coverage
 from torchcover.report import plot_band_maps
 
-# Takes the tag of a figure, the figure, and where on its axis.
+# Function that logs a figure with a tag at a step.
 FigureLogger = Callable[[str, Figure, int], Any]
 
 
 def log_maps(coverage: Coverage, loggers: Sequence[Any], prefix: str, step: int) -> list[str]:
-    """Hand the maps to every logger that takes figures or images.
+    """Log coverage maps with every logger that accepts figures or images.
 
-    A logger takes them by one of these, the first that it has:
+    The first available method of a logger is used:
 
-    * `log_image(key, images, step)`, as that of Weights & Biases;
-    * `add_figure(tag, figure, step)`, its own or that of its `experiment`, as TensorBoard's;
-    * `experiment.log_figure(run_id, figure, artifact_file)`, if it has a `run_id`, as MLflow's: into the file
+    * `log_image(key, images, step)`, as in Weights & Biases;
+    * `add_figure(tag, figure, step)` of the logger or of its `experiment`, as in TensorBoard;
+    * `experiment.log_figure(run_id, figure, artifact_file)` of loggers with a `run_id`, as in MLflow: the file
       `TAG/step_STEP.png` of the run;
-    * `experiment.log_figure(figure_name, figure, step)`, as Comet's.
+    * `experiment.log_figure(figure_name, figure, step)`, as in Comet.
 
     Args:
-        coverage: What `CoverageMetric.compute` returned.
-        loggers: Lightning's loggers, or objects like them.
-        prefix: In front of the tags of `plot_band_maps`, with a slash between.
-        step: Where on the logger's axis.
+        coverage: Result of `CoverageMetric.compute`.
+        loggers: Loggers of Lightning, or similar objects.
+        prefix: Prefix of the tags of `plot_band_maps`, separated by a slash.
+        step: Step on the axis of the logger.
 
     Returns:
-        The names of the classes of the loggers that take neither.
+        Class names of the loggers without any of these methods.
     """
-    takers = [(logger, _taker(logger)) for logger in loggers]
-    able = [take for _, take in takers if take is not None]
-    if able:
+    figure_loggers, unsupported = [], []
+    for logger in loggers:
+        log_figure = _find_figure_logger(logger)
+        if log_figure is None:
+            unsupported.append(type(logger).__name__)
+        else:
+            figure_loggers.append(log_figure)
+    if figure_loggers:
         for tag, figure in plot_band_maps(coverage):
-            for take in able:
-                take(f"{prefix}/{tag}", figure, step)
-    return [type(logger).__name__ for logger, take in takers if take is None]
+            for log_figure in figure_loggers:
+                log_figure(f"{prefix}/{tag}", figure, step)
+    return unsupported
 
 
 def log_result(result: Any, logger: Any, *, step: int = 0, tag: str = "torchcover") -> None:  # noqa: ANN401  (see below)
-    """Hand the rows and the picture of a result to a logger: `TAG/rows` and `TAG/picture`.
+    """Log the table and the figure of a result as `TAG/rows` and `TAG/picture`.
 
     Args:
-        result: Any with `to_dataframe()` and `plot()`: what `evaluate`, `map_target_visibility`, `encounter` or a search gave.
-        logger: TensorBoard's `SummaryWriter`, a run of Weights & Biases, the module `mlflow` with an active run, or
-            Lightning's logger of one of them.
-        step: Where on the logger's axis.
-        tag: In front of the names, with a slash between.
+        result: Object with `to_dataframe()` and `plot()`: the result of `evaluate`, `map_target_visibility`,
+            `evaluate_encounters` or a search.
+        logger: TensorBoard `SummaryWriter`, run of Weights & Biases, module `mlflow` with an active run, or the
+            Lightning logger of one of them.
+        step: Step on the axis of the logger.
+        tag: Prefix of the names, separated by a slash.
 
     Raises:
-        TypeError: Another logger.
-        ModuleNotFoundError: pandas is not there.
+        TypeError: The logger has another type.
+        ModuleNotFoundError: pandas is not installed.
     """
-    frame, figure = result.to_dataframe(), result.plot()
+    table, figure = result.to_dataframe(), result.plot()
     experiment = getattr(logger, "experiment", logger)
     if callable(getattr(experiment, "add_text", None)):
-        experiment.add_text(f"{tag}/rows", _markdown(frame), step)
+        experiment.add_text(f"{tag}/rows", _format_markdown(table), step)
         experiment.add_figure(f"{tag}/picture", figure, step)
-    elif callable(getattr(experiment, "log_table", None)):  # the module, or a client that has to be told the run
-        run = [logger.run_id] if hasattr(logger, "run_id") else []
-        experiment.log_table(*run, data=frame, artifact_file=f"{tag}/rows_{step:08d}.json")
-        experiment.log_figure(*run, figure, f"{tag}/picture_{step:08d}.png")
+    elif callable(getattr(experiment, "log_table", None)):  # the mlflow module, or its client, which needs the run id
+        run_id = [logger.run_id] if hasattr(logger, "run_id") else []
+        experiment.log_table(*run_id, data=table, artifact_file=f"{tag}/rows_{step:08d}.json")
+        experiment.log_figure(*run_id, figure, f"{tag}/picture_{step:08d}.png")
     elif type(experiment).__module__.partition(".")[0] == "wandb":
         from wandb import Image, Table
 
-        shown = {f"{tag}/rows": Table(dataframe=frame), f"{tag}/picture": Image(render_rgb_image(figure))}
-        experiment.log(shown, step=step)
+        media = {f"{tag}/rows": Table(dataframe=table), f"{tag}/picture": Image(render_rgb_image(figure))}
+        experiment.log(media, step=step)
     else:
         raise TypeError(
             "logger: a SummaryWriter, a run of Weights & Biases, mlflow, or Lightning's logger of one of them is "
@@ -80,29 +87,50 @@ def log_result(result: Any, logger: Any, *, step: int = 0, tag: str = "torchcove
         )
 
 
-def _markdown(frame: Any) -> str:  # noqa: ANN401  (a DataFrame)
-    """A table as TensorBoard shows it; bars would end a cell, and it shows HTML as such."""
-    rows = [list(frame.columns), ["---"] * len(frame.columns), *frame.round(4).astype(str).values.tolist()]
-    return "\n".join("| " + " | ".join(escape(str(cell)).replace("|", "&#124;") for cell in row) + " |" for row in rows)
+def _format_markdown(table: Any) -> str:  # noqa: ANN401  (a DataFrame)
+    """Format a table for TensorBoard, which renders HTML; bars would end a cell."""
+    rows = [list(table.columns), ["---"] * len(table.columns), *table.round(4).astype(str).values.tolist()]
+    lines = []
+    for row in rows:
+        cells = [escape(str(cell)).replace("|", "&#124;") for cell in row]
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
 
 
-def _taker(logger: Any) -> FigureLogger | None:  # noqa: ANN401  (any logger)
-    if callable(log_image := getattr(logger, "log_image", None)):
-        return lambda tag, figure, step: log_image(key=tag, images=[render_rgb_image(figure)], step=step)
+def _find_figure_logger(logger: Any) -> FigureLogger | None:  # noqa: ANN401  (any logger)
     experiment = getattr(logger, "experiment", None)
+    if callable(getattr(logger, "log_image", None)):
+        return partial(_log_with_wandb, logger)
     for owner in (logger, experiment):
-        if callable(add_figure := getattr(owner, "add_figure", None)):
-            taker: FigureLogger = add_figure
-            return taker
-    if callable(log_figure := getattr(experiment, "log_figure", None)):
-        if hasattr(logger, "run_id"):
-            return lambda tag, figure, step: log_figure(logger.run_id, figure, f"{tag}/step_{step:08d}.png")
-        return lambda tag, figure, step: log_figure(figure_name=tag, figure=figure, step=step)
+        add_figure: FigureLogger | None = getattr(owner, "add_figure", None)
+        if callable(add_figure):
+            return add_figure
+    if callable(getattr(experiment, "log_figure", None)):
+        return partial(_log_with_mlflow if hasattr(logger, "run_id") else _log_with_comet, logger)
     return None
 
 
+def _log_with_wandb(logger: Any, tag: str, figure: Figure, step: int) -> None:  # noqa: ANN401  (any logger)
+    logger.log_image(key=tag, images=[render_rgb_image(figure)], step=step)
+
+
+def _log_with_mlflow(logger: Any, tag: str, figure: Figure, step: int) -> None:  # noqa: ANN401  (any logger)
+    logger.experiment.log_figure(logger.run_id, figure, f"{tag}/step_{step:08d}.png")
+
+
+def _log_with_comet(logger: Any, tag: str, figure: Figure, step: int) -> None:  # noqa: ANN401  (any logger)
+    logger.experiment.log_figure(figure_name=tag, figure=figure, step=step)
+
+
 def render_rgb_image(figure: Figure) -> NDArray[np.uint8]:
-    """(H, W, 3) uint8 pixels of a figure."""
-    canvas: Any = FigureCanvasAgg(figure)  # without types for what it draws
+    """Render a figure to pixels.
+
+    Args:
+        figure: Figure, rendered at its own resolution.
+
+    Returns:
+        (H, W, 3) uint8 RGB.
+    """
+    canvas: Any = FigureCanvasAgg(figure)  # the stubs do not describe the buffer
     canvas.draw()
     return np.asarray(canvas.buffer_rgba())[..., :3].copy()

@@ -21,41 +21,41 @@ STAGES = {"validation": "val", "train": "train"}
 
 
 class CoverageCallback(Callback):
-    """Measures the coverage of the frames that a model trains or is validated on, and logs it.
+    """Lightning callback that measures and logs the coverage of training or validation frames.
 
-    At the end of an epoch every number of `Coverage.scalars(regions)` and the number of frames go to `self.log_dict`
-    under `coverage/val/`, `coverage/test/` (in `trainer.test`) or `coverage/train/`, so that loggers, `ModelCheckpoint`
-    and `EarlyStopping` see them; the maps go to the loggers that take figures or images, from rank zero. The other
-    loggers get the numbers, and one warning says so.
+    At the end of an epoch, every number of `Coverage.scalars(regions)` and the number of frames are logged by
+    `self.log_dict` under `coverage/val/`, `coverage/test/` (in `trainer.test`) or `coverage/train/`, so that loggers,
+    `ModelCheckpoint` and `EarlyStopping` can use them. Maps are logged from rank zero by loggers that accept figures or
+    images; other loggers get the numbers alone, with one warning.
 
-    With several processes each measures its own frames and the sums are added up. The samples that a
-    `DistributedSampler` repeats to fill the last batch are left out, see `FrameDeduplicator`. A checkpoint within an epoch
-    holds the sums so far of all processes, so that a resumed run ends with the same numbers; other checkpoints hold
-    nothing. The sanity check before training is not measured.
+    With several processes, each measures its own frames and the sums are added. Samples that a `DistributedSampler`
+    repeats to fill the last batch are excluded, see `FrameDeduplicator`. A checkpoint within an epoch contains the sums
+    of all processes, so that a resumed run gives the same numbers; other checkpoints contain no sums. The sanity check
+    before training is not measured.
 
     Args:
-        metric: What to measure. The callback resets it at the start of each epoch, or of each fit with `has_fixed_frames`,
-            and moves it to the model's device.
-        regions: Regions to log; those of the paper that fit the grid if not given.
-        stage: `"validation"` or `"train"`: whose batches to measure; the former also in `trainer.test`.
-        every_n_epochs: Measure the last of every n epochs. The others cost nothing.
-        every_n_steps: With `stage="train"`: also log the coverage of the epoch so far after every n batches.
-        has_fixed_frames: With `stage="validation"`: say that the frames are the same at every epoch. Each is then measured
-            when it first comes in a fit, later epochs log the numbers again, and maps are logged where frames were
-            added; a warning says so. They do not depend on the model: `ModelCheckpoint` has nothing to monitor in
+        metric: Metric. The callback resets it at the start of each epoch, or of each fit with `has_fixed_frames`, and
+            moves it to the device of the model.
+        regions: Regions to log; by default the regions of the paper that fit the grid.
+        stage: `"validation"` to measure validation batches and, in `trainer.test`, test batches; or `"train"`.
+        every_n_epochs: Measure the last of every n epochs; other epochs have no cost.
+        every_n_steps: With `stage="train"`: also log the coverage of the current epoch after every n batches.
+        has_fixed_frames: With `stage="validation"`: declare that all epochs have the same frames. Each frame is then
+            measured once per fit, later epochs log the same numbers, and maps are logged, with a warning, only if
+            frames were added. The numbers do not depend on the model, so that `ModelCheckpoint` should not monitor
             them. With several processes, the sampler must not shuffle.
-        should_log_maps: Whether to log maps.
-        rig_name: Which of several rigs in a frame; part of the tags if given.
-        get_frames: Gives the frames of a batch: a `FrameBatch` or a sequence of `Frame`, one for each sample, in order.
-            If not given, the batch is one of the two or has them as `frames`.
+        should_log_maps: Log maps.
+        rig_name: Name of the rig, if frames have several; it becomes a part of the tags.
+        get_frames: Function from a batch to a `FrameBatch` or a sequence with one `Frame` per sample, in order. By
+            default the batch is one of these or has the attribute or key `frames`.
 
     Attributes:
-        coverage: The last `Coverage` that was logged, the same on every process; None before.
+        coverage: Last logged `Coverage`, equal on every process; None before.
 
     Raises:
-        ValueError: An unknown stage, a number of epochs or steps below 1, steps outside training, fixed frames in it.
-            While it measures: reference points without the square metres that the metric wants.
-        ImportError: On import, without Lightning.
+        ValueError: The stage is unknown, a number of epochs or steps is below 1, or steps or fixed frames do not match
+            the stage. During measurement: the reference points lack the area weights of the metric.
+        ImportError: On import, if Lightning is not installed.
 
     Example:
         >>> from torchcover import BevGrid
@@ -89,105 +89,107 @@ class CoverageCallback(Callback):
         self.get_frames = get_frames
         self.tag = "/".join(["coverage", *([rig_name] if rig_name else []), STAGES[stage]])
         self.coverage: Coverage | None = None
-        self._epoch: int | None = None  # being measured; the same on every process, as collective calls need it
-        self._once = FrameDeduplicator()
-        self._prefix = self.tag  # of what is logged: in `trainer.test` another one
-        self._logged: dict[str, float] = {}  # the last numbers of this fit
-        self._added = False  # whether there are frames that are not in them
+        self._measured_epoch: int | None = None  # equal on every process, as collective calls require
+        self._deduplicator = FrameDeduplicator()
+        self._prefix = self.tag  # prefix of logged names, which differs in `trainer.test`
+        self._logged_scalars: dict[str, float] = {}  # last numbers of this fit
+        self._has_new_frames = False  # frames were added since these numbers
         self._warned: set[str] = set()
 
     @property
     def state_key(self) -> str:
-        """Where a checkpoint keeps the state: one place for each tag."""
+        """Key of the state in checkpoints, one per tag."""
         return self._generate_state_key(tag=self.tag)
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """Forget what came before; a checkpoint is restored after this."""
+        """Reset the callback; Lightning restores checkpoints afterwards."""
         self._prefix = f"{self.tag.rpartition('/')[0]}/test" if stage == "test" else self.tag
-        self._epoch = None
-        self._logged = {}
+        self._measured_epoch = None
+        self._logged_scalars = {}
 
-    def _start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        self.metric.to(pl_module.device)  # where the processes can exchange the sums
-        if self._epoch == trainer.current_epoch:
+    def _start_epoch(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        self.metric.to(pl_module.device)  # processes exchange the sums on this device
+        if self._measured_epoch == trainer.current_epoch:
             return
-        due = trainer.state.fn != "fit" or (trainer.current_epoch + 1) % self.every_n_epochs == 0
-        self._epoch = trainer.current_epoch if due and not trainer.sanity_checking else None
-        if self._epoch is None:
+        is_due = trainer.state.fn != "fit" or (trainer.current_epoch + 1) % self.every_n_epochs == 0
+        self._measured_epoch = trainer.current_epoch if is_due and not trainer.sanity_checking else None
+        if self._measured_epoch is None:
             return
-        if self.has_fixed_frames and self._logged:
-            self._once.start_epoch(clear_history=False)
+        if self.has_fixed_frames and self._logged_scalars:
+            self._deduplicator.start_epoch(clear_history=False)
         else:
-            self._once.start_epoch()
-            self._logged, self._added = {}, True
+            self._deduplicator.start_epoch()
+            self._logged_scalars, self._has_new_frames = {}, True
             self.metric.reset()
 
-    def _add(self, trainer: Trainer, pl_module: LightningModule, batch: object, loader_index: int) -> None:
-        # After a checkpoint at the last batch of an epoch, Lightning leaves out the hook for its start.
-        self._start(trainer, pl_module)
-        if self._epoch is None:
+    def _add_batch(self, trainer: Trainer, pl_module: LightningModule, batch: object, loader_index: int) -> None:
+        # After a checkpoint at the last batch of an epoch, Lightning does not call the hook for the epoch start.
+        self._start_epoch(trainer, pl_module)
+        if self._measured_epoch is None:
             return
         frames = extract_frames(batch if self.get_frames is None else self.get_frames(batch))
-        new = FrameBatch(tuple(self._once.select_new(frames, self._shard(trainer, loader_index), loader_index)))
-        if not new.frames:
+        shard = self._find_shard(trainer, loader_index)
+        new_frames = FrameBatch(tuple(self._deduplicator.select_new(frames, shard, loader_index)))
+        if not new_frames.frames:
             return
-        self._added = True
-        indices = [frame.index for frame in new.frames]
+        self._has_new_frames = True
+        indices = [frame.index for frame in new_frames.frames]
         self.metric.update(
-            new.get_clouds(self.rig_name),
-            new.reference,
-            errors_m=new.get_errors_m(self.rig_name),
-            weights=new.weights,
-            heights_m=new.get_heights_m(self.metric.grid.band_frame),
-            block_index=None if UNKNOWN_INDEX in indices else new.block_indices,
+            new_frames.get_clouds(self.rig_name),
+            new_frames.reference,
+            errors_m=new_frames.get_errors_m(self.rig_name),
+            weights=new_frames.weights,
+            heights_m=new_frames.get_heights_m(self.metric.grid.band_frame),
+            block_index=None if UNKNOWN_INDEX in indices else new_frames.block_indices,
         )
 
-    def _shard(self, trainer: Trainer, loader_index: int) -> Shard | None:
-        evaluated = trainer.test_dataloaders if trainer.testing else trainer.val_dataloaders
-        loaders: Any = trainer.train_dataloader if self.stage == "train" else evaluated
-        flat = CombinedLoader(loaders, "sequential").flattened
-        # A batch of several training loaders side by side does not say which frame came from which.
-        shard = None if self.stage == "train" and len(flat) > 1 else find_shard(flat[loader_index])
+    def _find_shard(self, trainer: Trainer, loader_index: int) -> Shard | None:
+        evaluation_loaders = trainer.test_dataloaders if trainer.testing else trainer.val_dataloaders
+        loaders: Any = trainer.train_dataloader if self.stage == "train" else evaluation_loaders
+        flat_loaders = CombinedLoader(loaders, "sequential").flattened
+        # A combined batch of several training loaders does not tell the loader of each frame.
+        shard = None if self.stage == "train" and len(flat_loaders) > 1 else find_shard(flat_loaders[loader_index])
         if shard is None and trainer.world_size > 1:
             self._warn_once(
                 "not one loader with a DistributedSampler: a frame that several processes get is counted several times"
             )
         return shard
 
-    def _finish(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        if self._epoch is None:
+    def _finish_epoch(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        if self._measured_epoch is None:
             return
-        self._epoch = None
-        # Whether there is something new has the same answer on all processes, as collective calls need it.
-        if not self.has_fixed_frames or trainer.strategy.reduce_boolean_decision(self._added, all=False):
-            if self.has_fixed_frames and self._logged:
-                self._warn_once("fixed_frames: an epoch had frames that were not there before; they are added")
+        self._measured_epoch = None
+        # The decision is reduced over all processes, as collective calls require.
+        if not self.has_fixed_frames or trainer.strategy.reduce_boolean_decision(self._has_new_frames, all=False):
+            if self.has_fixed_frames and self._logged_scalars:
+                self._warn_once("has_fixed_frames: an epoch had frames that were not there before; they are added")
             coverage = self._compute()
-            self._logged, self._added = self._scalars(coverage), False
+            self._logged_scalars, self._has_new_frames = self._get_scalars(coverage), False
             self._log_maps(trainer, coverage)
-        # All processes log the same values, so that their maximum is the value, not rounded; Lightning wants some
-        # reduction to be named.
-        pl_module.log_dict(self._logged, on_step=False, on_epoch=True, sync_dist=True, reduce_fx="max")
+        # All processes log equal values, so that the maximum is the value without rounding; Lightning requires a
+        # reduction.
+        pl_module.log_dict(self._logged_scalars, on_step=False, on_epoch=True, sync_dist=True, reduce_fx="max")
 
     def _compute(self) -> Coverage:
-        self.metric.update([], [], weights=[])  # a process that was dealt nothing but padding has not updated yet
+        self.metric.update([], [], weights=[])  # torchmetrics requires an update, even with padding only
         coverage: Coverage = self.metric.compute()
         self.coverage = coverage
         if not len(coverage.observed_cells.cell_indices):
             self._warn_once("no reference point lies in the grid: the coverage of these frames is unknown (NaN)")
         return coverage
 
-    def _scalars(self, coverage: Coverage) -> dict[str, float]:
+    def _get_scalars(self, coverage: Coverage) -> dict[str, float]:
         scalars = {**coverage.scalars(self.regions), "num_frames": float(coverage.counts["num_frames"])}
         return {f"{self._prefix}/{name}": value for name, value in scalars.items()}
 
     def _log_maps(self, trainer: Trainer, coverage: Coverage) -> None:
         if not (self.should_log_maps and trainer.is_global_zero and trainer.loggers):
             return
-        from torchcover.training.figures import log_maps  # matplotlib only where there is something to draw
+        from torchcover.training.figures import log_maps  # imports matplotlib
 
-        if refused := log_maps(coverage, trainer.loggers, self._prefix, _step(trainer)):
-            self._warn_once(f"{', '.join(refused)} takes neither figures nor images: it gets the numbers alone")
+        unsupported = log_maps(coverage, trainer.loggers, self._prefix, _get_logged_step(trainer))
+        if unsupported:
+            self._warn_once(f"{', '.join(unsupported)} takes neither figures nor images: it gets the numbers alone")
 
     def _warn_once(self, text: str) -> None:
         if text not in self._warned:
@@ -195,28 +197,28 @@ class CoverageCallback(Callback):
             rank_zero_warn(f"{self.tag}: {text}")
 
     def state_dict(self) -> dict[str, Any]:
-        """The sums so far of all processes, within an epoch; every process must call it, as Lightning does."""
-        if self._epoch is None:
+        """Return the sums of all processes within an epoch; every process must call it, as Lightning does."""
+        if self._measured_epoch is None:
             return {}
+        sums = {}
         with self.metric.sync_context():
-            sums = {
-                name: torch.as_tensor(total, device="cpu").clone() for name, total in self.metric.metric_state.items()
-            }
-        return {"epoch": self._epoch, "metric": sums, "frames": self._once.state_dict()}
+            for name, total in self.metric.metric_state.items():
+                sums[name] = torch.as_tensor(total, device="cpu").clone()
+        return {"epoch": self._measured_epoch, "metric": sums, "frames": self._deduplicator.state_dict()}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Go on within an epoch: rank zero takes over the sums, the others start from nothing."""
-        self._epoch, self._added = state_dict["epoch"], True
-        self._once.load_state_dict(state_dict["frames"])
+        """Continue within an epoch: rank zero restores the sums, all other ranks start with empty sums."""
+        self._measured_epoch, self._has_new_frames = state_dict["epoch"], True
+        self._deduplicator.load_state_dict(state_dict["frames"])
         self.metric.reset()
         if not is_distributed() or torch.distributed.get_rank() == 0:
             sums = {name: total.to(self.metric.device) for name, total in state_dict["metric"].items()}
             self.metric.merge_state(sums)
 
     def on_validation_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Start from nothing, or go on with fixed frames."""
+        """Start the epoch; fixed frames keep their sums."""
         if self.stage == "validation":
-            self._start(trainer, pl_module)
+            self._start_epoch(trainer, pl_module)
 
     def on_validation_batch_end(
         self,
@@ -229,15 +231,15 @@ class CoverageCallback(Callback):
     ) -> None:
         """Add the frames of a batch."""
         if self.stage == "validation":
-            self._add(trainer, pl_module, batch, dataloader_idx)
+            self._add_batch(trainer, pl_module, batch, dataloader_idx)
 
     def on_validation_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Log."""
+        """Log the numbers and maps of the epoch."""
         if self.stage == "validation":
-            self._finish(trainer, pl_module)
+            self._finish_epoch(trainer, pl_module)
 
     def on_test_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Start from nothing."""
+        """Start the epoch."""
         self.on_validation_epoch_start(trainer, pl_module)
 
     def on_test_batch_end(
@@ -253,40 +255,40 @@ class CoverageCallback(Callback):
         self.on_validation_batch_end(trainer, pl_module, outputs, batch, batch_idx, dataloader_idx)
 
     def on_test_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Log."""
+        """Log the numbers and maps of the epoch."""
         self.on_validation_epoch_end(trainer, pl_module)
 
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Start from nothing, unless the epoch was resumed."""
+        """Start the epoch, unless it was resumed."""
         if self.stage == "train":
-            self._start(trainer, pl_module)
+            self._start_epoch(trainer, pl_module)
 
     def on_train_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: object, batch: object, batch_idx: int
     ) -> None:
-        """Add the frames of a batch, and log if it is time."""
+        """Add the frames of a batch, and log after every n batches."""
         if self.stage != "train":
             return
-        self._add(trainer, pl_module, batch, 0)
-        if self._epoch is not None and self.every_n_steps and (batch_idx + 1) % self.every_n_steps == 0:
+        self._add_batch(trainer, pl_module, batch, 0)
+        if self._measured_epoch is not None and self.every_n_steps and (batch_idx + 1) % self.every_n_steps == 0:
             coverage = self._compute()
-            # `log_dict` would drop the values of steps that are no multiples of the trainer's log_every_n_steps.
+            # `log_dict` would drop values at steps that are no multiples of `log_every_n_steps` of the trainer.
             for logger in trainer.loggers:
-                logger.log_metrics(self._scalars(coverage), step=_step(trainer))
+                logger.log_metrics(self._get_scalars(coverage), step=_get_logged_step(trainer))
             self._log_maps(trainer, coverage)
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Log."""
+        """Log the numbers and maps of the epoch."""
         if self.stage == "train":
-            self._finish(trainer, pl_module)
+            self._finish_epoch(trainer, pl_module)
 
 
-def _step(trainer: Trainer) -> int:
-    """Where Lightning puts what `log_dict` logs now: steps count from 0, and the last one has been taken."""
+def _get_logged_step(trainer: Trainer) -> int:
+    """Return the step of `log_dict`: steps count from 0, and `global_step` is already the next one."""
     return max(trainer.global_step - 1, 0)
 
 
-def _check_arguments(stage: str, every_n_epochs: int, every_n_steps: int | None, fixed_frames: bool) -> None:
+def _check_arguments(stage: str, every_n_epochs: int, every_n_steps: int | None, has_fixed_frames: bool) -> None:
     if stage not in STAGES:
         raise ValueError(f"stage: one of {', '.join(STAGES)} is needed; got {stage!r}")
     if every_n_epochs < 1:
@@ -295,5 +297,7 @@ def _check_arguments(stage: str, every_n_epochs: int, every_n_steps: int | None,
         raise ValueError(f"every_n_steps: at least 1 is needed; got {every_n_steps}")
     if every_n_steps is not None and stage != "train":
         raise ValueError("every_n_steps: needs stage='train'; a validation is logged at its end")
-    if fixed_frames and stage != "validation":
-        raise ValueError("fixed_frames: needs stage='validation'; the frames of a training are shuffled and augmented")
+    if has_fixed_frames and stage != "validation":
+        raise ValueError(
+            "has_fixed_frames: needs stage='validation'; the frames of a training are shuffled and augmented"
+        )

@@ -1,4 +1,4 @@
-"""Frames out of MMDetection3D's batches. Needs nothing of MMDetection3D or MMEngine."""
+"""Frames from batches of MMDetection3D; neither MMDetection3D nor MMEngine is needed."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -17,20 +17,21 @@ def convert_data_batch(
     reference_key: str = "reference_points",
     vehicle_T_lidar: Tensor | None = None,
 ) -> FrameBatch:
-    """The frames of a batch of MMDetection3D, as MMEngine hands it to a metric.
+    """Convert a batch of MMDetection3D, as MMEngine passes it to a metric, to frames.
 
     Args:
-        data_batch: With `inputs["points"]`: one (N, 3 + ...) cloud for each sample, in metres.
-        data_samples: One dict for each sample, with the (M, 3 + ...) reference points, which `PackWithReference` of
-            `torchcover.training.mmengine` carries there, and `sample_idx`.
-        reference_key: Key of the reference points, which a dataset of one's own has to add.
-        vehicle_T_lidar: (4, 4) pose of the points' frame; by default they are in the vehicle frame already.
+        data_batch: Batch with `inputs["points"]`: one (N, 3 + ...) cloud per sample in meters.
+        data_samples: One dict per sample with (M, 3 + ...) reference points, which `PackWithReference` of
+            `torchcover.training.mmengine` adds, and `sample_idx`.
+        reference_key: Key of the reference points, which a custom dataset has to add.
+        vehicle_T_lidar: (4, 4) pose of the frame of the points; by default they are in the vehicle frame.
 
     Returns:
-        One frame for each sample. Its name is the `sample_idx`, and so is its index if that is a number; else it is -1.
+        One frame per sample. Its name is the `sample_idx`, which is also its index if it is an integer; otherwise the
+        index is -1.
 
     Raises:
-        ValueError: No points, no reference points, or not as many clouds as samples.
+        ValueError: Points or reference points are missing, or the numbers of clouds and samples differ.
     """
     clouds = data_batch.get("inputs", {}).get("points")
     if clouds is None or len(clouds) != len(data_samples):
@@ -39,15 +40,16 @@ def convert_data_batch(
             f"got {'none' if clouds is None else len(clouds)}"
         )
     frames = []
-    for k, (cloud, sample) in enumerate(zip(clouds, data_samples, strict=True)):
+    for index, (cloud, sample) in enumerate(zip(clouds, data_samples, strict=True)):
         if reference_key not in sample:
             raise ValueError(
-                f"sample {k} has no {reference_key!r}; add it to the results in the pipeline, and pack them with "
+                f"sample {index} has no {reference_key!r}; add it to the results in the pipeline, and pack them with "
                 "PackWithReference of torchcover.training.mmengine"
             )
-        points, reference_points = (
-            each if isinstance(each, Tensor) else torch.as_tensor(each, device="cpu")
-            for each in (cloud, sample[reference_key])
-        )
-        frames.append(build_frame(points, reference_points, sample.get("sample_idx"), vehicle_T_lidar))
+        points, reference = _to_tensor(cloud), _to_tensor(sample[reference_key])
+        frames.append(build_frame(points, reference, sample.get("sample_idx"), vehicle_T_lidar))
     return FrameBatch(tuple(frames))
+
+
+def _to_tensor(points: object) -> Tensor:
+    return points if isinstance(points, Tensor) else torch.as_tensor(points, device="cpu")

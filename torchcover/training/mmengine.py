@@ -1,4 +1,4 @@
-"""Coverage as a metric of MMEngine, for MMDetection3D, and a transform that it needs. Importing this registers both."""
+"""Coverage metric for MMEngine and MMDetection3D, with the transform that it needs; importing registers both."""
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -22,11 +22,11 @@ from torchcover.training.mmdetection3d import convert_data_batch
 
 @TRANSFORMS.register_module()
 class PackWithReference:
-    """The last transform of a pipeline: packs as another does, and keeps the reference points beside its `meta_keys`.
+    """Last transform of a pipeline: packs results with another transform, and adds the reference points.
 
     Args:
-        pack: The other, such as `Pack3DDetInputs`, or its config.
-        reference_key: Key of the reference points, which a dataset of one's own has to add.
+        pack: Packing transform, such as `Pack3DDetInputs`, or its config.
+        reference_key: Key of the reference points, which a custom dataset has to add.
 
     Raises:
         ValueError: When it is called: the results have no reference points.
@@ -36,36 +36,37 @@ class PackWithReference:
         self.pack = TRANSFORMS.build(pack) if isinstance(pack, Mapping) else pack
         self.reference_key = reference_key
 
-    def __call__(self, results: Any) -> Any:  # noqa: ANN401  (of one sample, or of each augmentation of it)
-        """What the other packs of it; `data_samples` has the reference points, too."""
-        each = results if isinstance(results, list) else [results]
-        if any(self.reference_key not in one for one in each):
-            raise ValueError(
-                f"the results have no {self.reference_key!r}: let the dataset, or a transform before, add it"
-            )
-        references = [one[self.reference_key] for one in each]
+    def __call__(self, results: Any) -> Any:  # noqa: ANN401  (of one sample, or a list with one per augmentation)
+        """Pack results, with the reference points in their `data_samples`."""
+        references = []
+        for result in results if isinstance(results, list) else [results]:
+            if self.reference_key not in result:
+                raise ValueError(
+                    f"the results have no {self.reference_key!r}: let the dataset, or a transform before, add it"
+                )
+            references.append(result[self.reference_key])
         packed = self.pack(results)
-        for one, reference in zip(packed if isinstance(packed, list) else [packed], references, strict=True):
-            one["data_samples"].set_metainfo({self.reference_key: reference})
+        for inputs, reference in zip(packed if isinstance(packed, list) else [packed], references, strict=True):
+            inputs["data_samples"].set_metainfo({self.reference_key: reference})
         return packed
 
 
 @METRICS.register_module()
 class MMEngineCoverage(BaseMetric):  # type: ignore[misc]  # MMEngine has no types
-    """Coverage of the frames that a model is validated on, under the names of `Coverage.scalars`.
+    """Coverage of the frames on which a model is validated, with the names of `Coverage.scalars`.
 
-    Where a `BaseMetric` gathers a result for each sample, this adds up fixed-size sums, which are reduced over the
-    processes. Padding samples and those that come again are left out, see `FrameDeduplicator`.
+    Other than `BaseMetric`, which collects a result per sample, this metric adds up sums of fixed size, which are
+    reduced over processes. Padding samples and repeated samples are excluded, see `FrameDeduplicator`.
 
     Args:
-        metric: A `CoverageMetric`, or its arguments as a config has them, with `grid` as a dict of those of `BevGrid`.
-        regions: Regions to report, or dicts of their arguments; those of the paper that fit the grid if not given.
-        vehicle_T_lidar: (4, 4) pose of the points' frame, as `convert_data_batch` takes it.
-        get_frames: Gives the frames from `data_batch` and `data_samples`; `convert_data_batch` if not given.
-        prefix: In front of the names, with a slash between; "coverage" if not given.
+        metric: `CoverageMetric`, or its arguments as a config with `grid` as a dict of the arguments of `BevGrid`.
+        regions: Regions to report, or dicts of their arguments; by default the regions of the paper that fit the grid.
+        vehicle_T_lidar: (4, 4) pose of the frame of the points, as in `convert_data_batch`.
+        get_frames: Function from `data_batch` and `data_samples` to frames; by default `convert_data_batch`.
+        prefix: Prefix of the names, separated by a slash; by default "coverage".
 
     Attributes:
-        coverage: The last `Coverage` that was evaluated; None before.
+        coverage: Last evaluated `Coverage`; None before.
 
     Example:
         >>> metric = MMEngineCoverage({"grid": {"x_m": (0.0, 20.0), "y_m": (-5.0, 5.0)}, "max_radius_m": 25.0})
@@ -88,58 +89,70 @@ class MMEngineCoverage(BaseMetric):  # type: ignore[misc]  # MMEngine has no typ
         prefix: str | None = None,
     ) -> None:
         super().__init__(prefix=prefix)
-        self.metric = metric if isinstance(metric, CoverageMetric) else _metric_of(metric)
-        self.regions = None if regions is None else [r if isinstance(r, Region) else Region(**r) for r in regions]
-        pose = None if vehicle_T_lidar is None else torch.as_tensor(vehicle_T_lidar, dtype=torch.float64, device="cpu")
-        self.get_frames = get_frames or partial(convert_data_batch, vehicle_T_lidar=pose)
+        self.metric = metric if isinstance(metric, CoverageMetric) else _build_metric(metric)
+        self.regions: list[Region] | None = None
+        if regions is not None:
+            self.regions = [region if isinstance(region, Region) else Region(**region) for region in regions]
+        transform = None
+        if vehicle_T_lidar is not None:
+            transform = torch.as_tensor(vehicle_T_lidar, dtype=torch.float64, device="cpu")
+        self.get_frames = get_frames or partial(convert_data_batch, vehicle_T_lidar=transform)
         self.coverage: Coverage | None = None
-        self._once = FrameDeduplicator()
+        self._deduplicator = FrameDeduplicator()
 
     def process(self, data_batch: Any, data_samples: Sequence[Mapping[str, Any]]) -> None:  # noqa: ANN401  (MMEngine's)
         """Add the frames of a batch.
 
-        Raises:
-            ValueError: As `CoverageMetric.update`, or reference points without the square metres that the metric wants.
-        """
-        self._add(extract_frames(self.get_frames(data_batch, data_samples)), size=None)
+        Args:
+            data_batch: Batch of the data loader.
+            data_samples: Outputs of the model for each sample.
 
-    def _add(self, frames: Sequence[Frame], size: int | None) -> None:
-        rank, processes = get_dist_info()
-        for frame in self._once.select_new(frames, Shard(rank, processes, size)):
-            index = None if frame.index == UNKNOWN_INDEX else frame.block_index
+        Raises:
+            ValueError: As in `CoverageMetric.update`, or the reference points lack the area weights of the metric.
+        """
+        self._add_frames(extract_frames(self.get_frames(data_batch, data_samples)), num_samples=None)
+
+    def _add_frames(self, frames: Sequence[Frame], num_samples: int | None) -> None:
+        rank, num_processes = get_dist_info()
+        for frame in self._deduplicator.select_new(frames, Shard(rank, num_processes, num_samples)):
+            block_index = None if frame.index == UNKNOWN_INDEX else frame.block_index
             self.metric.update(
                 frame.sensor,
                 frame.reference,
                 errors_m=frame.get_errors_m(),
                 weights=frame.reference_weights,
                 heights_m=frame.get_heights_m(self.metric.grid.band_frame),
-                block_index=index,
+                block_index=block_index,
             )
 
     def compute_metrics(self, results: list[Any]) -> dict[str, float]:
-        """The coverage so far of all processes; `results` stays empty."""
+        """Compute the scalars of all processes.
+
+        Args:
+            results: Unused; it stays empty.
+        """
         coverage: Coverage = self.metric.compute()
         self.coverage = coverage
         return coverage.scalars(self.regions)
 
     def evaluate(self, size: int) -> dict[str, float]:
-        """Add what was held back unless it is padding, add up the processes, and start anew.
+        """Evaluate all processes at the end of an epoch, and reset.
 
         Args:
-            size: Number of samples in the dataset. Of what a sampler deals out in turns, the rest is padding.
+            size: Number of samples in the dataset; further samples are padding.
 
         Returns:
-            The numbers under `prefix/`, the same on every process.
+            Scalars with the prefix, equal on every process.
         """
-        self._add([], size)
-        self.metric.to(get_comm_device())  # processes on GPUs exchange nothing that lies on the CPU
-        self.metric.update([], [], weights=[])  # a process that was dealt nothing but padding has not updated yet
+        self._add_frames([], size)
+        self.metric.to(get_comm_device())  # processes on GPUs cannot exchange tensors on the CPU
+        self.metric.update([], [], weights=[])  # torchmetrics requires an update, even with padding only
         scalars = self.compute_metrics(self.results)
         self.metric.reset()
-        self._once.start_epoch()
+        self._deduplicator.start_epoch()
         return {f"{self.prefix}/{name}": value for name, value in scalars.items()}
 
 
-def _metric_of(arguments: Mapping[str, Any]) -> CoverageMetric:
+def _build_metric(arguments: Mapping[str, Any]) -> CoverageMetric:
     grid = arguments["grid"]
     return CoverageMetric(**{**arguments, "grid": grid if isinstance(grid, BevGrid) else BevGrid(**grid)})
