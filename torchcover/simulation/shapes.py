@@ -71,19 +71,19 @@ def iterate_mesh_parts(meshes: Sequence[Mesh]) -> Iterator[tuple[slice, Float64]
     Yields:
         Slice of face numbers, and (3, 3, N) float64 corners (corner, coordinate, face) in meters.
     """
-    first_face = 0
+    first_face = face_count = 0
     pending_m: list[Float64] = []
     for mesh_number, mesh in enumerate(meshes, 1):
         # The coordinate is the first axis, so that memory is read row by row.
         coordinates_m = np.ascontiguousarray(mesh.vertices_m.T)
         for start in range(0, max(len(mesh.faces), 1), FACES_PER_CHUNK):
             pending_m.append(coordinates_m.take(mesh.faces[start : start + FACES_PER_CHUNK].T, axis=1))
-            face_count = sum(corners_m.shape[2] for corners_m in pending_m)
+            face_count += pending_m[-1].shape[2]
             is_last = mesh_number == len(meshes) and start + FACES_PER_CHUNK >= len(mesh.faces)
             if face_count and (face_count >= FACES_PER_CHUNK or is_last):
                 yield slice(first_face, first_face + face_count), np.concatenate(pending_m, axis=2).swapaxes(0, 1)
                 first_face += face_count
-                pending_m = []
+                face_count, pending_m = 0, []
 
 
 def get_corners_m(meshes: Sequence[Mesh], face_indices: Int64) -> Float64:
