@@ -85,7 +85,7 @@ def test_cameras_have_their_own_poses_and_names_and_the_range_of_their_depth(rob
     assert (named["d"]["min_range_m"], named["d"]["max_range_m"], named["m_l"]["max_range_m"]) == (0.3, 5.0, 9.0)
     assert named["m_r"]["mount"] == {"x_m": 0.5, "y_m": -0.1, "z_m": 0.2}
     assert named["d"]["fov_deg"] == pytest.approx(math.degrees(1.5), abs=1e-4)
-    assert robot.notes[:2] == ["Left out: i, of type imu.", "m: a camera, which counts as if it measured depth."]
+    assert robot.notes[:2] == ["Excluded: i, of type imu.", "m: a camera, which is simulated as a depth camera."]
 
 
 @pytest.mark.parametrize("scale", [1.0, -0.5])
@@ -144,7 +144,7 @@ def test_what_a_sensor_is_built_into_is_left_out_and_the_largest_body_stays(robo
     )
     assert len(robot.body.vertices_m) == 16
     assert robot.notes == [
-        "Left out: what sensors are built into, 1 of 3 bodies.",
+        "Excluded: housings of sensors, 1 of 3 bodies.",
         "Rays that end on the own vehicle: l 108 of 543 (19.9%), b 543 of 543 (100.0%).",
     ]
 
@@ -212,8 +212,8 @@ def test_settings_that_are_not_applied_are_named(robot_of):
     lidar = LIDAR.format("l", "", 1.0).replace("</sensor>", f"{plugin}</sensor>")
     notes = robot_of(CHASSIS, on("base", lidar, f"<sensor name='c' type='depth'>{camera}</sensor>")).notes
     assert "l: settings of its plugin are not applied: <min_range> 0.9; set them in rig.yaml." in notes
-    assert any(note.startswith("c: <lens><type> equidistant is not applied, a pinhole is taken") for note in notes)
-    assert "c: <visibility_mask> 7 is not applied; it sees all bodies." in notes
+    assert any(note.startswith("c: <lens><type> equidistant is not applied, a pinhole is assumed") for note in notes)
+    assert "c: <visibility_mask> 7 is not applied; the sensor sees all bodies." in notes
 
 
 def test_joints_that_mimic_others_are_at_their_offset_and_limits_without_0_are_noted(robot_of):
@@ -275,13 +275,13 @@ MESH = "<link name='base'><visual><geometry><mesh filename='package://p/{}.stl'/
 @pytest.mark.parametrize(
     ("content", "told"),
     [
-        ([CHASSIS, TWO, joint("base", "b"), joint("b", "c"), joint("base", "c")], "'c' hangs on 'b' and on 'base'"),
-        ([CHASSIS, TWO, joint("b", "c"), joint("c", "b")], "'b', 'c' hang on each other in a ring"),
-        ([TWO, joint("b", "c"), joint("c", "b")], "'b', 'c' hang on each other in a ring"),
-        ([CHASSIS, TWO, joint("b", "c")], "'base', 'b' hang on no other"),
-        ([CHASSIS, joint("base", "nowhere")], "about 'nowhere', which is no link"),
-        ([CHASSIS, CHASSIS], "several of <link> are called 'base'"),
-        ([CHASSIS, joint("base", "b"), joint("base", "b"), TWO], "several of <joint> are called 'base_b'"),
+        ([CHASSIS, TWO, joint("base", "b"), joint("b", "c"), joint("base", "c")], "'c' is the child of 'b' and of"),
+        ([CHASSIS, TWO, joint("b", "c"), joint("c", "b")], "'b', 'c' form a ring"),
+        ([TWO, joint("b", "c"), joint("c", "b")], "'b', 'c' form a ring"),
+        ([CHASSIS, TWO, joint("b", "c")], "'base', 'b' have no parent"),
+        ([CHASSIS, joint("base", "nowhere")], "refers to 'nowhere', which is no link"),
+        ([CHASSIS, CHASSIS], "several of <link> are named 'base'"),
+        ([CHASSIS, joint("base", "b"), joint("base", "b"), TWO], "several of <joint> are named 'base_b'"),
         ([CHASSIS, "<link name='b'/>", joint("base", "b", inside="<mimic joint='x'/>")], "mimics 'x', which is no"),
         ([CHASSIS, "<link name='b'/>", joint("base", "b", inside="<mimic joint='base_b'/>")], "mimics itself"),
         (["<link name='b'><visual><geometry><heightmap/></geometry></visual></link>"], "<heightmap> cannot be applied"),

@@ -1,4 +1,4 @@
-"""Sensors in the Gazebo tags of a URDF, as keys of a rig."""
+"""Sensors in the Gazebo tags of a URDF, converted to keys of a rig."""
 
 import math
 import re
@@ -18,11 +18,12 @@ from torchcover.geometry import (
 )
 from torchcover.geometry.arrays import Float64
 
-LIDARS = ("ray", "gpu_ray", "lidar", "gpu_lidar")
-CAMERAS = ("camera", "multicamera")
-DEPTH_CAMERAS = ("depth", "depth_camera", "rgbd", "rgbd_camera")
-# As in the built-in rigs of cameras.
-STRIDE = 4
+# Kind of sensor for each `type` of Gazebo.
+SENSOR_KINDS = {
+    **dict.fromkeys(("ray", "gpu_ray", "lidar", "gpu_lidar"), "lidar"),
+    **dict.fromkeys(("camera", "multicamera"), "camera"),
+    **dict.fromkeys(("depth", "depth_camera", "rgbd", "rgbd_camera"), "depth camera"),
+}
 # Settings of ROS plugins that change ranges, noise, rates or lenses of a sensor.
 PLUGIN_SETTINGS = re.compile(
     r"(min|max)range|gaussiannoise|updaterate|pointcloudcutoff(max)?|hackbaseline|focallength|c[xy]|distortion[kt]\d"
@@ -30,7 +31,12 @@ PLUGIN_SETTINGS = re.compile(
 
 
 class PlacedSensor(NamedTuple):
-    """A sensor of a robot: its `sensor_keys` in a rig, and its (4, 4) pose in the vehicle frame."""
+    """Sensor of a robot.
+
+    Args:
+        sensor_keys: Keys of the sensor in a rig.
+        vehicle_T_sensor: (4, 4) extrinsics.
+    """
 
     sensor_keys: dict[str, Any]
     vehicle_T_sensor: Float64
@@ -39,20 +45,34 @@ class PlacedSensor(NamedTuple):
 def read_numbers(text: str | None, count: int, description: str) -> list[float]:
     """Read a fixed number of finite numbers.
 
+    Args:
+        text: Numbers, separated by spaces.
+        count: Required number of them.
+        description: Name of the value in messages.
+
+    Returns:
+        The numbers.
+
     Raises:
-        ValueError: Other text, with `description` in the message.
+        ValueError: The text is anything else.
     """
     try:
         numbers = [float(word) for word in (text or "").split()]
     except ValueError:
         numbers = []
-    if len(numbers) != count or not all(map(math.isfinite, numbers)):
+    if len(numbers) != count or not np.isfinite(numbers).all():
         raise ValueError(f"{description}: {count} number{'s' * (count > 1)} needed; got {text!r}")
     return numbers
 
 
 def read_pose(element: Element | None) -> Float64:
-    """Read the (4, 4) transform of a URDF `<origin>` or an SDF `<pose>`; the identity if there is none.
+    """Read the transform of a URDF `<origin>` or an SDF `<pose>`.
+
+    Args:
+        element: The element; None for the identity.
+
+    Returns:
+        (4, 4) transform.
 
     Raises:
         ValueError: Numbers are missing, or the rotation format is unknown.
@@ -85,10 +105,10 @@ def read_sensors(root: Element, vehicle_T_frame: dict[str, Float64]) -> tuple[li
 
     Args:
         root: The `<robot>`.
-        vehicle_T_frame: Name of each link and joint -> its (4, 4) pose in the vehicle frame.
+        vehicle_T_frame: (4, 4) pose of each link and joint in the vehicle frame, by name.
 
     Returns:
-        The sensors, and notes about everything that is not applied.
+        The sensors, and notes about settings that are not applied.
 
     Raises:
         ValueError: A frame, a block or a number is missing or cannot be used.
@@ -98,17 +118,17 @@ def read_sensors(root: Element, vehicle_T_frame: dict[str, Float64]) -> tuple[li
     names: set[str] = set()
     for gazebo in root.iterfind("gazebo"):
         for sensor in gazebo.iterfind("sensor"):
-            name, kind = sensor.get("name", "sensor"), sensor.get("type", "")
-            if kind not in (*LIDARS, *CAMERAS, *DEPTH_CAMERAS):
-                notes.append(f"Left out: {name}, of type {kind or 'none'}.")
+            name, gazebo_type = sensor.get("name", "sensor"), sensor.get("type", "")
+            kind = SENSOR_KINDS.get(gazebo_type)
+            if kind is None:
+                notes.append(f"Excluded: {name}, of type {gazebo_type or 'none'}.")
                 continue
             vehicle_T_sensor = _find_pose(sensor, name, vehicle_T_frame, gazebo.get("reference", ""))
             frames = ChainMap({"": vehicle_T_sensor}, vehicle_T_frame)
             rate_hz = _read_number(sensor, "update_rate", f"sensor {name!r}", 0.0)
-            notes += _note_plugin_settings(sensor, name, rate_hz)
-            is_lidar = kind in LIDARS
-            read = _read_lidar(sensor, name, frames, notes) if is_lidar else _read_cameras(sensor, name, frames, notes)
-            for keys, pose in read:
+            notes += _list_ignored_settings(sensor, name, rate_hz)
+            read_kind = _read_lidar if kind == "lidar" else _read_cameras
+            for keys, pose in read_kind(sensor, name, frames, notes):
                 if keys["name"] in names:
                     keys["name"] += f"_{len(sensors)}"
                 names.add(keys["name"])
@@ -129,85 +149,87 @@ def _find_pose(owner: Element, name: str, vehicle_T_frame: Mapping[str, Float64]
 
 def _add_mount(keys: dict[str, Any], pose: Float64) -> dict[str, Any]:
     """Add the mount, to the tenth of a millimeter and the hundredth of a degree, after type and name."""
-    angles = dict(
-        zip(("yaw_deg", "pitch_deg", "roll_deg"), convert_rotation_to_euler(pose[:3, :3]).round(2), strict=True)
-    )
-    values = dict(zip(("x_m", "y_m", "z_m"), pose[:3, 3].round(4), strict=True)) | angles
-    mount = {key: float(value) for key, value in values.items() if value}
-    first = {key: keys.pop(key) for key in ("type", "name")}
-    return {**first, "mount": mount, **keys}
+    names = ("x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg")
+    values = (*pose[:3, 3].round(4), *convert_rotation_to_euler(pose[:3, :3]).round(2))
+    mount = {name: float(value) for name, value in zip(names, values, strict=True) if value}
+    return {"type": keys.pop("type"), "name": keys.pop("name"), "mount": mount, **keys}
 
 
-def _read_number(parent: Element, path: str, what: str, default: float | None = None) -> float:
+def _read_number(parent: Element, path: str, source: str, default: float | None = None) -> float:
+    """Read the number of a descendant; `source` names the parent in messages."""
     text = parent.findtext(path)
     if text is None and default is not None:
         return default
-    return read_numbers(text, 1, f"{what}: {path}")[0]
+    return read_numbers(text, 1, f"{source}: {path}")[0]
 
 
 def _read_lidar(
     sensor: Element, name: str, frames: Mapping[str, Float64], notes: list[str]
 ) -> Iterator[tuple[dict[str, Any], Float64]]:
-    """Read a LiDAR: its columns are those that Gazebo samples, ends included; the mount looks to their middle."""
-    what = f"sensor {name!r}"
-    block = next((block for tag in ("lidar", "ray") if (block := sensor.find(tag)) is not None), None)
+    """Read a LiDAR with the columns that Gazebo samples, ends included; the mount faces their center."""
+    source = f"sensor {name!r}"
+    block = sensor.find("lidar") if sensor.find("lidar") is not None else sensor.find("ray")
     if block is None:
-        raise ValueError(f"{what}: <lidar> or <ray> is missing")
-    columns = _read_samples(block, "horizontal", what, notes)
-    rows = _read_samples(block, "vertical", what, notes, usual=1.0)
-    left, right = (_read_number(block, f"scan/horizontal/{end}_angle", what) for end in ("min", "max"))
-    low, high = (_read_number(block, f"scan/vertical/{end}_angle", what, 0.0) for end in ("min", "max"))
-    spread_deg = math.degrees(right - left) * columns / max(columns - 1, 1)
+        raise ValueError(f"{source}: <lidar> or <ray> is missing")
+    columns = _read_samples(block, "horizontal", source, notes)
+    rows = _read_samples(block, "vertical", source, notes, default=1.0)
+    min_azimuth_rad = _read_number(block, "scan/horizontal/min_angle", source)
+    max_azimuth_rad = _read_number(block, "scan/horizontal/max_angle", source)
+    min_elevation_rad = _read_number(block, "scan/vertical/min_angle", source, 0.0)
+    max_elevation_rad = _read_number(block, "scan/vertical/max_angle", source, 0.0)
+    fov_deg = math.degrees(max_azimuth_rad - min_azimuth_rad) * columns / max(columns - 1, 1)
     keys: dict[str, Any] = {
         "type": "lidar",
         "name": name,
         "channels": rows,
-        "vertical_fov_deg": [round(math.degrees(low), 4), round(math.degrees(high), 4)],
-        "horizontal_fov_deg": round(min(spread_deg, 360.0), 4) or 1.0,  # of a single column
+        "vertical_fov_deg": [round(math.degrees(min_elevation_rad), 4), round(math.degrees(max_elevation_rad), 4)],
+        "horizontal_fov_deg": round(min(fov_deg, 360.0), 4) or 1.0,  # 1 degree for a single column
         "columns": columns,
-        "min_range_m": _read_number(block, "range/min", what, 0.0),
-        "max_range_m": _read_number(block, "range/max", what),
+        "min_range_m": _read_number(block, "range/min", source, 0.0),
+        "max_range_m": _read_number(block, "range/max", source),
         **_read_noise(block, name, notes),
     }
-    _note_visibility_mask(block, name, notes)
-    sensor_T_middle = build_transform(
-        convert_euler_to_rotation(math.degrees((left + right) / 2), 0.0, 0.0), np.zeros(3)
-    )
-    yield keys, frames[""] @ sensor_T_middle
+    _add_visibility_note(block, name, notes)
+    center_deg = math.degrees((min_azimuth_rad + max_azimuth_rad) / 2)
+    yield keys, frames[""] @ build_transform(convert_euler_to_rotation(center_deg, 0.0, 0.0), np.zeros(3))
 
 
-def _read_samples(block: Element, axis: str, what: str, notes: list[str], usual: float | None = None) -> int:
-    """Read the number of rays along an axis: its samples times its resolution, as in Gazebo Classic, one at least."""
-    samples = _read_number(block, f"scan/{axis}/samples", what, usual)
-    resolution = _read_number(block, f"scan/{axis}/resolution", what, 1.0)
+def _read_samples(block: Element, axis: str, source: str, notes: list[str], default: float | None = None) -> int:
+    """Read the number of rays along an axis: samples times resolution, as in Gazebo Classic, but at least 1."""
+    samples = _read_number(block, f"scan/{axis}/samples", source, default)
+    resolution = _read_number(block, f"scan/{axis}/resolution", source, 1.0)
     rays = max(round(samples * resolution), int(samples * resolution > 0))
     if resolution != 1.0:
-        otherwise = f"Gazebo (gz-sim) ignores <resolution> and has {samples:g}"
-        notes.append(f"{what}: {rays} {axis} rays, samples times <resolution>, as in Gazebo Classic; {otherwise}.")
+        notes.append(
+            f"{source}: {rays} {axis} rays, samples times <resolution>, as in Gazebo Classic; Gazebo (gz-sim) ignores "
+            f"<resolution> and has {samples:g}."
+        )
     return rays
 
 
 def _read_cameras(
     sensor: Element, name: str, frames: Mapping[str, Float64], notes: list[str]
 ) -> Iterator[tuple[dict[str, Any], Float64]]:
-    cameras, measures_depth = sensor.findall("camera"), sensor.get("type") in DEPTH_CAMERAS
+    """Read the cameras of a sensor; a camera without depth is read as a depth camera, and noted."""
+    cameras, measures_depth = sensor.findall("camera"), SENSOR_KINDS[sensor.get("type", "")] == "depth camera"
     if not cameras:
         raise ValueError(f"sensor {name!r}: <camera> is missing")
     if not measures_depth:
-        notes.append(f"{name}: a camera, which counts as if it measured depth.")
+        notes.append(f"{name}: a camera, which is simulated as a depth camera.")
     for number, camera in enumerate(cameras):
         suffix = camera.get("name", str(number)) if len(cameras) > 1 else ""
         full_name = f"{name}_{suffix}" if suffix else name
-        what = f"sensor {full_name!r}"
-        near_m, far_m = (_read_clip(camera, end, what) for end in ("near", "far"))
+        source = f"sensor {full_name!r}"
+        near_m, far_m = _read_clip(camera, "near", source), _read_clip(camera, "far", source)
         keys: dict[str, Any] = {
             "type": "camera",
             "name": full_name,
-            "width": round(_read_number(camera, "image/width", what)),
-            "height": round(_read_number(camera, "image/height", what)),
+            "width": round(_read_number(camera, "image/width", source)),
+            "height": round(_read_number(camera, "image/height", source)),
         }
-        keys |= _read_lens(camera, keys["width"], keys["height"], what)
-        keys |= {"stride": STRIDE, "min_range_m": near_m, "max_range_m": far_m}
+        keys |= _read_lens(camera, keys["width"], keys["height"], source)
+        # Every fourth pixel, as in the built-in rigs with cameras.
+        keys |= {"stride": 4, "min_range_m": near_m, "max_range_m": far_m}
         if keys.get("cy", 0.0) not in (0.0, keys["height"] / 2 - 0.5):
             notes.append(f"{full_name}: cy is counted from the top of the image; Gazebo Classic 10 counts from below.")
         if measures_depth:
@@ -215,49 +237,50 @@ def _read_cameras(
         lens_type = camera.findtext("lens/type", "").strip()
         if lens_type not in ("", "gnomonical"):
             notes.append(
-                f"{full_name}: <lens><type> {lens_type} is not applied, a pinhole is taken: Gazebo applies it to "
+                f"{full_name}: <lens><type> {lens_type} is not applied, a pinhole is assumed: Gazebo applies it to "
                 "sensors of type wideanglecamera only; give `lens` and fx, fy, cx, cy in rig.yaml for a fisheye."
             )
-        _note_visibility_mask(camera, full_name, notes)
+        _add_visibility_note(camera, full_name, notes)
         yield keys, _find_pose(camera, full_name, frames, "")
 
 
-def _read_clip(camera: Element, end: str, what: str) -> float:
-    """Read the near or far clipping distance; that of the depth image precedes that of the color image."""
-    of_depth = f"depth_camera/clip/{end}"
-    path = of_depth if camera.find(of_depth) is not None else f"clip/{end}"
-    return _read_number(camera, path, what, 0.0 if end == "near" else None)
+def _read_clip(camera: Element, end: str, source: str) -> float:
+    """Read the near or far clipping distance; the depth image has priority over the color image."""
+    depth_path = f"depth_camera/clip/{end}"
+    path = depth_path if camera.find(depth_path) is not None else f"clip/{end}"
+    return _read_number(camera, path, source, 0.0 if end == "near" else None)
 
 
-def _read_lens(camera: Element, width: int, height: int, what: str) -> dict[str, Any]:
-    """Read intrinsics: those of `<lens><intrinsics>`, which count from the image corner, else the field of view."""
-    coefficients = [_read_number(camera, f"distortion/{key}", what, 0.0) for key in ("k1", "k2", "p1", "p2", "k3")]
+def _read_lens(camera: Element, width: int, height: int, source: str) -> dict[str, Any]:
+    """Read intrinsics from `<lens><intrinsics>`, which count from the image corner, else from the field of view."""
+    coefficients = [_read_number(camera, f"distortion/{key}", source, 0.0) for key in ("k1", "k2", "p1", "p2", "k3")]
     is_distorted = any(coefficients)
     center = camera.findtext("distortion/center", "0.5 0.5")
-    if is_distorted and read_numbers(center, 2, f"{what}: distortion/center") != [0.5, 0.5]:
-        raise ValueError(f"{what}: distortion/center {center} cannot be applied, only 0.5 0.5; use lens/intrinsics")
+    if is_distorted and read_numbers(center, 2, f"{source}: distortion/center") != [0.5, 0.5]:
+        raise ValueError(f"{source}: distortion/center {center} cannot be applied, only 0.5 0.5; use lens/intrinsics")
     intrinsics = camera.find("lens/intrinsics")
     if intrinsics is None:
-        fov_rad = _read_number(camera, "horizontal_fov", what)
+        fov_rad = _read_number(camera, "horizontal_fov", source)
         if not is_distorted:
             return {"fov_deg": round(math.degrees(fov_rad), 4)}
         fx = fy = width / 2 / math.tan(fov_rad / 2)
         cx, cy = width / 2, height / 2
     else:
-        where = f"{what}: lens/intrinsics"
-        fx, fy = (_read_number(intrinsics, key, where) for key in ("fx", "fy"))
-        cx = _read_number(intrinsics, "cx", where, width / 2)
-        cy = _read_number(intrinsics, "cy", where, height / 2)
-        if skew := _read_number(intrinsics, "s", where, 0.0):
-            raise ValueError(f"{where}/s {skew:g} cannot be applied: a camera without skew is needed")
+        path = f"{source}: lens/intrinsics"
+        fx, fy = _read_number(intrinsics, "fx", path), _read_number(intrinsics, "fy", path)
+        cx = _read_number(intrinsics, "cx", path, width / 2)
+        cy = _read_number(intrinsics, "cy", path, height / 2)
+        if skew := _read_number(intrinsics, "s", path, 0.0):
+            raise ValueError(f"{path}/s {skew:g} cannot be applied: a camera without skew is needed")
         if not is_distorted and fx == fy and (cx, cy) == (width / 2, height / 2):
             return {"fov_deg": round(math.degrees(2 * math.atan(width / 2 / fx)), 4)}
+    # From the corner of the first pixel to its center.
     keys: dict[str, Any] = {"fx": fx, "fy": fy, "cx": cx - 0.5, "cy": cy - 0.5}
     return keys | ({"lens": "brown_conrady", "coefficients": coefficients} if is_distorted else {})
 
 
 def _read_noise(block: Element, name: str, notes: list[str]) -> dict[str, float]:
-    """Read the standard deviation of ranges in meters; a bias has no counterpart, and is noted."""
+    """Read the standard deviation of ranges in meters; a bias is not supported, and is noted."""
     if block.findtext("noise/type", "gaussian").strip() == "none":
         return {}
     for key in ("mean", "bias_mean", "bias_stddev"):
@@ -267,13 +290,14 @@ def _read_noise(block: Element, name: str, notes: list[str]) -> dict[str, float]
     return {"range_noise_m": stddev_m} if stddev_m else {}
 
 
-def _note_visibility_mask(block: Element, name: str, notes: list[str]) -> None:
+def _add_visibility_note(block: Element, name: str, notes: list[str]) -> None:
+    """Add a note about a visibility mask, which is not applied."""
     if (mask := block.findtext("visibility_mask")) is not None:
-        notes.append(f"{name}: <visibility_mask> {mask.strip()} is not applied; it sees all bodies.")
+        notes.append(f"{name}: <visibility_mask> {mask.strip()} is not applied; the sensor sees all bodies.")
 
 
-def _note_plugin_settings(sensor: Element, name: str, rate_hz: float) -> list[str]:
-    """Name the settings of plugins that would change what the sensor measures."""
+def _list_ignored_settings(sensor: Element, name: str, rate_hz: float) -> list[str]:
+    """List a note about the settings of plugins that would change the measurements; empty without any."""
     ignored = []
     for child in sensor.iterfind("plugin/*"):
         text = (child.text or "").strip()

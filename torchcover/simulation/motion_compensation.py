@@ -288,7 +288,8 @@ def read_scan(recording: Recording, sensor: str, index: int, vehicle_T_sensor: M
     """
     scan = recording.read_scan(sensor, index)
     points_m = scan.points_m.astype(np.float64)
-    is_return = np.isfinite(points_m).all(axis=1) & (np.abs(points_m) > NO_RETURN_M).any(axis=1)
+    has_coordinates = np.isfinite(points_m).all(axis=1)
+    is_return: Bools = np.asarray(has_coordinates & (np.abs(points_m) > NO_RETURN_M).any(axis=1))
     vehicle_points_m = points_m if scan.vehicle_T_sensor is None else transform_points(scan.vehicle_T_sensor, points_m)
     if recording.ego_box is not None:
         is_return[find_points_in_box(vehicle_points_m, recording.ego_box)] = False

@@ -213,7 +213,7 @@ def fit_laser_lines(points_m: Float64, row: NDArray[np.intp], params: ScanEstima
 
     def sum_inliers(values: Float64) -> Float64:
         """Sum values over the inliers of each laser."""
-        return np.bincount(row, is_inlier * values, minlength=num_lasers)
+        return np.bincount(row, is_inlier * values, minlength=num_lasers).astype(np.float64)
 
     for _ in range(3):
         count = np.maximum(sum_inliers(np.ones(len(row))), 1)
