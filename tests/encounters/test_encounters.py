@@ -63,7 +63,7 @@ def high(name, **keys):
 
 
 @pytest.mark.parametrize("speed_kmh", [18.0, 36.0])
-def test_the_sight_opens_when_the_line_past_the_corner_of_a_wall_meets_the_walker(speed_kmh):
+def test_detection_begins_when_the_wall_no_longer_occludes(speed_kmh):
     scanner = {
         "name": "front", "mount": {"x_m": 1.5, "z_m": 1.5}, "channels": 1, "vertical_fov_deg": [-6, -6],
         "horizontal_fov_deg": 40, "columns": 4000, "max_range_m": 90, "rate_hz": 500,
@@ -85,7 +85,7 @@ def test_the_sight_opens_when_the_line_past_the_corner_of_a_wall_meets_the_walke
 
 
 @pytest.mark.parametrize("kmh", [(50, 0), (50, 50), (20, 90), (90, 3), (90, -54), (0, 30), (-15, 20), (-15, -6)])
-def test_what_braking_needs_is_what_a_braking_vehicle_needs(kmh):
+def test_braking_time_equals_a_simulated_stop(kmh):
     ego, other = kmh
     case = crossing(float(ego), {"yaw_deg": 0 if other < 0 else 180, "speed_kmh": abs(other) * math.copysign(1.0, ego)})
     criterion = Criterion(deceleration_mps2=6.0, latency_s=0.4)
@@ -99,7 +99,7 @@ def test_what_braking_needs_is_what_a_braking_vehicle_needs(kmh):
     assert criterion.compute_braking_time_s(speed_mps, towards_mps) == pytest.approx(expected_s, abs=1e-4)
 
 
-def test_outlines_touch_when_the_front_has_come_to_the_side():
+def test_contact_time_is_when_outlines_touch():
     assert StagedEncounter(crossing(36.0, {"body": BOX}), SOLID).contact_time_s == pytest.approx(
         1.0 - 0.5 / 10, abs=2e-6
     )
@@ -124,7 +124,7 @@ def grazing(overlap_m, **ego):
     return Encounter.model_validate({"name": "g", "ego": {"speed_kmh": 36} | ego, "road_user": other})
 
 
-def test_a_touch_of_less_than_a_millisecond_is_one():
+def test_contacts_shorter_than_a_millisecond_are_found():
     staged = StagedEncounter(grazing(0.004), SOLID)
     assert staged.contact_time_s == pytest.approx(1.5 - 0.05045, abs=1e-9)
     whole_s = np.arange(2000) / 1000
@@ -140,7 +140,7 @@ def test_a_touch_of_less_than_a_millisecond_is_one():
 
 
 @pytest.mark.parametrize("speed_kmh", [36.0, -36.0])
-def test_rows_of_obstacles_lie_where_the_ego_comes_from_or_beyond(speed_kmh):
+def test_obstacles_lie_before_or_beyond_the_meeting_point(speed_kmh):
     rows = [{"body": BOX, "longitudinal_gap_m": 0.5}, {"body": WALL, "lateral_gap_m": 2.0, "longitudinal_gap_m": 0.4}]
     beyond = {
         "body": BOX,
@@ -163,7 +163,7 @@ def test_rows_of_obstacles_lie_where_the_ego_comes_from_or_beyond(speed_kmh):
 
 @pytest.mark.parametrize("speed_kmh", [36.0, -31.7])
 @pytest.mark.parametrize("yaw_deg", [0.0, 17.0])
-def test_bodies_may_touch(speed_kmh, yaw_deg):
+def test_touching_obstacles_are_valid(speed_kmh, yaw_deg):
     row = [
         {"body": body, "longitudinal_gap_m": 0.0, "lateral_gap_m": 0.0, "yaw_deg": yaw_deg}
         for body in ("van", "suv", WALL, BOX)
@@ -171,7 +171,7 @@ def test_bodies_may_touch(speed_kmh, yaw_deg):
     assert len(StagedEncounter(crossing(speed_kmh, {"approach_distance_m": 0.7}, obstacles=row), SOLID).obstacles) == 4
 
 
-def test_a_bend_ends_at_the_meeting_and_is_as_long_as_its_angle():
+def test_bends_end_at_the_meeting_point():
     turning = Encounter.model_validate(
         {"name": "t", "ego": {"speed_kmh": 18, "radius_m": 8, "turn_deg": 90}, "max_lead_time_s": 4,
          "road_user": {"body": "child_120cm", "speed_kmh": 5, "approach_distance_m": 4}}
@@ -185,7 +185,7 @@ def test_a_bend_ends_at_the_meeting_and_is_as_long_as_its_angle():
 
 
 @pytest.mark.parametrize("looks", [1, 2, 3, 5])
-def test_the_first_run_is_that_of_all_looks_with_few_of_them(looks):
+def test_first_run_equals_exhaustive_search_with_fewer_tests(looks):
     generator = np.random.default_rng(looks)
     for chance in (0.2, 0.6, 0.9):
         steps = 10 * np.arange(40) + np.arange(7)[:, None]
@@ -222,7 +222,7 @@ HIDDEN = [
 ]
 
 
-def test_points_are_those_of_a_simulation_with_the_other_in_the_world():
+def test_points_equal_a_simulation_with_the_road_user():
     case = crossing(obstacles=HIDDEN)
     small = mounted(ahead(), CAMERA, RADAR)
     staged = StagedEncounter(case, small.ego_solid)
@@ -252,7 +252,7 @@ def test_points_are_those_of_a_simulation_with_the_other_in_the_world():
     assert (seen > 0).all()
 
 
-def test_the_answer_is_that_of_looking_all_the_time():
+def test_results_equal_exhaustive_search():
     case, criterion = crossing(obstacles=HIDDEN), Criterion(points=12, pixels=150)
     small = mounted(ahead(dropout=0.3), ahead("noisy", rate_hz=20, range_noise_m=0.3), CAMERA)
     found = sighted(small, case, criterion, num_start_offsets=4, seed=3)
@@ -275,7 +275,7 @@ def test_the_answer_is_that_of_looking_all_the_time():
     assert (found.ttc_without_sensor_s[0] == found.sensor_ttc_s[1:].max(axis=0)).all()
 
 
-def test_lidars_count_together_at_the_looks_of_the_slower_and_a_loss_is_never_a_gain():
+def test_lidars_are_counted_together_and_failures_never_help():
     assert group_sensors([0.1, None, 0.05, 0.1, None, 0.2], range(6)) == [(1,), (4,), (0, 3, 2), (2,), (5, 0, 3, 2)]
     assert group_sensors([2, None, 1], [2]) == [(2,)]
     few = lidar("few", columns=180, channels=8, vertical_fov_deg=[-20, 0])
@@ -293,7 +293,7 @@ def test_lidars_count_together_at_the_looks_of_the_slower_and_a_loss_is_never_a_
         assert (faster.ttc_s >= found.ttc_s).all()
 
 
-def test_a_sensor_that_is_slower_than_the_encounter_is_too_late():
+def test_slow_sensors_are_too_late_with_a_warning():
     with pytest.warns(UserWarning, match=r"3 scans of sensor 'top' take 3 s, .* ends after 0.98"):
         found = sighted(mounted(lidar(rate_hz=1)), crossing(), Criterion(), num_start_offsets=2)
     assert not found.ttc_s.any()
@@ -305,7 +305,7 @@ def test_a_sensor_that_is_slower_than_the_encounter_is_too_late():
     assert found.ttc_s.max() < found.censoring_ttc_s
 
 
-def test_fog_hides_what_is_beyond_and_it_is_said_what_was_there_from_the_beginning():
+def test_fog_delays_detection_and_early_detections_are_censored():
     far = crossing(72.0, {"approach_distance_m": None, "speed_kmh": 0}, max_lead_time_s=3)
     sensor = lidar(channels=60, vertical_fov_deg=[-4, 0], columns=7200, max_range_m=80)
     found = [sighted(mounted(sensor), case, Criterion(points=1), num_start_offsets=2) for case in (
@@ -322,7 +322,7 @@ FAMILY = {
 }  # fmt: skip
 
 
-def test_lists_are_combined_and_ranges_drawn_evenly_for_each_combination():
+def test_lists_are_combined_and_ranges_sampled_evenly():
     these = EncounterSet.model_validate({"name": "s", "num_samples": 8, "encounters": [FAMILY]}).encounters
     assert len(these) == 2 * 2 * 8
     assert [one.name for one in these[::8]] == ["f: hatchback", "f: van"] * 2
@@ -333,7 +333,7 @@ def test_lists_are_combined_and_ranges_drawn_evenly_for_each_combination():
         assert share.tolist() == [one.road_user.impact_location for one in these[:8]]
 
 
-def test_rows_are_of_speeds_with_intervals_over_draws():
+def test_rows_have_intervals_over_samples():
     these = EncounterSet.model_validate({"name": "s", "num_samples": 8, "encounters": [FAMILY | {"obstacles": []}]})
     two = rig(high("ahead"), high("top", columns=40))
     found = evaluate_encounters([two], these, Criterion(points=3), num_start_offsets=3, vehicle="suv")
@@ -357,7 +357,7 @@ def test_rows_are_of_speeds_with_intervals_over_draws():
     assert bands[0][1:] == (rows[0].min_ttc_s, rows[0].max_ttc_s)
 
 
-def test_in_time_up_to_a_speed_is_in_time_at_all_that_are_slower():
+def test_highest_timely_speed_includes_all_lower_speeds():
     these = EncounterSet.model_validate(
         {"name": "s", "encounters": [FAMILY | {"ego": {"speed_kmh": [50, 10, 30]}, "obstacles": [], "road_user":
          {"body": "child_120cm", "speed_kmh": 5, "approach_distance_m": 1.5}}]}
@@ -381,7 +381,7 @@ def test_in_time_up_to_a_speed_is_in_time_at_all_that_are_slower():
     assert [row.speed_kmh for row in found.rows] == [0, -20, -50]
 
 
-def test_a_film_shows_where_everybody_is_and_what_is_on_the_other():
+def test_animation_shows_vehicles_and_points():
     other = {"body": "child_120cm", "speed_kmh": 5, "approach_distance_m": 2.0}
     these = EncounterSet.model_validate(
         {"name": "s", "encounters": [FAMILY | {"ego": {"speed_kmh": [20, 90]}, "road_user": other}]}
@@ -438,7 +438,7 @@ MISTAKES = [
 
 
 @pytest.mark.parametrize(("keys", "told"), MISTAKES)
-def test_a_family_that_makes_no_sense_is_told_once(keys, told, tmp_path):
+def test_invalid_families_are_refused_once(keys, told, tmp_path):
     family = {"name": "f", "ego": {"speed_kmh": 10}, "road_user": {"body": "child_120cm", "speed_kmh": 5}} | keys
     path = tmp_path / "set.yaml"
     path.write_text(yaml.safe_dump({"name": "s", "encounters": [family]}))
@@ -447,7 +447,7 @@ def test_a_family_that_makes_no_sense_is_told_once(keys, told, tmp_path):
     assert len(str(failure.value)) < 1000
 
 
-def test_families_of_one_name_are_told():
+def test_families_with_equal_names_are_refused():
     families = [
         {"name": "f", "ego": {"speed_kmh": kmh}, "road_user": {"body": "child_120cm", "speed_kmh": 5}}
         for kmh in (10, 20)
@@ -473,12 +473,12 @@ def test_families_of_one_name_are_told():
         ),
     ],
 )
-def test_ways_that_never_meet_or_are_blocked_are_mistakes(case, told):
+def test_impossible_encounters_are_refused(case, told):
     with pytest.raises(ValueError, match=told):
         StagedEncounter(case, SOLID)
 
 
-def test_mistakes_of_the_last_encounter_are_told_before_the_first_look(monkeypatch):
+def test_invalid_encounters_are_refused_before_the_first_scan(monkeypatch):
     monkeypatch.setattr(MountedRig, "get_mounted_sensors", None)
     both = crossing(), crossing(36, {"impact_location": 3.0, "yaw_deg": 0, "approach_distance_m": 4})
     with pytest.raises(ValueError, match="never touch"):

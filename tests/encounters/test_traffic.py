@@ -67,7 +67,7 @@ def driven(scenario):
     return simulator, Drive.from_scene("w", simulator.get_scene_geometry(0)[0].scene)
 
 
-def test_who_is_met_and_how_near_in_time_is_geometry(driven):
+def test_approaches_have_geometric_times_to_collision(driven):
     child, faster = find_approaches(driven[1], Criterion())
     # The child's side is 1.8 - 0.2 m from that of the ego's way 2 s after 1.6 s; the front has 42 - 0.2 m to go.
     times_s = STEP_S * np.arange(child.frame_index, child.frame_index + len(child.ttc_s))
@@ -86,7 +86,7 @@ def test_who_is_met_and_how_near_in_time_is_geometry(driven):
     ]
 
 
-def test_points_are_those_of_frames(scenario, driven):
+def test_points_equal_those_of_frames(scenario, driven):
     simulator, there = driven
     frames = SimulatedFrames(
         scenario,
@@ -107,7 +107,7 @@ def test_points_are_those_of_frames(scenario, driven):
     assert counted > 1000
 
 
-def test_lidars_count_together_by_steps_and_who_looks_more_often_loses_nothing(driven):
+def test_lidars_of_different_rates_are_counted_together(driven):
     simulator, there = driven
     eyes = DriveSensors.from_simulator(simulator, 0, Criterion())
     assert (eyes.scan_periods, eyes.frame_strides) == ([1, 2, None], [1, 2, 1])
@@ -126,7 +126,7 @@ def test_lidars_count_together_by_steps_and_who_looks_more_often_loses_nothing(d
     assert detected_s(1, 1) > detected_s(2, 1) == detected_s(1, 2) == detected_s(2, 2) > 0
 
 
-def test_the_answer_is_that_of_looking_all_the_time(driven):
+def test_results_equal_exhaustive_search(driven):
     simulator, there = driven
     some = {"before": 0, "later": 0, "never": 0}
     for criterion in (
@@ -164,7 +164,7 @@ def test_the_answer_is_that_of_looking_all_the_time(driven):
     assert all(some.values())
 
 
-def test_who_is_in_time_is_open_where_braking_was_never_needed(driven):
+def test_timeliness_is_undecided_without_need_for_braking(driven):
     _, there = driven
     blind = DriveSensors([1], [1], [1], [1], lambda step, _: [np.empty((0, 3))])
     soft = Criterion(deceleration_mps2=1.5)
@@ -182,7 +182,7 @@ def test_who_is_in_time_is_open_where_braking_was_never_needed(driven):
     assert "Braking was needed in 1 encounters" in table.notes[1]
 
 
-def test_who_looks_rarely_has_seen_him_before():
+def test_rare_scans_before_the_approach_count():
     track = Track("t", "car", "passenger", (4.0, 2.0, 1.5), Trajectory.create_static([10.0, 0.0, 0.0]))
     there = Drive("w", STEP_S * np.arange(70), np.tile(np.eye(4), (70, 1, 1)), None, [track])
     one = Approach(track, 45, np.array([2.0] * 20), np.array([0.5] * 20), "cars and vans", 0.0)
@@ -193,7 +193,7 @@ def test_who_looks_rarely_has_seen_him_before():
         assert detect_approach("r", there, one, eyes, Criterion(max_ttc_s=2.5)).ttc_s[0] == ttc_s
 
 
-def test_a_lorry_and_its_trailer_are_one_road_user():
+def test_truck_and_trailer_are_one_road_user():
     times_s = STEP_S * np.arange(30)
     ego = np.tile(np.eye(4), (30, 1, 1))
     ego[:, 0, 3] = 20 * times_s
@@ -218,7 +218,7 @@ def test_a_lorry_and_its_trailer_are_one_road_user():
         (10, (9.9, 4), (-3, -8), 0.0),
     ],
 )
-def test_braking_is_needed_where_it_helps(ego_mps, other_mps, approach_distance_m, needed_s):
+def test_braking_times_are_zero_without_effect(ego_mps, other_mps, approach_distance_m, needed_s):
     times_s = STEP_S * np.arange(60)
     ego = np.tile(np.eye(4), (60, 1, 1))
     ego[:, 0, 3] = ego_mps * times_s
@@ -233,7 +233,7 @@ def test_braking_is_needed_where_it_helps(ego_mps, other_mps, approach_distance_
     ("seen_from", "ttc_s", "in_time"),
     [(0, 4.0, 1), (6, 2.0, 1), (7, 1.0, 0), (8, 1.0, 0), (9, 0.0, 0)],
 )
-def test_the_nearest_time_until_detection_counts_though_it_grew_again(seen_from, ttc_s, in_time):
+def test_smallest_time_to_collision_until_detection_counts(seen_from, ttc_s, in_time):
     track = Track("t", "car", "passenger", (4.0, 2.0, 1.5), Trajectory.create_static([10.0, 0.0, 0.0]))
     there = Drive("w", STEP_S * np.arange(9), np.tile(np.eye(4), (9, 1, 1)), None, [track])
     one = Approach(track, 5, np.array([3.0, 2.0, 1.0, 3.5]), np.array([0.5, 0.5, 1.1, 0.5]), "cars and vans", 0.0, 0.0)
@@ -252,7 +252,7 @@ def test_the_nearest_time_until_detection_counts_though_it_grew_again(seen_from,
     assert math.isnan(found.in_time[0]) if seen_from == 0 else found.in_time[0] == 0
 
 
-def test_who_is_hidden_until_braking_is_needed_is_too_late(scenario):
+def test_occlusion_until_braking_time_is_too_late(scenario):
     soft, hard = (
         evaluate_traffic_encounters(
             [rig(TOP)], scenario, Criterion(points=4, deceleration_mps2=brakes, latency_s=0.3), num_scenes=9
@@ -271,7 +271,7 @@ def test_who_is_hidden_until_braking_is_needed_is_too_late(scenario):
     assert table.rows[0][3].text.endswith("too late")
 
 
-def test_a_recording_of_a_world_says_the_same(scenario, tmp_path):
+def test_recorded_encounters_equal_simulated_ones(scenario, tmp_path):
     frames = SimulatedFrames(
         scenario, rig(TOP), num_frames=31, boxes=True, reference_sensor=PaperReference(rows=2, columns=2)
     )
@@ -310,7 +310,7 @@ class Closing(SyntheticDrive):
 
 
 @pytest.mark.parametrize("layout", ["kitti_raw", "nuscenes", "argoverse2"])
-def test_real_road_users_are_first_hit_as_their_layout_says(layout, tmp_path):
+def test_recorded_road_users_are_detected_in_all_layouts(layout, tmp_path):
     recording = open_recording(LAYOUTS[layout](Closing(steps=15), tmp_path))
     (one,) = evaluate_recorded_encounters(recording).detections
     longitudinal_gap_m = 50.0 - CAR_SIZE_M[0] / 2 - recording.ego_box.upper_m[0]
@@ -321,7 +321,7 @@ def test_real_road_users_are_first_hit_as_their_layout_says(layout, tmp_path):
 
 
 @pytest.mark.parametrize(("category", "met"), [("car", 0), ("pedestrian", 1)])
-def test_parked_vehicles_are_not_met_and_people_who_stand_are(category, met):
+def test_parked_vehicles_are_excluded_but_not_standing_people(category, met):
     class Standing(Closing):
         def world_T_car(self, index):
             return build_transform(np.eye(3), [68.0 + 0.1 * (index % 2), 0.0, 0.75])
@@ -334,7 +334,7 @@ def test_parked_vehicles_are_not_met_and_people_who_stand_are(category, met):
     assert len(found.detections) == met
 
 
-def test_what_cannot_be_asked_is_told(tmp_path):
+def test_invalid_traffic_requests_are_refused(tmp_path):
     with pytest.raises(ValueError, match="nothing moves in it"):
         evaluate_traffic_encounters([rig()], world())
     with pytest.raises(ValueError, match="num_scenes: a number >= 1"):

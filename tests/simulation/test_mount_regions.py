@@ -33,7 +33,7 @@ def distance_m(mesh, place_m):
 
 
 @pytest.mark.parametrize("name", VEHICLES)
-def test_places_lie_on_the_skin_and_heights_are_distances_from_it(name):
+def test_mount_points_lie_on_the_surface(name):
     (vehicle, skin), generator = loaded(name), np.random.default_rng(0)
     assert vehicle.mount_regions
     for region in vehicle.mount_regions.values():
@@ -46,7 +46,7 @@ def test_places_lie_on_the_skin_and_heights_are_distances_from_it(name):
 
 
 @pytest.mark.parametrize("name", VEHICLES)
-def test_a_region_is_one_patch_that_looks_to_its_side(name):
+def test_regions_are_one_patch_facing_their_side(name):
     """No place beside another lies on another part, nor on a wall that only seems to be seen from there."""
     (vehicle, skin), shares = loaded(name), np.linspace(0.0, 1.0, 5)
     for region in vehicle.mount_regions.values():
@@ -74,17 +74,17 @@ def test_left_and_right_are_mirror_images(name):
 
 
 @pytest.mark.parametrize("name", SMALL)
-def test_people_animals_bikes_and_poles_have_none(name):
+def test_small_bodies_have_no_mount_regions(name):
     assert get_mount_regions(VehicleShape(type="vehicle", vehicle=name)) == {}
 
 
-def test_regions_are_nothing_to_a_simulation():
+def test_mount_regions_do_not_change_simulations():
     suv = Vehicle.load("suv")
     assert suv.collect_content() == suv.model_copy(update={"mount_regions": {}}).collect_content()
 
 
 @pytest.mark.parametrize("side", SIDE_VIEWS)
-def test_outwards_is_where_one_looks_from_whichever_way_faces_turn(side):
+def test_normals_point_outwards_for_any_face_orientation(side):
     turned = Skin(Mesh(BOX.mesh.vertices_m, BOX.mesh.faces[:, ::-1]))
     across_m = (0.1, 0.2)
     axis, sign = SIDE_VIEWS[side][:2]
@@ -94,14 +94,14 @@ def test_outwards_is_where_one_looks_from_whichever_way_faces_turn(side):
         assert point.position_m[axis] == {"x": sign * 2.0, "y": sign * 1.0, "z": 1.5}["xyz"[axis]]
 
 
-def test_a_line_through_an_edge_that_two_faces_share_meets_one_of_them():
+def test_lines_through_shared_edges_hit_a_face():
     assert BOX.find_surface_point("above", (0.0, 0.0)).position_m.tolist() == [0.0, 0.0, 1.5]
     assert BOX.find_surface_point("above", (2.0, 1.0)).position_m.tolist() == [2.0, 1.0, 1.5]
     assert BOX.find_surface_point("above", (2.001, 0.0)) is None
 
 
 @pytest.mark.parametrize(("side", "facing_deg"), [("above", 0), ("front", 0), ("rear", 180), ("left", 90)])
-def test_a_sensor_faces_outwards_unless_the_region_says_where_to(side, facing_deg):
+def test_sensors_face_outwards_or_as_the_region_defines(side, facing_deg):
     axis = SIDE_VIEWS[side].axis
     window = {f"{other}_m": (0.1, 0.5) for other in "xyz" if other != "xyz"[axis]}
     assert MountRegion(side=side, **window).heading_deg == facing_deg
@@ -118,12 +118,12 @@ def test_a_sensor_faces_outwards_unless_the_region_says_where_to(side, facing_de
         ({"side": "below", "x_m": (0.0, 1.0), "y_m": (0.0, 1.0)}, "'above', 'front', 'rear', 'left' or 'right'"),
     ],
 )
-def test_a_region_that_is_none_is_refused(keys, message):
+def test_invalid_regions_are_refused(keys, message):
     with pytest.raises(ValueError, match=message):
         MountRegion(**keys)
 
 
-def test_a_place_beside_the_body_is_refused():
+def test_positions_off_the_body_are_refused():
     beyond = MountRegion(side="above", x_m=(1.0, 3.0), y_m=(-0.5, 0.5))
     with pytest.raises(ValueError, match=r"x = 3\.000 m, y = 0\.000 m \(u = 1, v = 0\.5\) the body has no surface"):
         beyond.find_mount_point(BOX, 1.0, 0.5)

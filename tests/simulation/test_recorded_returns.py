@@ -61,7 +61,7 @@ def sweeps():
     return [sweep(generator) for _ in range(3)]
 
 
-def test_a_plain_gives_back_what_it_was_made_with(sweeps, tmp_path):
+def test_calibration_recovers_a_simulated_plain(sweeps, tmp_path):
     rig, [found] = calibrate(written(tmp_path, sweeps), RIG)
     assert abs(np.log(found.fit.range_at_10_percent_m / RANGE_M)) < 3 * found.fit.log_range_error < 0.15
     assert abs(np.log(found.fit.log_range_std / SPREAD)) < 3 * found.fit.log_std_error < 0.6
@@ -69,7 +69,7 @@ def test_a_plain_gives_back_what_it_was_made_with(sweeps, tmp_path):
     assert rig.sensors[0].range_at_10_percent_m == round(found.fit.range_at_10_percent_m, 1)
 
 
-def test_errors_are_those_of_the_curvature_of_what_is_likely(sweeps):
+def test_errors_follow_the_curvature_of_the_likelihood(sweeps):
     rays = count_ground_rays(sweeps, RIG.sensors[0])
     fit, returned = fit_returns(rays, ROAD), rays.return_counts / rays.ray_counts
 
@@ -93,7 +93,7 @@ def test_errors_are_those_of_the_curvature_of_what_is_likely(sweeps):
     assert [fit.log_range_error, fit.log_std_error] == pytest.approx(expected, rel=0.1)
 
 
-def test_half_of_the_turn_predicts_the_other_half(sweeps):
+def test_fit_predicts_the_other_half_of_revolutions(sweeps):
     rays = count_ground_rays(sweeps, RIG.sensors[0])
     ahead = np.abs(rays.azimuth_deg) < 90
     fit, judged = fit_returns(rays.select(ahead), ROAD), rays.select(~ahead)
@@ -113,14 +113,14 @@ def test_half_of_the_turn_predicts_the_other_half(sweeps):
             assert real == pytest.approx((probability * judged.ray_counts)[there].sum() / rays_there, abs=0.06)
 
 
-def test_rays_behind_a_wall_are_in_nobodys_count():
+def test_rays_behind_walls_are_not_counted():
     """Else what the wall hides would be road that did not return."""
     rays = count_ground_rays([sweep(np.random.default_rng(1), wall_m=30.0)], RIG.sensors[0])
     ahead = np.abs(rays.azimuth_deg) < 10
     assert rays.range_m[ahead].max() < 31 < 60 < rays.range_m[~ahead].max()
 
 
-def test_rays_pass_over_what_is_low():
+def test_rays_pass_above_low_obstacles():
     """Behind a beam of 0.5 m the road is hidden from 30 to 30 / (1 - 0.5 / 1.9) = 41 m only."""
     beam = count_ground_rays([sweep(np.random.default_rng(1), wall_m=30.0, top_m=0.5)], RIG.sensors[0])
     ahead = np.abs(beam.azimuth_deg) < 10
@@ -128,7 +128,7 @@ def test_rays_pass_over_what_is_low():
     assert ((beam.range_m[ahead] > 45) & (beam.range_m[ahead] < 80)).sum() > 100
 
 
-def test_the_road_is_found_where_it_tilts_and_bends():
+def test_road_profile_fits_slopes_and_curvature():
     x, y = np.meshgrid(np.linspace(-60, 60, 121), np.linspace(-6, 6, 25))
     height_m = 0.02 * x - 0.01 * y + 0.2 * (x / 40) ** 2 * (x > 0)
     profile = fit_road_profile(np.stack([x, y, height_m], axis=-1).reshape(-1, 3))
@@ -140,7 +140,7 @@ def test_the_road_is_found_where_it_tilts_and_bends():
     )
 
 
-def test_what_lies_beside_the_lanes_is_no_road():
+def test_points_outside_lanes_are_no_road():
     x, y = np.meshgrid(np.linspace(-60, 60, 121), np.linspace(-20, 20, 81))
     lanes = np.abs(y) < RoadParams().half_lanes_m
     points_m = np.stack([x, y, 0.02 * x + 0.3 * ~lanes], axis=-1)
@@ -150,13 +150,13 @@ def test_what_lies_beside_the_lanes_is_no_road():
     )
 
 
-def test_rays_to_what_is_near_are_in_nobodys_count(sweeps):
+def test_near_rays_are_not_counted(sweeps):
     """The steep ones: they return, whatever the LiDAR."""
     assert np.tan(np.deg2rad(RIG.sensors[0].compute_elevations_deg())).min() < -HEIGHT_M / 5
     assert count_ground_rays(sweeps, RIG.sensors[0]).range_m.min() > RoadParams().min_range_m
 
 
-def test_near_road_cannot_tell_how_far_a_lidar_sees(sweeps, tmp_path):
+def test_near_road_does_not_determine_the_range(sweeps, tmp_path):
     """All of it returns: any range that is long enough explains that."""
     _, [found] = calibrate(written(tmp_path, sweeps), RIG)
     rays = count_ground_rays(sweeps, RIG.sensors[0])
@@ -176,11 +176,11 @@ def test_near_road_cannot_tell_how_far_a_lidar_sees(sweeps, tmp_path):
     ],
     ids=["empty", "standing", "one sweep again"],
 )
-def test_recordings_that_say_nothing_are_refused(sweeps, tmp_path, sweeps_made, poses, told):
+def test_uninformative_recordings_are_refused(sweeps, tmp_path, sweeps_made, poses, told):
     with pytest.raises(ValueError, match=told):
         calibrate(written(tmp_path, sweeps_made(sweeps), poses), RIG)
 
 
-def test_a_rig_of_other_sensors_is_refused(sweeps, tmp_path):
+def test_rigs_without_common_sensors_are_refused(sweeps, tmp_path):
     with pytest.raises(ValueError, match="no LiDAR of the rig 'argoverse2' is in it"):
         calibrate(written(tmp_path, sweeps[:1]), Rig.load("argoverse2"))

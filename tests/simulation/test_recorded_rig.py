@@ -29,7 +29,7 @@ def in_a_room(lidar, seed, dropout=0.2):
 
 
 @pytest.mark.parametrize("model", list_builtin_names("lidars"))
-def test_the_scan_of_every_model_is_found(model):
+def test_scan_pattern_of_every_model_is_estimated(model):
     lidar = Lidar.model_validate({"name": "a", "model": model, "columns": 240})
     found = estimate_scan([in_a_room(lidar, seed) for seed in range(2)])
     np.testing.assert_allclose(found.elevations_deg, np.sort(lidar.compute_elevations_deg())[::-1], atol=1e-9)
@@ -41,7 +41,7 @@ def test_the_scan_of_every_model_is_found(model):
     assert found.horizontal_fov_deg == pytest.approx(lidar.horizontal_fov_deg, abs=1e-6)
 
 
-def test_rows_that_shake_are_found_and_rows_that_blend_are_not():
+def test_noisy_rows_are_found_but_not_blended_ones():
     lidar = Lidar.model_validate({"name": "a", "model": "velodyne_hdl32e", "columns": 400})
     points_m = in_a_room(lidar, 0, 0.0)
 
@@ -108,7 +108,7 @@ class Turning(Drive):
         (Turning(told=("rings",)), "motion undone .rotates clockwise from"),
     ],
 )
-def test_rows_of_a_vehicle_in_motion_are_those_of_its_rays(drive, said):
+def test_rows_of_a_moving_vehicle_are_recovered(drive, said):
     rig = build_rig_document(drive)
     (lidar,) = Rig.model_validate(rig).sensors
     assert re.search(said, rig["description"])
@@ -119,7 +119,7 @@ def test_rows_of_a_vehicle_in_motion_are_those_of_its_rays(drive, said):
     np.testing.assert_allclose(lidar.mount.to_matrix(), drive.mount, atol=1e-5)
 
 
-def test_of_frames_seconds_apart_no_motion_is_undone_and_no_clock_is_blamed():
+def test_motion_is_not_undone_for_distant_frames():
     drive = Turning(told=("rings",))
     drive.times_s = 100.0 * drive.times_s
     said = build_rig_document(drive)["description"]
@@ -129,7 +129,7 @@ def test_of_frames_seconds_apart_no_motion_is_undone_and_no_clock_is_blamed():
         build_rig_document(drive)
 
 
-def test_clouds_stored_laser_by_laser_need_no_rows_that_can_be_told_apart():
+def test_clouds_stored_by_laser_need_no_separable_rows():
     # The lasers of the upper half leave 0.1 m above the others: no elevation is that of one laser.
     lidar = Lidar.model_validate({"name": "a", "model": "velodyne_hdl64e", "columns": 400})
     points_m = in_a_room(lidar, 0, 0.0)
@@ -144,7 +144,7 @@ def test_clouds_stored_laser_by_laser_need_no_rows_that_can_be_told_apart():
     assert found.origin_height_m == pytest.approx(0.15, abs=0.02)
 
 
-def test_a_field_of_view_has_its_middle_and_ranges():
+def test_field_of_view_and_range_are_estimated():
     lidar = Lidar(name="a", channels=4, vertical_fov_deg=(-9, 0), columns=40, horizontal_fov_deg=80, max_range_m=99)
     turned = build_transform(convert_euler_to_rotation(170.0, 0.0, 0.0), np.zeros(3))
     points_m = transform_points(turned, in_a_room(lidar, 0, 0.0))
@@ -291,7 +291,7 @@ CAMERAS = {
 
 @pytest.mark.parametrize("raw", [False, True])
 @pytest.mark.parametrize("layout", CAMERAS)
-def test_cameras_show_points_where_their_data_set_says(layout, raw, tmp_path):
+def test_cameras_project_points_like_their_data_set(layout, raw, tmp_path):
     """Images are released undistorted or rectified; the raw ones are those of the lenses."""
     path, name, size, pixels = CAMERAS[layout](Drive(steps=3), tmp_path)
     recording = open_recording(path, RecordingSettings(format=layout))
@@ -318,7 +318,7 @@ def test_cameras_show_points_where_their_data_set_says(layout, raw, tmp_path):
     assert "as calibrated" in rig.description
 
 
-def test_lidars_are_where_calibrations_say(tmp_path):
+def test_lidar_extrinsics_come_from_calibrations(tmp_path):
     path, *_ = argoverse2_with_camera(Drive(steps=2), tmp_path)
     rig = build_rig_document(
         open_recording(path), sensor_names=["down_lidar"], lidar_models={"down_lidar": "velodyne_vlp32c"}
@@ -335,7 +335,7 @@ def test_lidars_are_where_calibrations_say(tmp_path):
     assert "transforms to base_link" in rig["description"]
 
 
-def test_what_no_rig_can_be_made_of(tmp_path):
+def test_recordings_without_usable_sensors_are_refused(tmp_path):
     drive = Drive(steps=2)
     with pytest.raises(ValueError, match="no LiDAR roof, other; the recording has left, right"):
         build_rig_document(drive, sensor_names=["roof", "left"], lidar_models={"other": "velodyne_vlp16"})
@@ -364,7 +364,7 @@ def test_what_no_rig_can_be_made_of(tmp_path):
         ("R_rect_00", "R_rect_07", "R_rect_00 with 12 numbers"),
     ],
 )
-def test_calibrations_of_kitti_that_cannot_be(tmp_path, line, instead, told):
+def test_invalid_kitti_calibrations_are_refused(tmp_path, line, instead, told):
     path, *_ = kitti_raw_with_cameras(Drive(steps=2), tmp_path)
     file = path.parent / "calib_cam_to_cam.txt"
     assert line in file.read_text()
@@ -378,7 +378,7 @@ def test_calibrations_of_kitti_that_cannot_be(tmp_path, line, instead, told):
     assert "no cameras without calib_cam_to_cam.txt" in rig["description"]
 
 
-def test_cameras_of_others_that_cannot_be(tmp_path):
+def test_invalid_cameras_of_recordings_are_refused(tmp_path):
     from pyarrow import feather
 
     path, *_ = argoverse2_with_camera(Drive(steps=2), tmp_path)

@@ -41,7 +41,7 @@ def robot_of(tmp_path):
     return read
 
 
-def test_a_link_and_its_sensor_are_where_all_joints_before_them_are_at_0(robot_of):
+def test_sensor_pose_chains_all_joints_at_zero(robot_of):
     turns = [("0.3 0 0.5", (0.1, -0.2, 1.0)), ("0 0.4 0", (0.0, 0.5, -0.3))]
     places = [np.eye(4), np.eye(4), np.eye(4)]
     for place, (xyz, rpy) in zip(places, [*turns, ("0.01 0.02 0.03", (0.0, 0.0, 0.2))], strict=True):
@@ -60,7 +60,7 @@ def test_a_link_and_its_sensor_are_where_all_joints_before_them_are_at_0(robot_o
     assert (rig.sensors[0].rate_hz, rig.sensors[0].range_noise_m) == (20.0, 0.02)
 
 
-def test_the_rays_of_a_lidar_are_those_that_gazebo_casts(robot_of):
+def test_lidar_rays_equal_those_of_gazebo(robot_of):
     keys = robot_of(CHASSIS, on("base", LIDAR.format("left", "<pose>0 0 1 0 0 0</pose>", math.pi))).sensors[0]
     (lidar,) = Rig.model_validate({"name": "a", "sensors": [keys]}).sensors
     rays = np.einsum("ij,jrc->irc", lidar.mount.to_matrix()[:3, :3], lidar.compute_directions())
@@ -68,7 +68,7 @@ def test_the_rays_of_a_lidar_are_those_that_gazebo_casts(robot_of):
     np.testing.assert_allclose(np.arcsin(rays[2])[:, 0], [-0.1, 0.1, 0.3], atol=1e-5)
 
 
-def test_cameras_have_their_own_poses_and_names_and_the_range_of_their_depth(robot_of):
+def test_cameras_have_poses_names_and_depth_ranges(robot_of):
     depth = CAMERA.format("").replace(
         "</camera>", "<depth_camera><clip><near>0.3</near><far>5</far></clip></depth_camera></camera>"
     )
@@ -100,7 +100,7 @@ def test_cameras_have_their_own_poses_and_names_and_the_range_of_their_depth(rob
         ("<mesh filename='file://m.dae' scale='{0} 1 1'/>", (0.4, 0.2, 0.6)),
     ],
 )
-def test_shapes_have_their_middle_at_their_origin_and_face_outwards(robot_of, tmp_path, shape, size_m, scale):
+def test_shapes_are_centered_and_face_outwards(robot_of, tmp_path, shape, size_m, scale):
     box = trimesh.creation.box((0.4, 0.2, 0.6))
     box.export(tmp_path / "m.stl")
     dae = trimesh.exchange.dae.export_collada(box.copy().apply_scale(100)).replace(
@@ -118,7 +118,7 @@ def test_shapes_have_their_middle_at_their_origin_and_face_outwards(robot_of, tm
     assert trimesh.Trimesh(mesh.vertices_m, mesh.faces).volume > 0
 
 
-def test_meshes_of_a_package_are_found_around_the_file_or_where_it_is_told(tmp_path):
+def test_meshes_of_packages_are_found(tmp_path):
     urdf = "<robot name='a'><link name='b'><visual><geometry><mesh filename='package://bot/meshes/m.stl'/></geometry></visual></link></robot>"
     for root, file, packages in (
         (tmp_path / "ws" / "bot", "urdf/a.urdf", None),
@@ -134,7 +134,7 @@ def test_meshes_of_a_package_are_found_around_the_file_or_where_it_is_told(tmp_p
         )
 
 
-def test_what_a_sensor_is_built_into_is_left_out_and_the_largest_body_stays(robot_of):
+def test_housings_are_excluded_except_the_largest_body(robot_of):
     links = (
         "<link name='l'>" + BOX.format("0.1 0.1 0.1") + "</link><link name='m'>" + BOX.format("0.1 0.1 0.2") + "</link>"
     )
@@ -149,7 +149,7 @@ def test_what_a_sensor_is_built_into_is_left_out_and_the_largest_body_stays(robo
     ]
 
 
-def test_a_guard_of_posts_around_a_lidar_stays_and_takes_its_rays(robot_of):
+def test_posts_around_a_lidar_stay_and_block_rays(robot_of):
     """Its bounding box holds the sensor, but it is not built into it: posts are 2 cm wide, 6 cm away."""
     corners = [f"{x} {y} 0" for x in (-0.06, 0.06) for y in (-0.06, 0.06)]
     posts = "".join(BOX.format("0.02 0.02 0.2").replace("<geo", f"<origin xyz='{xyz}'/><geo") for xyz in corners)
@@ -170,13 +170,13 @@ def test_a_guard_of_posts_around_a_lidar_stays_and_takes_its_rays(robot_of):
     "<pose relative_to='l'>-0.1 0 -0.3 0 0.174532925 1.570796327</pose>",
     "<pose frame='__model__' degrees='true'>0.1 0 0 0 10 90</pose>",
 ])  # fmt: skip
-def test_attributes_of_a_pose_are_applied(robot_of, pose):
+def test_pose_attributes_are_applied(robot_of, pose):
     links = "<link name='l'/>" + joint("base", "l", "0.2 0 0.3")
     mount = robot_of(CHASSIS, links, on("base", f"<sensor name='c' type='depth'>{pose}{CAMERA.format('')}</sensor>"))
     assert mount.sensors[0]["mount"] == {"x_m": 0.1, "z_m": 0.2, "yaw_deg": 90.0, "pitch_deg": 10.0}
 
 
-def test_lens_distortion_and_noise_of_a_camera_are_applied(robot_of):
+def test_camera_distortion_and_noise_are_applied(robot_of):
     """Gazebo counts the principal point from the corner of the image, torchcover from the center of the first pixel."""
     inside = (
         "<lens><intrinsics><fx>{}</fx><fy>320</fy><cx>320</cx><cy>{}</cy><s>0</s></intrinsics></lens>"
@@ -195,7 +195,7 @@ def test_lens_distortion_and_noise_of_a_camera_are_applied(robot_of):
 
 
 @pytest.mark.parametrize(("samples", "resolution", "channels"), [(1, 0.1, 1), (4, 0.5, 2), (3, 2, 6), (3, 1, 3)])
-def test_a_resolution_counts_as_in_gazebo_classic_and_is_named(robot_of, samples, resolution, channels):
+def test_resolution_is_applied_as_in_gazebo_classic(robot_of, samples, resolution, channels):
     lidar = LIDAR.format("l", "", 1.0).replace(
         "<samples>3</samples>", f"<samples>{samples}</samples><resolution>{resolution}</resolution>"
     )
@@ -205,7 +205,7 @@ def test_a_resolution_counts_as_in_gazebo_classic_and_is_named(robot_of, samples
     assert any(note in words for words in robot.notes) == (resolution != 1)
 
 
-def test_settings_that_are_not_applied_are_named(robot_of):
+def test_ignored_settings_are_named(robot_of):
     plugin = "<plugin><min_range>0.9</min_range><updateRate>20.0</updateRate><topic>x</topic></plugin>"
     lens = "<lens><type>equidistant</type></lens><visibility_mask>7</visibility_mask></camera>"
     camera = CAMERA.format("").replace("</camera>", lens)
@@ -216,7 +216,7 @@ def test_settings_that_are_not_applied_are_named(robot_of):
     assert "c: <visibility_mask> 7 is not applied; the sensor sees all bodies." in notes
 
 
-def test_joints_that_mimic_others_are_at_their_offset_and_limits_without_0_are_noted(robot_of):
+def test_mimic_joints_have_offsets_and_limits_are_noted(robot_of):
     """b slides by 0.1 m; c follows b with 2 * 0.1 + 0.05 m along y; d, which excludes 0, stays there."""
     links = "".join(f"<link name='{name}'>{BOX.format('0.1 0.1 0.1')}</link>" for name in "bcd")
     limit = "<limit lower='0.2' upper='0.6'/>"
@@ -234,7 +234,7 @@ def test_joints_that_mimic_others_are_at_their_offset_and_limits_without_0_are_n
     assert note.startswith("Joints outside of their limits: 'base_d' at 0 rad (0.2 to 0.6)")
 
 
-def test_the_time_for_a_robot_is_linear_in_its_links(robot_of):
+def test_reading_time_is_linear_in_links(robot_of):
     """A chain and a star of 20,000 links took minutes, for each link looked at all others."""
     names = [f"l{k}" for k in range(20_000)]
     links = "".join(f"<link name='{name}'/>" for name in names)
@@ -244,7 +244,7 @@ def test_the_time_for_a_robot_is_linear_in_its_links(robot_of):
     assert time.process_time() - start_s < 20.0
 
 
-def test_what_is_written_can_be_simulated_and_names_stay_names(robot_of, tmp_path):
+def test_written_robots_can_be_simulated(robot_of, tmp_path):
     nasty = "&lt;b&gt;"
     sensor = LIDAR.format(nasty, "<pose>0 0 0.5 0 0 0</pose>", 6.28)
     robot = robot_of(CHASSIS, on("base", sensor))
@@ -257,7 +257,7 @@ def test_what_is_written_can_be_simulated_and_names_stay_names(robot_of, tmp_pat
     assert len(frame.sensor) > 100
 
 
-def test_without_sensors_there_is_no_rig(robot_of, tmp_path):
+def test_robots_without_sensors_have_no_rig(robot_of, tmp_path):
     assert {path.name for path in robot_of(CHASSIS).save(tmp_path / "out")} == {
         "body.ply",
         "vehicle.yaml",
@@ -301,7 +301,7 @@ MESH = "<link name='base'><visual><geometry><mesh filename='package://p/{}.stl'/
         ([], "a <robot> with links is needed"),
     ],
 )  # fmt: skip
-def test_what_is_no_robot_is_told_in_one_line(robot_of, content, told):
+def test_invalid_robots_are_refused_in_one_line(robot_of, content, told):
     with pytest.raises(BadFileError, match=r"a\.urdf: ") as caught:
         robot_of(*content)
     assert told in str(caught.value)

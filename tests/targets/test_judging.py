@@ -56,7 +56,7 @@ def seen_where(points, *, raster=None, state=None, share=None, detection_points=
     )
 
 
-def test_the_border_lies_between_each_place_that_is_seen_and_its_neighbours_that_are_not():
+def test_detection_border_separates_detected_from_undetected_cells():
     """Seen from 3.5 m ahead of the middle on; to the left from 2 m on, less a gap that comes later."""
     seen = seen_where(lambda x, y: np.where((x > 3.5) | ((y > 2) & ~((y > 3) & (y < 4))), 9, 0))
     edges = seen.compute_detection_border_m().reshape(-1, 3, 2)
@@ -81,7 +81,7 @@ def test_the_border_lies_between_each_place_that_is_seen_and_its_neighbours_that
     assert not len(seen_where(lambda x, y: 9).compute_detection_border_m())
 
 
-def test_sides_part_the_places_at_corners_of_45_degrees():
+def test_sides_are_separated_at_45_degrees():
     seen = seen_where(lambda x, y: np.where(x > 0, 9, 4))
     assert (np.bincount(seen.side.ravel() + 1) == [32, 104, 104, 120, 120]).all()
     by_side = {(row.side, row.max_distance_m): row for row in seen.summarize_sides()}
@@ -102,13 +102,13 @@ def test_sides_part_the_places_at_corners_of_45_degrees():
     }  # in every other step, however many points the others have
 
 
-def test_what_is_seen_in_some_steps_only_is_not_seen():
+def test_targets_must_be_detected_in_every_frame():
     """Eighty points in one of sixteen steps are five in the mean."""
     seen = seen_where(lambda x, y: 80 / 16, least=0)
     assert not seen.detected_mask.any()
 
 
-def test_the_worst_places_have_the_fewest_points_and_keep_apart():
+def test_worst_positions_have_fewest_points_and_spacing():
     seen = seen_where(lambda x, y: np.abs(x) + np.abs(y))
     worst = seen.find_worst_positions(3)
     assert [place.points for place in worst] == sorted(place.points for place in worst)
@@ -118,7 +118,7 @@ def test_the_worst_places_have_the_fewest_points_and_keep_apart():
     assert len(seen.find_worst_positions(10_000, min_spacing_m=0.1)) == seen.counts["free"]
 
 
-def test_the_files_hold_what_the_map_holds(tmp_path):
+def test_files_contain_the_map(tmp_path):
     seen = seen_where(lambda x, y: np.abs(x) + 0.5, raster=Raster((-3.0, 3.0), (-2.0, 2.0), 1.0))
     names = [path.name for path in save_target_map(seen, tmp_path)]
     assert names == ["targets.csv", "targets.npz", "report.html", "targets.png", "summary.json"]
@@ -140,7 +140,7 @@ def test_the_files_hold_what_the_map_holds(tmp_path):
     assert build_target_record(replace(seen, state=np.ones_like(seen.state)))["sides"][0]["detected_share"] is None
 
 
-def test_the_picture_shows_cells_where_they_are():
+def test_plot_shows_cells_at_their_positions():
     seen = seen_where(lambda x, y: np.where(y > 0, 0, 100))
     figure = seen.plot()
     canvas = FigureCanvasAgg(figure)
@@ -158,7 +158,7 @@ def test_the_picture_shows_cells_where_they_are():
     assert figure.axes[0].get_legend() is not None
 
 
-def test_names_become_bodies(tmp_path):
+def test_targets_load_from_names_and_files(tmp_path):
     (tmp_path / "post.yaml").write_text(
         "name: my post\nparts: [{name: p, shape: {type: box, size_m: [0.2, 0.2, 0.5]}, poses: [{z_m: -3}]}]\n"
     )
@@ -184,7 +184,7 @@ def test_names_become_bodies(tmp_path):
         ({"num_frames": 10**9}, "use fewer frames"),
     ],
 )
-def test_an_option_that_cannot_be_is_an_error(options, message):
+def test_invalid_options_are_refused(options, message):
     with pytest.raises((ValueError, FileNotFoundError), match=message):
         map_target_visibility("front_roof_32", **{"target": "child", **options})
 
@@ -201,6 +201,6 @@ def test_an_option_that_cannot_be_is_an_error(options, message):
         (((0.0, 1.0), (0.0, 1.0), 9.0), "no whole number of cells"),
     ],
 )
-def test_a_raster_that_cannot_be_is_an_error(bounds, message):
+def test_invalid_rasters_are_refused(bounds, message):
     with pytest.raises(ValueError, match=message):
         Raster(*bounds)

@@ -25,7 +25,7 @@ def instant(made):
 
 
 @pytest.mark.parametrize(("pitch_deg", "roll_deg"), [(0, 0), (4, 0), (-4, 3), (0, -3)])
-def test_the_ground_under_a_place_is_that_of_a_tilted_plane(pitch_deg, roll_deg):
+def test_ground_heights_follow_a_tilted_plane(pitch_deg, roll_deg):
     tilted = {**FLOOR, "poses": [{"pitch_deg": pitch_deg, "roll_deg": roll_deg}]}
     places = np.random.default_rng(1).uniform(-20, 20, (200, 2))
     normal = SceneGeometry(scenario(tilted).build_scene()).scene.static_meshes[0].vertices_m
@@ -40,7 +40,7 @@ def test_the_ground_under_a_place_is_that_of_a_tilted_plane(pitch_deg, roll_deg)
     np.testing.assert_allclose(in_world[:, 2], 0, atol=2e-3)
 
 
-def test_a_deck_above_is_no_place_to_stand_and_a_pavement_is():
+def test_targets_stand_on_curbs_not_on_bridges():
     deck = {"name": "deck", "shape": {"type": "box", "size_m": [8, 8, 0.5]}, "poses": [{"x_m": 10, "z_m": 4}]}
     kerb = {"name": "kerb", "shape": {"type": "box", "size_m": [8, 8, 0.15]}, "poses": [{"x_m": -10}]}
     made = instant(scenario(FLOOR, {**deck, "ground": True}, {**kerb, "ground": True}))
@@ -48,7 +48,7 @@ def test_a_deck_above_is_no_place_to_stand_and_a_pavement_is():
     np.testing.assert_allclose(found, [0, 0.15, 0, np.nan], atol=1e-4)
 
 
-def test_a_slope_that_the_vehicle_stands_on_changes_nothing():
+def test_slopes_below_the_vehicle_change_nothing():
     rig, pole, raster = Rig.load("front_roof_32"), Target.load("pole"), Raster((4.0, 12.0), (-2.0, 2.0), 1.0)
     flat = measure_target_visibility(rig, scenario(FLOOR), pole, raster, num_frames=2)
     tilted = {**FLOOR, "poses": [{"pitch_deg": 5.0}]}
@@ -60,7 +60,7 @@ def test_a_slope_that_the_vehicle_stands_on_changes_nothing():
     assert np.abs(below.points - flat.points).max() > 3
 
 
-def test_where_there_is_no_ground_there_is_no_target():
+def test_positions_without_ground_are_outside():
     rig, pole = Rig.load("front_roof_32"), Target.load("pole")
     found = measure_target_visibility(rig, scenario(FLOOR), pole, Raster((26.0, 34.0), (-2.0, 2.0), 1.0))
     beyond = found.raster.positions_m[:, 0].reshape(found.raster.shape) > 30

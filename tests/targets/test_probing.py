@@ -43,7 +43,7 @@ def numbers(probes, region, rig="small"):
 
 
 @pytest.mark.parametrize(("name", "bodies"), [("child", ()), ("pole", (WALL,))], ids=["free space", "a wall"])
-def test_the_numbers_are_those_of_targets_over_the_same_cells(name, bodies, monkeypatch):
+def test_near_field_numbers_equal_those_of_target_maps(name, bodies, monkeypatch):
     scenario, target = world(*bodies), Target.load(name)
     for module in (target_frames, probing):  # its surface is looked at from random places
         monkeypatch.setattr(
@@ -63,7 +63,7 @@ def test_the_numbers_are_those_of_targets_over_the_same_cells(name, bodies, monk
     assert 0.1 < numbers(probes, LEFT)[0].value < 1
 
 
-def test_every_place_of_a_region_is_as_likely_as_any_other_and_so_the_budget_moves_no_number():
+def test_positions_of_a_region_are_sampled_uniformly():
     vehicle = world().compute_ego_box()
     grid = BevGrid((-6.0, 6.0), (-5.0, 5.0), 1.0)
     pole = NearFieldTarget.from_target(Target.load("pole"), vehicle, build_near_field(vehicle.outline_m), grid)
@@ -81,7 +81,7 @@ def test_every_place_of_a_region_is_as_likely_as_any_other_and_so_the_budget_mov
             assert excess == pytest.approx(1.0, abs=5 * np.sqrt(2 / len(own)))
 
 
-def test_a_mirror_symmetric_rig_is_symmetric_exactly_in_all_places_and_within_errors_in_some():
+def test_symmetric_rig_has_symmetric_results():
     frames = simulated(world(), num_frames=32)
     every = probed(frames, [0], positions_per_region=ALL)
     assert numbers(every, LEFT)[0].value == numbers(every, RIGHT)[0].value
@@ -93,7 +93,7 @@ def test_a_mirror_symmetric_rig_is_symmetric_exactly_in_all_places_and_within_er
         assert abs(one.value - numbers(every, LEFT)[0].value) < 4 * one.error
 
 
-def test_parts_and_other_processes_add_up_to_the_whole(tmp_path):
+def test_merged_parts_equal_the_whole(tmp_path):
     path = drive(tmp_path, (0, 0, 0, 0), (2, 20, 0, 0))
     frames = simulated(
         world(ego={"shape": {"type": "box", "size_m": [4, 2, 1]}, "trajectory": str(path)}), num_frames=20
@@ -114,7 +114,7 @@ def test_parts_and_other_processes_add_up_to_the_whole(tmp_path):
         other.merge_state(whole)
 
 
-def test_where_nothing_is_free_the_number_is_unknown_with_a_count():
+def test_numbers_are_nan_without_free_positions():
     probes = probed(simulated(world(BLOCK), num_frames=8), body="child", positions_per_region=3)
     left, right = probes.get_target_sums("small").summarize()[LEFT:]
     assert (left.num_cells, left.observed_cells, left.visible_m2) == (24, 0, pytest.approx(np.nan, nan_ok=True))
@@ -122,7 +122,7 @@ def test_where_nothing_is_free_the_number_is_unknown_with_a_count():
     assert 0 < right.observed_cells == next(iter(right.numbers.values())).count
 
 
-def test_rays_that_were_cast_for_the_clouds_end_where_they_are_cast_again(tmp_path, monkeypatch):
+def test_reused_ray_ends_equal_new_ones(tmp_path, monkeypatch):
     path = drive(tmp_path, (0, 0, 0, 0), (2, 20, 0, 0))
     ego = {"shape": {"type": "box", "size_m": [4, 2, 1]}, "trajectory": str(path)}
     frames = simulated(world(WALL, ego=ego), rigs=rig(lidar(mount={"z_m": 1.1})))

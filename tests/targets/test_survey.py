@@ -38,7 +38,7 @@ def with_target(scenario, name, x_m, y_m, yaw_rad):
 
 
 @pytest.mark.parametrize(("name", "heading"), [("child", "narrow"), ("dog", "wide"), ("pole", 30.0)])
-def test_points_are_those_of_a_simulation_with_the_target_in_the_world(name, heading):
+def test_points_equal_a_simulation_with_the_target(name, heading):
     target, scenario = Target.load(name), world(WALL)
     sensors = rig(lidar(), lidar("corner", mount={"x_m": 2.1, "y_m": 1.1, "z_m": 0.6, "yaw_deg": 45}), CAMERA)
     seen = measure_target_visibility(sensors, scenario, target, RASTER, heading=heading)
@@ -62,7 +62,7 @@ def test_points_are_those_of_a_simulation_with_the_target_in_the_world(name, hea
 
 
 @pytest.mark.parametrize("name", ["adult", "dog"])
-def test_a_radars_points_are_those_of_its_cells_with_the_target_in_the_world(name):
+def test_radar_points_equal_a_simulation_with_the_target(name):
     """Rays of a cell that pass the target hit the floor and a wall behind it, and one point is left of all of them."""
     target, sensors = Target.load(name), rig(RADAR)
     behind = {"name": "w", "shape": {"type": "box", "size_m": [0.2, 8, 3]}, "poses": [{"x_m": 5.4}]}
@@ -81,7 +81,7 @@ def test_a_radars_points_are_those_of_its_cells_with_the_target_in_the_world(nam
     assert 0 < max(counts) < np.nanmax(rays.points) / 3
 
 
-def test_a_radars_cell_gives_its_point_to_what_fills_it():
+def test_radar_cells_measure_the_body_that_fills_them():
     """A post before a wide wall in the same cell is lost in it; with the wall out of the cell, it is seen."""
     cell = {"horizontal_fov_deg": 20, "azimuth_cell_deg": 20, "vertical_fov_deg": [0, 10]}
     cell |= {"range_cell_m": 2.0, "ray_spacing_m": 0.05}
@@ -96,7 +96,7 @@ def test_a_radars_cell_gives_its_point_to_what_fills_it():
     assert (merged.points[0, 0], apart.points[0, 0]) == (0, 1)
 
 
-def test_points_are_the_mean_over_the_steps_of_a_world_that_moves(tmp_path):
+def test_points_are_averaged_over_frames_of_moving_scenes(tmp_path):
     """The ego drives past a wall that hides the target at first, and another car drives through the places."""
     ego = {**EGO, "trajectory": drive(tmp_path, (0, 0, 0, 0), (1, 4, 0, 0))}
     passing = {
@@ -121,7 +121,7 @@ def test_points_are_the_mean_over_the_steps_of_a_world_that_moves(tmp_path):
     assert (seen.state[8] == FREE).all()
 
 
-def test_a_place_does_not_depend_on_the_raster_the_chunks_or_the_threads(monkeypatch):
+def test_positions_are_independent_of_raster_chunks_and_threads(monkeypatch):
     target, sensors = Target.load("dog"), rig(lidar(dropout=0.2, range_noise_m=0.05))
     whole = measure_target_visibility(sensors, world(WALL), target, RASTER, num_frames=2, seed=3)
     part = measure_target_visibility(
@@ -146,7 +146,7 @@ def test_a_place_does_not_depend_on_the_raster_the_chunks_or_the_threads(monkeyp
     np.testing.assert_array_equal(again.surface_share, whole.surface_share)
 
 
-def test_rays_that_drop_out_are_missing_and_noise_moves_points_only():
+def test_drop_out_removes_points_and_noise_moves_them():
     target, raster = Target.load("adult"), Raster((2.0, 6.0), (-2.0, 2.0), 1.0)
     exact = measure_target_visibility(rig(), world(), target, raster).points.sum()
     noisy = measure_target_visibility(
@@ -164,7 +164,7 @@ def test_rays_that_drop_out_are_missing_and_noise_moves_points_only():
     assert measure_target_visibility(rig(lidar(dropout=1.0)), world(), target, raster).surface_share.max() == 0.0
 
 
-def test_the_narrow_side_gets_fewer_points_than_the_wide_one():
+def test_narrow_sides_get_fewer_points():
     target = Target.load("cyclist")
     narrow, wide = (
         measure_target_visibility(rig(), world(), target, RASTER, heading=heading) for heading in ("narrow", "wide")
@@ -174,7 +174,7 @@ def test_the_narrow_side_gets_fewer_points_than_the_wide_one():
 
 
 @pytest.mark.parametrize(("heading", "yaw_deg"), [("narrow", [90, 0, 180]), ("wide", [0, -90, 90]), (17.0, [17] * 3)])
-def test_a_side_is_turned_to_the_nearest_point_of_the_vehicle(heading, yaw_deg):
+def test_targets_turn_a_side_to_the_vehicle(heading, yaw_deg):
     """Of a body that is longer than wide; the vehicle is to its left, in front of it, and behind it."""
     car, dog = BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5)), BoundingBox((-0.5, -0.1, 0.0), (0.5, 0.1, 0.7))
     places = np.array([[1.5, -3.0], [-3.0, 0.5], [4.0, 0.0]])
@@ -182,7 +182,7 @@ def test_a_side_is_turned_to_the_nearest_point_of_the_vehicle(heading, yaw_deg):
     np.testing.assert_allclose(np.cos(np.deg2rad(turned - yaw_deg)), 1.0, atol=1e-12)
 
 
-def test_what_hides_a_target_hides_its_points_and_what_stands_there_takes_its_room():
+def test_buildings_occlude_targets_and_occupy_positions():
     building = {"name": "b", "shape": {"type": "box", "size_m": [4, 4, 6]}, "poses": [{"x_m": 5.0, "y_m": 3.0}]}
     seen = measure_target_visibility(rig(), world(building), Target.load("child"), RASTER)
     names = np.array(STATES)[seen.state]
@@ -197,13 +197,13 @@ def test_what_hides_a_target_hides_its_points_and_what_stands_there_takes_its_ro
     assert (seen.free_frames == (seen.state == FREE)).all()
 
 
-def test_a_raster_within_the_vehicle_is_occupied_everywhere():
+def test_rasters_inside_the_vehicle_are_occupied():
     seen = measure_target_visibility(rig(), world(), Target.load("pole"), Raster((-1.0, 1.0), (-0.5, 0.5), 0.5))
     assert (seen.state == OCCUPIED).all()
     assert np.isnan(seen.points).all()
 
 
-def test_a_target_that_no_random_place_sees_has_an_unknown_share():
+def test_invisible_targets_have_no_surface_share():
     """A child behind a high wall all along."""
     wall = {"name": "w", "shape": {"type": "box", "size_m": [0.2, 60, 9]}, "poses": [{"x_m": 4.0}]}
     seen = measure_target_visibility(rig(), world(wall), Target.load("child"), Raster((2.5, 5.5), (0.0, 1.0), 1.0))
@@ -213,7 +213,7 @@ def test_a_target_that_no_random_place_sees_has_an_unknown_share():
     assert seen.counts["surface_share_unobserved"] == 1
 
 
-def test_the_share_is_that_of_the_surface_which_is_near_a_measured_point():
+def test_surface_share_equals_the_area_near_points():
     """One row of rays at 1 m meets a wall of 2 m: what is within 0.3 m of it, of the side that faces the vehicle."""
     mesh = Box(type="box", size_m=(0.02, 4.0, 2.0)).build_mesh()
     level = lidar(mount={"z_m": 1.0}, channels=1, vertical_fov_deg=[0, 0], columns=36000)
@@ -230,7 +230,7 @@ def test_the_share_is_that_of_the_surface_which_is_near_a_measured_point():
     assert all_of_it.surface_share[0, 0] == 1.0
 
 
-def test_the_surface_is_spread_by_area_and_leaves_out_what_is_inside():
+def test_surface_samples_represent_the_outer_area():
     """A box with another one inside it has the surface of the outer one; near agrees with distances."""
     target = Target.load("adult")
     surface = TargetSurface.from_target(target)
@@ -243,7 +243,7 @@ def test_the_surface_is_spread_by_area_and_leaves_out_what_is_inside():
     np.testing.assert_array_equal(near, distance <= 0.4)
 
 
-def test_a_target_hides_its_own_rear():
+def test_targets_occlude_their_own_rear():
     """Two plates of a square metre, one behind the other."""
     front, rear = (
         Box(type="box", size_m=(0.02, 1, 1)).build_mesh().transform(build_transform(np.eye(3), [x, 0, 0]))
@@ -257,9 +257,7 @@ def test_a_target_hides_its_own_rear():
 
 
 @pytest.mark.parametrize(("low_m", "thick_m", "hit"), [(0.7, 0.03, False), (0.08, 0.05, True), (-0.4, 0.5, True)])
-def test_a_target_keeps_the_height_of_its_file_and_what_reaches_below_the_ground_is_lifted(
-    tmp_path, low_m, thick_m, hit
-):
+def test_targets_keep_their_height_above_the_ground(tmp_path, low_m, thick_m, hit):
     """A level scan at 0.0925 m meets a bar of 0.2 m, 3 m ahead, with as many rays as its angle holds, or none."""
     shape, pose = f"{{type: box, size_m: [0.02, 0.2, {thick_m}]}}", f"{{x_m: 7.0, z_m: {low_m}}}"
     (tmp_path / "bar.yaml").write_text(f"name: bar\nparts: [{{name: b, shape: {shape}, poses: [{pose}]}}]\n")

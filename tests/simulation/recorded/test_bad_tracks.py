@@ -48,14 +48,14 @@ def table(tmp_path):
     return folder / "boxes.csv", {"ego_trajectory": str(folder / "ego.csv")}
 
 
-def test_paths_that_are_no_recording(tmp_path):
+def test_paths_without_recordings_are_refused(tmp_path):
     fails(scenario(tmp_path / "none"), "none: no such file or folder; recorded tracks are needed", FileNotFoundError)
     fails(scenario(tmp_path), "recorded tracks are .* a log of Argoverse 2 .*; a table of boxes")
     (tmp_path / "a.txt").write_text("x")
     fails(scenario(tmp_path / "a.txt"), r"a\.txt: recorded tracks are")
 
 
-def test_recordings_without_objects_over_time(tmp_path):
+def test_recordings_without_tracks_are_refused(tmp_path):
     drive = Drive()
     log = kitti_raw(drive, tmp_path / "kitti")
     fails(scenario(log, scene="a"), "scene: applies to tables of nuScenes only")
@@ -69,7 +69,7 @@ def test_recordings_without_objects_over_time(tmp_path):
     fails(scenario(folder), rf"{folder}: the vehicle has no poses with times", BadFileError)
 
 
-def test_an_ego_that_is_not_there(tmp_path, table):
+def test_absent_egos_are_refused(tmp_path, table):
     path, keys = table
     fails(scenario(path), "ego_id: the recording has no ego vehicle; name one of its tracks: 'a1', 'a2'")
     fails(scenario(path, ego_id="a11"), "ego_id: there is no 'a11' in the recording; it has 'a1'")
@@ -79,7 +79,7 @@ def test_an_ego_that_is_not_there(tmp_path, table):
     fails(scenario(log, ego_id=7), "there is no '7' in the recording")
 
 
-def test_an_ego_that_leaves_or_jumps(tmp_path, table):
+def test_egos_that_leave_or_jump_are_refused(tmp_path, table):
     path, keys = table
     fails(scenario(path, ego_id="a8", duration_s=4.0), r"'a8' and the others are known for 2\.8 s; begin_s 0 and")
     assert scenario(path, ego_id="a8").num_time_steps == 29
@@ -95,7 +95,7 @@ def test_an_ego_that_leaves_or_jumps(tmp_path, table):
     fails(scenario(path, ego_id="a1"), "or jumps. It is there from 0 to 1.8 s, 2 to 2 s, 2.2 to 4 s")
 
 
-def test_an_ego_and_others_at_different_times(table):
+def test_egos_and_tracks_at_different_times_are_refused(table):
     path, keys = table
     path.write_text(re.sub(r"(?m)^(\d\.\d),", r"10\1,", path.read_text()))
     fails(scenario(path, **keys), "the ego 'ego.csv' is there from 0 to 4 s, the others from 100 to 104 s")
@@ -111,7 +111,7 @@ def test_an_ego_and_others_at_different_times(table):
         ("category", "kind", "missing: category"),
     ],
 )
-def test_tables_of_boxes(table, old, new, message):
+def test_invalid_box_tables_are_refused(table, old, new, message):
     path, keys = table
     with pytest.raises(BadFileError, match=message) as caught:
         scenario(replaced(path, old, new), **keys).build_scene()
@@ -132,12 +132,12 @@ def test_tables_of_boxes(table, old, new, message):
         ("<commonRoad", '<!DOCTYPE a [<!ENTITY b "c">]><commonRoad', "without entities"),
     ],
 )
-def test_scenarios_of_commonroad(tmp_path, old, new, message):
+def test_invalid_commonroad_scenarios_are_refused(tmp_path, old, new, message):
     path = replaced(write_commonroad(tmp_path / "a.xml"), old, new)
     fails(scenario(path), rf"a\.xml: .*{message}", BadFileError)
 
 
-def test_shapes_of_commonroad(tmp_path):
+def test_commonroad_polygons_become_boxes(tmp_path):
     box = "<rectangle><length>4.5</length><width>1.8</width></rectangle>"
     corners = "".join(f"<point><x>{x}</x><y>{y}</y></point>" for x, y in ((0, -1), (4, -1), (4, 1), (0, 1)))
     path = replaced(write_commonroad(tmp_path / "a.xml"), box, f"<polygon>{corners}</polygon>")
@@ -168,7 +168,7 @@ RECTANGLE = "<rectangle><length>4.5</length><width>1.8</width>{}</rectangle>"
         ),
     ],
 )
-def test_shapes_of_commonroad_have_centers_and_turns(tmp_path, shapes, size_m, middle_m, turn_deg):
+def test_commonroad_shapes_have_centers_and_orientations(tmp_path, shapes, size_m, middle_m, turn_deg):
     path = write_commonroad(tmp_path / "a.xml")
     before = read_objects(path).tracks[0].trajectory
     replaced(path, RECTANGLE.format(""), shapes)
@@ -187,7 +187,7 @@ def test_shapes_of_commonroad_have_centers_and_turns(tmp_path, shapes, size_m, m
     np.testing.assert_allclose(track.trajectory.angles_deg[0, 0] - yaw_deg, turn_deg, atol=1e-3)
 
 
-def test_commonroad_scenarios_report_what_is_left_out_and_drop_a_repeated_initial_state(tmp_path):
+def test_commonroad_exclusions_are_reported(tmp_path):
     path = write_commonroad(tmp_path / "a.xml")
     before = read_objects(path).tracks[0].trajectory
     text = path.read_text()
@@ -201,7 +201,7 @@ def test_commonroad_scenarios_report_what_is_left_out_and_drop_a_repeated_initia
     np.testing.assert_array_equal(after.positions_m, before.positions_m)
 
 
-def test_tables_of_nuscenes(tmp_path):
+def test_invalid_nuscenes_tables_are_refused(tmp_path):
     folder = write_nuscenes(tmp_path)
     annotations = folder / "sample_annotation.json"
     good = json.loads(annotations.read_text())
@@ -243,13 +243,13 @@ def feather(path, **columns):
         ("timestamp_ns", lambda times: [times[0]] * len(times), "id a1: .*must ascend"),
     ],
 )
-def test_logs_of_argoverse(tmp_path, column, change, message):
+def test_invalid_argoverse_logs_are_refused(tmp_path, column, change, message):
     log = write_argoverse2(tmp_path)
     feather(log / "annotations.feather", **{column: change})
     fails(scenario(log), message, BadFileError)
 
 
-def test_logs_that_lack_something(tmp_path, monkeypatch):
+def test_incomplete_logs_are_refused(tmp_path, monkeypatch):
     log = write_argoverse2(tmp_path, (*OTHERS, EGO._replace(category="ego_vehicle")))
     (log / "annotations.feather").rename(log / "annotations_with_ego.feather")
     assert "ego" not in [actor.name for actor in scenario(log).build_scene().actors]
@@ -267,7 +267,7 @@ def lack_pyarrow(monkeypatch):
     monkeypatch.setattr(isolated, "PROGRAM", f"import sys; sys.modules['pyarrow'] = None; {isolated.PROGRAM}")
 
 
-def test_a_missing_package_is_one_line_of_the_command_line(monkeypatch, capsys):
+def test_missing_packages_are_reported_in_one_line(monkeypatch, capsys):
     lack_pyarrow(monkeypatch)
     monkeypatch.setattr(sys, "argv", ["torchcover", "evaluate", "front_roof_32", "--scenario", "tracks_argoverse2"])
     with pytest.raises(SystemExit) as ended:
@@ -277,7 +277,7 @@ def test_a_missing_package_is_one_line_of_the_command_line(monkeypatch, capsys):
     assert "pip install 'torchcover[av2]'" in line
 
 
-def test_ground_that_is_far_from_the_tracks_gets_a_hint(tmp_path, table):
+def test_distant_ground_causes_a_hint(tmp_path, table):
     path, keys = table
     plate = trimesh.creation.box((900.0, 900.0, 2.0))
     for height_m, hinted in ((29.0, False), (12.0, True)):
@@ -299,7 +299,7 @@ def test_ground_that_is_far_from_the_tracks_gets_a_hint(tmp_path, table):
     Simulator(scenario(path, **keys), {"rig": RIG}, FEW).check_run(8)
 
 
-def test_true_poses_over_a_plane_get_the_hint_too(tmp_path):
+def test_true_poses_above_a_plane_cause_the_hint(tmp_path):
     folder = write_csv(tmp_path)
     given = Scenario.model_validate(
         {

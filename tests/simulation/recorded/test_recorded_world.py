@@ -71,7 +71,7 @@ def made(request, drive):
     return recording, told, Scenario.load(drive / request.param / "scenario.yaml").build_scene()
 
 
-def test_the_ground_is_where_it_was(made):
+def test_ground_matches_the_simulated_slope(made):
     recording, _, world = made
     ground, low_m = SceneGeometry(world).ground, np.array([[0.0, -3.0, 0.0], [30.0, -6.0, 0.0]])
     ground_m = low_m + UPHILL * low_m[:, :1] * np.array([0.0, 0.0, 1.0])
@@ -81,7 +81,7 @@ def test_the_ground_is_where_it_was(made):
     )
 
 
-def test_the_wall_stands_and_nothing_stands_where_anything_drives(made):
+def test_walls_are_static_and_driven_areas_free(made):
     recording, _, world = made
     first_m = recording.get_world_T_vehicle(0)[:3, 3]
     corners_m = world.static_meshes[1].vertices_m + first_m - world.ego.trajectory.positions_m[0]
@@ -92,7 +92,7 @@ def test_the_wall_stands_and_nothing_stands_where_anything_drives(made):
     assert apart_m.max() < 1.75 * CELL_M  # to a corner of a cell
 
 
-def test_who_moves_is_on_its_track(made):
+def test_moving_objects_follow_their_tracks(made):
     recording, told, world = made
     assert "1 moving objects" in told
     (car,) = world.actors
@@ -106,7 +106,7 @@ def test_who_moves_is_on_its_track(made):
     assert (np.abs(np.ptp(car.mesh.vertices_m, axis=0) - [5.0, 2.0, 2.2]) < [1.0, 0.5, 0.5]).all()
 
 
-def test_the_vehicle_drives_as_it_did(made):
+def test_ego_vehicle_follows_its_recorded_path(made):
     recording, _, world = made
     assert world.num_time_steps == len(recording.frame_names)
     moved = recording.get_world_T_vehicle(7)[:3, 3] - recording.get_world_T_vehicle(0)[:3, 3]
@@ -118,7 +118,7 @@ def test_fewer_frames_make_a_shorter_world(drive):
     assert Scenario.load(drive / "short" / "scenario.yaml").build_scene().num_time_steps == 6
 
 
-def test_sides_of_cells_are_closed_and_as_large_as_those_of_the_block():
+def test_cell_mesh_is_closed_with_correct_volume():
     cells = np.argwhere(np.ones((3, 4, 5), dtype=bool)) - [1, 2, 3]
     mesh, block = build_cell_mesh(cells), Box(type="box", size_m=(3, 4, 5)).build_mesh()
     assert len(np.unique(mesh.vertices_m, axis=0)) == len(mesh.vertices_m)
@@ -134,7 +134,7 @@ def test_sides_of_cells_are_closed_and_as_large_as_those_of_the_block():
     np.testing.assert_allclose(own, whole)  # a volume that is positive: its sides look outwards
 
 
-def test_what_no_world_can_be_made_of_is_told():
+def test_unusable_drives_are_refused():
     alone = Drive(steps=8)
     with pytest.raises(ValueError, match="no ground is observed around the vehicle"):
         write_scenario(alone, alone.path)

@@ -76,7 +76,7 @@ def opened(written, kind):
 
 
 @pytest.mark.parametrize("kind", FORMATS)
-def test_everybody_is_where_a_slow_twin_says_at_instants_and_between(written, kind):
+def test_actor_poses_equal_a_reference_implementation(written, kind):
     drive, heights, recorded_s, atol = opened(written, kind)
     world = drive.build_scene()
     ego = OTHERS[0] if kind == "commonroad" else EGO
@@ -102,7 +102,7 @@ def test_everybody_is_where_a_slow_twin_says_at_instants_and_between(written, ki
 
 
 @pytest.mark.parametrize("kind", FORMATS)
-def test_a_run_is_as_long_as_the_recording_and_then_the_same_again(written, kind):
+def test_runs_repeat_after_the_end_of_the_recording(written, kind):
     drive, *_ = opened(written, kind)
     assert drive.is_repeating
     assert (drive.num_time_steps, drive.num_distinct_time_steps) == (41, 41)
@@ -114,7 +114,7 @@ def test_a_run_is_as_long_as_the_recording_and_then_the_same_again(written, kind
     assert round(compute_frame_interval_s(drive, None) / 0.1) == 25  # the golden share of its instants
 
 
-def test_an_instant_that_is_seen_again_is_counted_and_seen_as_before(written):
+def test_repeated_frames_are_counted_and_equal(written):
     drive, *_ = opened(written, "table")
     simulator = Simulator(drive, {"rig": RIG}, FEW)
     first, again = simulator.simulate_frame(3), simulator.simulate_frame(3 + 41)
@@ -123,7 +123,7 @@ def test_an_instant_that_is_seen_again_is_counted_and_seen_as_before(written):
     assert not np.array_equal(first.reference, again.reference)
 
 
-def test_nothing_is_drawn(written):
+def test_recorded_scenes_do_not_depend_on_seeds(written):
     drive, *_ = opened(written, "argoverse2")
     again, *_ = opened(written, "argoverse2")
     one, other = drive.build_scene(seed=1), again.build_scene(seed=2, run_index=5)
@@ -151,7 +151,7 @@ def off_ground_m(world, others, heights=hill_m):
     return heights_of(world.static_meshes[0], places_m[:, :2]) - places_m[:, 2]
 
 
-def test_the_ground_is_below_the_tracks_within_centimetres(written):
+def test_ground_lies_below_tracks_within_centimeters(written):
     world = opened(written, "argoverse2")[0].build_scene()
     assert np.abs(off_ground_m(world, [EGO])).max() < 0.03
     # Of things, nobody knows whether they stand or hang; Argoverse's bicycles are without a rider.
@@ -161,7 +161,7 @@ def test_the_ground_is_below_the_tracks_within_centimetres(written):
 
 
 @pytest.mark.parametrize("kind", ["table", "argoverse2"])
-def test_wheels_stand_on_slopes_whether_or_not_tilts_were_recorded(written, kind):
+def test_wheels_stand_on_slopes(written, kind):
     world = opened(written, kind)[0].build_scene()
     for actor in world.actors:
         if actor.category not in ("car", "truck", "bus"):
@@ -177,7 +177,7 @@ def test_wheels_stand_on_slopes_whether_or_not_tilts_were_recorded(written, kind
     assert kind != "table" or not any(person.trajectory.angles_deg[:, 1:].any() for person in people)
 
 
-def test_the_ground_goes_on_beyond_the_tracks(written):
+def test_ground_extends_beyond_tracks(written):
     world = opened(written, "argoverse2")[0].build_scene()
     vertices_m = world.static_meshes[0].vertices_m
     assert np.isfinite(vertices_m).all()
@@ -185,7 +185,7 @@ def test_the_ground_goes_on_beyond_the_tracks(written):
     assert (np.abs(vertices_m[:, 2] - 31.0) < 8.0).all()
 
 
-def test_a_few_boxes_that_are_wrong_do_not_lift_the_ground(tmp_path):
+def test_outliers_do_not_lift_the_ground(tmp_path):
     drive = drive_of(write_csv(tmp_path))
     rewrite(tmp_path / "boxes.csv", lambda row: raised(row, 3.0, "a5", "a8"))
     good = [EGO, *(one for one in OTHERS if one.name in ("a1", "a2", "a3", "a4", "a6", "a7"))]
@@ -208,11 +208,11 @@ def test_large_coordinates_change_nothing(tmp_path):
         np.testing.assert_allclose(cloud, seen[0], atol=2e-4)
 
 
-def test_where_nothing_has_a_height_the_ground_is_two_triangles(written):
+def test_flat_recordings_have_flat_ground(written):
     assert len(opened(written, "commonroad")[0].build_scene().static_meshes[0].faces) == 2
 
 
-def test_bodies_have_the_sizes_of_the_boxes(written):
+def test_bodies_are_scaled_to_boxes(written):
     for kind, of_category in (("argoverse2", {"car", "truck", "bus", "pedestrian"}), ("nuscenes", {"cyclist"})):
         world = opened(written, kind)[0].build_scene()
         for one in OTHERS:
@@ -225,13 +225,13 @@ def test_bodies_have_the_sizes_of_the_boxes(written):
     assert (of(world, "a9").category, len(of(world, "a9").mesh.faces)) == ("movable_object.barrier", 12)
 
 
-def test_a_body_without_a_recorded_height_has_its_own(written):
+def test_bodies_without_recorded_height_keep_theirs(written):
     world = opened(written, "commonroad")[0].build_scene()
     size_m = BoundingBox.from_points(of(world, "3").mesh.vertices_m).size_m
     np.testing.assert_allclose(size_m, (9.5, 2.5, 1.07 * 3.45))  # of the lorry whose length is nearest
 
 
-def test_another_track_may_be_the_ego_and_then_the_recordings_own_is_one_of_the_others(written):
+def test_any_track_can_be_the_ego(written):
     world = scenario(written / "argoverse2", ego_id="a1").build_scene()
     np.testing.assert_allclose(
         world.ego.trajectory.interpolate(1.0), poses(OTHERS[0], times_s=np.array([1.0]))[0], atol=2e-4
@@ -242,7 +242,7 @@ def test_another_track_may_be_the_ego_and_then_the_recordings_own_is_one_of_the_
     assert "a1" not in [actor.name for actor in world.actors]
 
 
-def test_the_frame_of_the_ego_may_be_given(written):
+def test_ego_frame_can_be_set(written):
     known = scenario(written / "argoverse2").build_scene().ego.trajectory.interpolate(1.0)
     given = (
         scenario(written / "argoverse2", ego_T_vehicle={"x_m": 0.339, "z_m": -0.3})
@@ -252,7 +252,7 @@ def test_the_frame_of_the_ego_may_be_given(written):
     np.testing.assert_allclose(given, known @ build_transform(np.eye(3), [-1.0, 0.0, 0.0]), atol=1e-9)
 
 
-def test_the_start_of_a_planning_problem_is_one_instant_unless_a_time_is_given(written):
+def test_planning_problem_is_one_frame_without_a_duration(written):
     start = scenario(written / "commonroad.xml")
     assert (start.num_time_steps, start.num_distinct_time_steps) == (1, 1)
     np.testing.assert_allclose(start.build_scene().ego.trajectory.interpolate(0.0)[:2, 3], ORIGIN_M)
@@ -263,7 +263,7 @@ def test_the_start_of_a_planning_problem_is_one_instant_unless_a_time_is_given(w
     assert len(Simulator(standing, {"rig": RIG}, FEW).simulate_frame(3).clouds["rig"]) > 200
 
 
-def test_who_was_not_seen_for_too_long_was_not_there(tmp_path):
+def test_objects_are_absent_during_long_gaps(tmp_path):
     gap = (Somebody("a1", "car", (4.5, 1.8, 1.5), (24.0, 0.0), 0.0, 9.0), *OTHERS[1:])
     folder = write_csv(tmp_path, gap)
     rewrite(folder / "boxes.csv", lambda row: None if row[1] == "a1" and 1.1 < float(row[0]) < 2.5 else row)
@@ -276,18 +276,20 @@ def test_who_was_not_seen_for_too_long_was_not_there(tmp_path):
     ).all()
 
 
-def test_who_is_where_the_ego_is_is_left_out_and_named(tmp_path):
+def test_objects_that_overlap_the_ego_are_removed(tmp_path):
     inside = Somebody("inside", "car", (4.0, 1.8, 1.5), (10.0, 0.5), 0.0)
     above = Somebody("sign", "sign", (4.0, 1.8, 0.5), (20.0, 0.0), 0.0)
     folder = write_csv(tmp_path, (*OTHERS, inside, above))
     rewrite(folder / "boxes.csv", lambda row: raised(row, 5.0, "sign"))
-    with pytest.warns(UserWarning, match=r"boxes.csv: 1 of 11 tracks overlap the ego vehicle at some time \('inside'\)"):
+    with pytest.warns(
+        UserWarning, match=r"boxes.csv: 1 of 11 tracks overlap the ego vehicle at some time \('inside'\)"
+    ):
         names = [actor.name for actor in drive_of(folder).build_scene().actors]
     assert "inside" not in names
     assert "sign" in names
 
 
-def test_who_is_seen_at_an_instant_is_there_whatever_is_subtracted_of_the_times(written):
+def test_time_offsets_do_not_remove_objects(written):
     for begin_s in (0.2, 0.6, 1.4):
         drive, *_ = opened(written, "table")
         world = Scenario.model_validate(
@@ -305,7 +307,7 @@ def test_who_is_seen_at_an_instant_is_there_whatever_is_subtracted_of_the_times(
 @pytest.mark.parametrize(
     ("layout", "name", "faces"), [("kitti_raw", "0", 13), ("carla", "17", 13), ("folder", "car", 12)]
 )
-def test_whatever_recording_has_boxes_plays_as_traffic(tmp_path, layout, name, faces):
+def test_recordings_with_boxes_become_traffic(tmp_path, layout, name, faces):
     recorded = Drive()
     drive = scenario(LAYOUTS[layout](recorded, tmp_path))
     world = drive.build_scene()
@@ -321,7 +323,7 @@ def test_whatever_recording_has_boxes_plays_as_traffic(tmp_path, layout, name, f
     assert len(Simulator(drive, {"rig": RIG}, FEW).simulate_frame(2).clouds["rig"]) > 100
 
 
-def test_the_vehicle_of_a_recording_is_one_of_the_others_if_another_is_the_ego(tmp_path):
+def test_recorded_ego_becomes_an_actor_of_another_ego(tmp_path):
     world = scenario(LAYOUTS["kitti_raw"](Drive(), tmp_path), ego_id="0").build_scene()
     (own,) = world.actors
     assert own.name == "ego"
@@ -339,7 +341,7 @@ def test_one_scene_of_several_is_shown(tmp_path):
         scenario(tmp_path, scene="third").build_scene()
 
 
-def test_what_a_run_means_depends_on_what_is_in_the_files(tmp_path):
+def test_fingerprint_depends_on_file_contents(tmp_path):
     folder = write_argoverse2(tmp_path / "log")
     before = scenario(folder).collect_content()
     assert before == scenario(write_argoverse2(tmp_path / "copy")).collect_content()
@@ -355,7 +357,7 @@ def test_what_a_run_means_depends_on_what_is_in_the_files(tmp_path):
     assert before != scenario(tmp_path / "copy", begin_s=1.0).collect_content()
 
 
-def test_the_built_in_ones_are_those_that_are_written_here(written):
+def test_built_in_tracks_equal_the_written_files(written):
     built_in = get_builtin_folder("scenarios") / "tracks"
     for path in written.rglob("*.*"):
         if path.suffix in (".csv", ".json", ".xml"):
@@ -367,7 +369,7 @@ def test_the_built_in_ones_are_those_that_are_written_here(written):
             Simulator(drive, {"rig": RIG}, FEW).check_run(4)
 
 
-def test_what_was_not_recorded_is_drawn_if_asked_for_and_stands_where_nobody_was(written):
+def test_sampled_scenery_avoids_recorded_tracks(written):
     path = written / "argoverse2"
     bare, drawn = scenario(path).build_scene(0), scenario(path, built_share=1.0).build_scene(0)
     assert len(bare.static_meshes) == 1
@@ -390,6 +392,6 @@ def test_what_was_not_recorded_is_drawn_if_asked_for_and_stands_where_nobody_was
 @pytest.mark.parametrize(
     "keys", [{"roadside_density": 2.0}, {"built_share": 1.0, "ground": "road.ply"}, {"built_share": 2.0}]
 )
-def test_what_is_drawn_beside_tracks_is_said_as_a_whole(keys, written):
+def test_scenery_options_are_checked_together(keys, written):
     with pytest.raises(ValueError, match="built_share"):
         scenario(written / "argoverse2", **keys)
