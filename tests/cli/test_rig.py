@@ -15,7 +15,7 @@ def test_rig_of_a_simulated_recording_is_recovered(torchcover, scenes, tmp_path)
     rig_file.write_text(printed)
     rig, true = Rig.load(rig_file), Rig.load(scenes / "both.yaml")
     assert rig.name == "recording"
-    assert "7 rows (those that returned anything), 30 columns" in rig.description
+    assert "7 rows (with returns), 30 columns" in rig.description
     for lidar, of in zip(rig.sensors, true.sensors, strict=True):
         # Behind the vehicle there is nothing that a level ray hits.
         returned_deg = np.sort(of.compute_elevations_deg())[::-1][of.name == "rear" :]

@@ -74,7 +74,7 @@ def test_figures_and_recordings_use_the_vehicle(torchcover, free, monkeypatch):
         dropped.append(summary["frame_counts"]["sensor_ego_vehicle"])
     assert dropped[1] > 100 > dropped[0] == 0
     code, _, error = torchcover("evaluate", "--frames", free / "drive", "--vehicle", "1,2,3", "--out", free / "out")
-    assert (code, "x0,x1,y0,y1,z0,z1 in metres are needed" in error) == (2, True)
+    assert (code, "x0,x1,y0,y1,z0,z1 in meters are needed" in error) == (2, True)
 
 
 class Blank:

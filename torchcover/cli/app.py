@@ -168,8 +168,7 @@ def _make_signal_callback() -> Callable[[Sequence[int]], None]:
 def _explain_user_error(error: BaseException) -> str | None:
     """Explain an error of the user or of his installation; None for an internal error."""
     if isinstance(error, USAGE_ERROR):
-        # `str(error)` lacks the name of the option; pydantic adds the kind of its exception.
-        return str(error.format_message()).replace("Value error, ", "")  # type: ignore[attr-defined]
+        return _explain_usage_error(error)
     if isinstance(error, ValueError | TypeError | OSError):
         return str(error)
     if isinstance(error, ImportError) and "pip install" in str(error):  # a missing extra
@@ -182,6 +181,17 @@ def _explain_user_error(error: BaseException) -> str | None:
     if isinstance(error, OverflowError | RecursionError):
         return f"a number is too large, or a file is nested too deeply ({error})"
     return None
+
+
+def _explain_usage_error(error: Exception) -> str:
+    """Explain an error in options and arguments."""
+    cause: Any = error.__cause__
+    if not hasattr(cause, "errors"):
+        return str(error.format_message())  # type: ignore[attr-defined]  # `str(error)` lacks the name of the option
+    from torchcover.files import explain_validation_error
+
+    # Typer validates values with pydantic, whose own messages name neither the option nor the value.
+    return f"{error.param.opts[0]}: {explain_validation_error(cause)[0]}"  # type: ignore[attr-defined]
 
 
 @app.callback(invoke_without_command=True)

@@ -164,9 +164,9 @@ def open_frames(
         ValueError: Settings of a recording without one, or as in `open_recording`.
     """
     if frames is None:
-        given = [f"recording.{name}" for name in recording_settings.model_fields_set]
-        if sensors or given:
-            raise ValueError(f"{', '.join(given) or '--sensors'}: only for a recording, which --frames names")
+        names = [f"recording.{name}" for name in recording_settings.model_fields_set]
+        if sensors or names:
+            raise ValueError(f"{', '.join(names) or '--sensors'}: only for a recording, which --frames names")
         return None
     from rich.markup import escape
 

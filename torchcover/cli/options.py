@@ -61,8 +61,8 @@ def with_options(parameters: Sequence[inspect.Parameter]) -> Callable[[Command],
             """Call the command without options that have no value."""
             command(**{name: value for name, value in values.items() if name not in added or value is not None})
 
-        own = [item for item in get_parameters(command) if item.kind is not inspect.Parameter.VAR_KEYWORD]
-        keywords = [item.replace(kind=inspect.Parameter.KEYWORD_ONLY) for item in (*own, *parameters)]
+        declared = [item for item in get_parameters(command) if item.kind is not inspect.Parameter.VAR_KEYWORD]
+        keywords = [item.replace(kind=inspect.Parameter.KEYWORD_ONLY) for item in (*declared, *parameters)]
         all_parameters = sorted(keywords, key=_assign_group)
         update_wrapper(call_with_values, command)
         # Typer reads both attributes.

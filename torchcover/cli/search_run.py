@@ -83,10 +83,10 @@ def _select(path: Path, out: Path, *, resume: bool, **settings: Any) -> Selectio
         "--num-evaluations": settings["num_evaluations"] is not None,
         "--resume": resume,
     }
-    given = [option for option, is_given in unused.items() if is_given]
-    if given:
+    useless = [option for option, has_value in unused.items() if has_value]
+    if useless:
         raise ValueError(
-            f"{', '.join(given)}: has no effect, because all {SELECTION_KEY} of this file are evaluated; omit it"
+            f"{', '.join(useless)}: has no effect, because all {SELECTION_KEY} of this file are evaluated; omit it"
         )
     space, plan = SelectionSpace.load(path), SearchPlan(**settings | {"budget_s": math.inf})
     with make_common_frames(space, plan, plan.seed, plan.num_scenes) as frames:

@@ -191,6 +191,6 @@ def _find_kind(name: str) -> str:
 
 def _reject_options(kind: str, values: dict[str, Any], reason: str) -> None:
     """Reject options that have a value but apply to another kind of item."""
-    given = [option for option, value in values.items() if value is not None]
-    if given:
-        raise ValueError(f"{', '.join(given)}: for {kind} only, and {reason}")
+    wrong = [option for option, value in values.items() if value is not None]
+    if wrong:
+        raise ValueError(f"{', '.join(wrong)}: for {kind} only, and {reason}")

@@ -190,10 +190,11 @@ def describe_differences(current: Mapping[str, str], saved: Mapping[str, str]) -
     """
     differences = []
     for name in sorted(current.keys() | saved.keys()):
-        here, there = current.get(name, "none"), saved.get(name, "none")
-        if here != there:
-            is_hash = here.startswith("#") or there.startswith("#")
-            differences.append(f"{name} (other content)" if is_hash else f"{name} ({there} there, {here} here)")
+        current_value, saved_value = current.get(name, "none"), saved.get(name, "none")
+        if current_value != saved_value:
+            is_hash = current_value.startswith("#") or saved_value.startswith("#")
+            change = "other content" if is_hash else f"{saved_value} there, {current_value} here"
+            differences.append(f"{name} ({change})")
     return ", ".join(differences)
 
 

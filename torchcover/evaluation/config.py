@@ -19,7 +19,7 @@ Names = tuple[str, ...]
 
 
 class EvaluateConfig(BaseModel):
-    """All settings of a run that a file can contain; settings without a value are derived from the others."""
+    """Settings of a run that a file can contain; settings without a value are derived from the others."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 

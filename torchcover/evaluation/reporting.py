@@ -248,22 +248,22 @@ def report(
     ego = task.frames.scenario.ego
     assert ego is not None  # every simulation task has an ego vehicle
     ground = build_flat_ground().model_copy(update={"ego": ActorDescription(shape=ego.shape)})
-    num_steps = len(named_rigs) + (encounters is not None) + (requirements is not None) + num_frames
-    with Progress(num_steps, "report", is_shown=show_progress) as bar:
+    bar_total = len(named_rigs) + (encounters is not None) + (requirements is not None) + num_frames
+    with Progress(bar_total, "report", is_shown=show_progress) as bar:
         target_maps = {}
         for rig in named_rigs:
             target_maps[rig.name] = map_target_visibility(
                 rig, loaded_target, ground, sensor_model=sensor_model, seed=seed
             )
-            bar.advance(num_steps)
+            bar.advance(bar_total)
         encounter_results = check_result = None
         if encounters is not None:
             encounter_results = evaluate_encounters(named_rigs, encounters, seed=seed, **vehicle_and_model)
-            bar.advance(num_steps)
+            bar.advance(bar_total)
         if requirements is not None:
             check_result = check(named_rigs, requirements, seed=seed, num_workers=num_workers, **vehicle_and_model)
-            bar.advance(num_steps)
-        result = measure_coverage(task, settings, _BudgetRule(bar, num_steps, start_s + budget_s))
+            bar.advance(bar_total)
+        result = measure_coverage(task, settings, _BudgetRule(bar, bar_total, start_s + budget_s))
     return Report(result, target_maps, num_frames, encounter_results, check_result)
 
 
@@ -273,19 +273,19 @@ class _BudgetRule:
 
     Args:
         bar: Progress bar.
-        num_steps: Total number of its steps.
+        bar_total: Its total: frames and other evaluations.
         end_s: End of the budget on the monotonic clock.
         progress_text: Text of the rule for other progress bars.
     """
 
     bar: Progress
-    num_steps: int
+    bar_total: int
     end_s: float
     progress_text: str = ""
 
     def is_reached(self, num_frames: int) -> bool:
         """Return True if the budget is used up and the numbers have confidence intervals."""
-        self.bar.advance(self.num_steps)
+        self.bar.advance(self.bar_total)
         return num_frames >= MIN_BLOCKS and time.monotonic() >= self.end_s
 
     def estimate_num_frames(self, max_frames: int) -> int:

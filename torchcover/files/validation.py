@@ -60,7 +60,7 @@ def explain_validation_error(
         The phrases.
 
     Example:
-        >>> from pydantic import BaseModel
+        >>> from pydantic import BaseModel, ValidationError
         >>> class Mount(BaseModel):
         ...     x_m: float
         >>> try:
