@@ -6,9 +6,9 @@ from .agreement import compare_correlations as compare_correlations
 from .agreement import correlate_rankings as correlate_rankings
 from .agreement import read_results as read_results
 from .frame_metric import FrameMetric as FrameMetric
-from .frame_metric import FrameQueryCache as FrameQueryCache
 from .frame_metric import SceneRatios as SceneRatios
 from .frame_metric import describe_number as describe_number
+from .frame_queries import FrameQueryCache as FrameQueryCache
 from .placement_scores import PlacementScores as PlacementScores
 from .placement_scores import score_placements as score_placements
 from .ranks import Ranking as Ranking

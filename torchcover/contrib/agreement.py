@@ -104,23 +104,29 @@ def read_results(path: Path) -> Mapping[tuple[str, str], PlacementRatings]:
         BadFileError: Another content, or a repeated or missing value.
     """
     table = read_csv(path, number_columns=("value",), text_columns=COLUMNS)
-    found: dict[tuple[str, str], dict[tuple[str, str], float]] = {}
-    words = zip(*(table.texts[column] for column in COLUMNS), strict=True)
-    for (placement, quantity, model, category), value in zip(words, table.numbers["value"].tolist(), strict=True):
-        of_kind = found.setdefault((quantity, category), {})
-        if (model, placement) in of_kind:
+    results: dict[tuple[str, str], dict[tuple[str, str], float]] = {}
+    rows = zip(*(table.texts[column] for column in COLUMNS), table.numbers["value"].tolist(), strict=True)
+    for placement, quantity, model, category, value in rows:
+        values = results.setdefault((quantity, category), {})
+        if (model, placement) in values:
             raise ValueError(f"{quantity} {category} of {model or 'no model'} on {placement} is there twice")
-        of_kind[model, placement] = value
-    return {key: _judged(" ".join(key).strip(), values) for key, values in found.items()}
+        values[model, placement] = value
+    return {key: _build_ratings(" ".join(key).strip(), values) for key, values in results.items()}
 
 
-def _judged(name: str, values: Mapping[tuple[str, str], float]) -> PlacementRatings:
-    judges, placements = (tuple(dict.fromkeys(words)) for words in zip(*values, strict=True))
-    missing = [f"{judge} on {place}" for judge in judges for place in placements if (judge, place) not in values]
+def _build_ratings(name: str, values: Mapping[tuple[str, str], float]) -> PlacementRatings:
+    raters, placements = (tuple(dict.fromkeys(names)) for names in zip(*values, strict=True))
+    array = np.full((len(raters), len(placements)), math.nan)
+    missing = []
+    for row, rater in enumerate(raters):
+        for column, placement in enumerate(placements):
+            if (rater, placement) in values:
+                array[row, column] = values[rater, placement]
+            else:
+                missing.append(f"{rater} on {placement}")
     if missing:
         raise ValueError(f"{name}: no value of {', '.join(missing)}")
-    array = np.array([[values[judge, place] for place in placements] for judge in judges])
-    return PlacementRatings(name, placements, judges, array)
+    return PlacementRatings(name, placements, raters, array)
 
 
 class RankCorrelation(NamedTuple):
@@ -222,30 +228,31 @@ def correlate_rankings(
 
     Example:
         >>> from torchcover.estimation import Quantity
-        >>> judged = PlacementRatings("AP", tuple("abcd"), ("net", "other"), np.array([[1.0, 2, 3, 4], [1, 2, 4, 3]]))
+        >>> values = np.array([[1.0, 2, 3, 4], [1, 2, 4, 3]])
+        >>> ratings = PlacementRatings("AP", tuple("abcd"), ("PointPillars", "CenterPoint"), values)
         >>> height = Ranking.from_values(Quantity("height", "mean height", "m", lower_is_better=False), [1.0, 2, 3, 3])
-        >>> found = correlate_rankings([height], judged, num_samples=100)
-        >>> round(found.correlations[0].spearman.value, 3), found.best_metric, found.metric_count
+        >>> agreement = correlate_rankings([height], ratings, num_samples=100)
+        >>> round(agreement.correlations[0].spearman.value, 3), agreement.best_metric, agreement.metric_count
         (1.0, 'height', 1)
     """
     count = len(ratings.placements)
-    for one in rankings:
-        if len(one.numbers) != count or (
-            one.samples is not None and one.samples[:num_samples].shape != (num_samples, count)
-        ):
+    for ranking in rankings:
+        samples = ranking.samples
+        has_samples = samples is None or samples[:num_samples].shape == (num_samples, count)
+        if len(ranking.numbers) != count or not has_samples:
             raise ValueError(
-                f"{one.name}: a value of each of {count} placements is needed, and {num_samples} draws or none"
+                f"{ranking.name}: a value of each of {count} placements is needed, and {num_samples} draws or none"
             )
-    truths, columns = _resample_ratings(ratings, num_samples, placements=resample_placements)
-    ranked = tuple(_correlate_ranking(one, ratings.mean, truths, columns) for one in rankings)
-    strength = np.array([abs(row.spearman.value) for row in ranked])
-    if np.isnan(strength).all():
-        return MetricAgreement(ratings, ranked, None, math.nan, math.nan)
-    best = check_best_correlation(np.stack([one.scores for one in rankings]), ratings.mean)
+    sampled_means, columns = _resample_ratings(ratings, num_samples, resample_placements=resample_placements)
+    correlations = tuple(_correlate_ranking(ranking, ratings.mean, sampled_means, columns) for ranking in rankings)
+    strengths = np.array([abs(correlation.spearman.value) for correlation in correlations])
+    if np.isnan(strengths).all():
+        return MetricAgreement(ratings, correlations, None, math.nan, math.nan)
+    best = check_best_correlation(np.stack([ranking.scores for ranking in rankings]), ratings.mean)
     return MetricAgreement(
         ratings=ratings,
-        correlations=ranked,
-        best_metric=rankings[int(np.nanargmax(strength))].name,
+        correlations=correlations,
+        best_metric=rankings[int(np.nanargmax(strengths))].name,
         best_p_value=best.p_value,
         chance_threshold=float(np.quantile(best.chance_correlations, BY_CHANCE)),
     )
@@ -275,40 +282,49 @@ def compare_correlations(
 
     Example:
         >>> from torchcover.estimation import Quantity
-        >>> judged = PlacementRatings("AP", tuple("abcd"), ("net",), np.array([[1.0, 2, 3, 4]]))
+        >>> ratings = PlacementRatings("AP", tuple("abcd"), ("PointPillars",), np.array([[1.0, 2, 3, 4]]))
         >>> height = Quantity("height", "mean height", "m", lower_is_better=False)
         >>> good, bad = (Ranking.from_values(height, values) for values in ([1.0, 2, 3, 4], [4.0, 3, 2, 1]))
-        >>> compare_correlations(good, bad, judged)
+        >>> compare_correlations(good, bad, ratings)
         RankCorrelation(value=2.0, low=2.0, high=2.0)
     """
-    truths, columns = _resample_ratings(ratings, num_samples, placements=resample_placements)
-    found = [compute_spearman(each.scores, ratings.mean) for each in (first, second)]
-    drawn = [compute_spearman(*_get_sampled_scores(each, truths, columns)) for each in (first, second)]
-    return RankCorrelation.from_samples(float(found[0] - found[1]), drawn[0] - drawn[1])
+    sampled_means, columns = _resample_ratings(ratings, num_samples, resample_placements=resample_placements)
+    values, samples = [], []
+    for ranking in (first, second):
+        values.append(float(compute_spearman(ranking.scores, ratings.mean)))
+        samples.append(compute_spearman(*_get_sampled_scores(ranking, sampled_means, columns)))
+    return RankCorrelation.from_samples(values[0] - values[1], samples[0] - samples[1])
 
 
-def _resample_ratings(judged: PlacementRatings, draws: int, *, placements: bool) -> tuple[Float64, Int64]:
+def _resample_ratings(
+    ratings: PlacementRatings, num_samples: int, *, resample_placements: bool
+) -> tuple[Float64, Int64]:
     """Resample the raters: (R, n) means of the ratings and (R, n) indices of the placements."""
-    generator, count = np.random.default_rng(0), len(judged.placements)
-    chosen = generator.integers(len(judged.raters), size=(draws, len(judged.raters)))
-    columns = generator.integers(count, size=(draws, count)) if placements else np.tile(np.arange(count), (draws, 1))
-    return judged.values[chosen].mean(axis=1), columns
+    rng, placement_count, rater_count = np.random.default_rng(0), len(ratings.placements), len(ratings.raters)
+    raters = rng.integers(rater_count, size=(num_samples, rater_count))
+    columns = np.tile(np.arange(placement_count), (num_samples, 1))
+    if resample_placements:
+        columns = rng.integers(placement_count, size=(num_samples, placement_count))
+    return ratings.values[raters].mean(axis=1), columns
 
 
-def _get_sampled_scores(one: Ranking, truths: Float64, columns: Int64) -> tuple[Float64, Float64]:
+def _get_sampled_scores(ranking: Ranking, sampled_means: Float64, columns: Int64) -> tuple[Float64, Float64]:
     """Return (R, n) scores of a metric and (R, n) mean ratings in each bootstrap sample."""
-    drawn = (
-        np.broadcast_to(one.scores, truths.shape) if one.sampled_scores is None else one.sampled_scores[: len(truths)]
-    )
-    return np.take_along_axis(drawn, columns, axis=1), np.take_along_axis(truths, columns, axis=1)
+    scores = ranking.sampled_scores
+    if scores is None:
+        scores = np.broadcast_to(ranking.scores, sampled_means.shape)
+    scores = scores[: len(sampled_means)]
+    return np.take_along_axis(scores, columns, axis=1), np.take_along_axis(sampled_means, columns, axis=1)
 
 
-def _correlate_ranking(one: Ranking, truth: Float64, truths: Float64, columns: Int64) -> MetricCorrelation:
-    drawn = _get_sampled_scores(one, truths, columns)
-    rho, tau = (
-        RankCorrelation.from_samples(float(statistic(one.scores, truth)), statistic(*drawn))
-        for statistic in (compute_spearman, compute_kendall_tau_b)
-    )
-    return MetricCorrelation(
-        one.name, rho, tau, check_best_correlation(one.scores, truth).p_value, one.samples is not None
-    )
+def _correlate_ranking(
+    ranking: Ranking, mean_ratings: Float64, sampled_means: Float64, columns: Int64
+) -> MetricCorrelation:
+    sampled_scores = _get_sampled_scores(ranking, sampled_means, columns)
+    correlations = []
+    for compute_correlation in (compute_spearman, compute_kendall_tau_b):
+        value = float(compute_correlation(ranking.scores, mean_ratings))
+        correlations.append(RankCorrelation.from_samples(value, compute_correlation(*sampled_scores)))
+    p_value = check_best_correlation(ranking.scores, mean_ratings).p_value
+    spearman, kendall_tau = correlations
+    return MetricCorrelation(ranking.name, spearman, kendall_tau, p_value, ranking.samples is not None)

@@ -59,7 +59,7 @@ class MetricComparison:
 
     @property
     def main_rankings(self) -> list[Ranking]:
-        """Rankings by numbers over all data, without those of a category or a region."""
+        """Rankings by numbers over all data, without numbers of a category or a region."""
         return [ranking for ranking in self.rankings if not ranking.is_part]
 
     def compute_taus(self) -> list[KendallTau]:
@@ -98,7 +98,7 @@ class MetricComparison:
         return [NOT_VALIDATED, *too_few_rigs, *warnings, *ray_notes, *missing]
 
     def build_page_tables(self, *, include_parts: bool = True) -> list[PageTable]:
-        """Build the table of numbers, and that of Kendall's tau for at least three rigs.
+        """Build the table of numbers, and the table of Kendall's tau for at least three rigs.
 
         Args:
             include_parts: True: include numbers of a category or a region.

@@ -170,7 +170,7 @@ def _rank_by_coverage(coverages: Sequence[Coverage], region: Region, seed: int) 
 
 def _select_published(rankings: Sequence[Ranking]) -> Iterator[Ranking]:
     """Select rankings by published metrics; the number of points is the baseline that any metric has to beat."""
-    # Of the numbers of parts, those of the categories on which detectors are evaluated.
+    # Categories on which detectors are evaluated; numbers of other parts are excluded.
     categories = ("car", "pedestrian", "cyclist")
     for ranking in rankings:
         if ranking.is_part and ranking.name.split(":")[1] not in categories:

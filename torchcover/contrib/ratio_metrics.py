@@ -9,13 +9,12 @@ import torch
 from torch import Tensor
 
 import torchcover.geometry.tensors  # noqa: F401
-from torchcover.contrib.frame_metric import (
+from torchcover.contrib.frame_metric import SceneRatios, describe_number
+from torchcover.contrib.frame_queries import (
     CATEGORIES,
     RANGE_BORDERS_M,
     ObjectStrata,
-    SceneRatios,
     count_points_in_boxes,
-    describe_number,
     get_rig_name,
 )
 from torchcover.coverage import BevGrid, Region, check_regions
@@ -378,7 +377,7 @@ class PointDensity(SceneRatios):
 def _estimate_heights_m(cloud: Tensor, frame: Frame) -> Tensor:
     """Estimate (N,) heights of points above ground from the nearest reference point; NaN without known ground."""
     heights_m = frame.get_heights_m("ground")
-    assert heights_m is not None  # None is the result for the band frame vehicle only
+    assert heights_m is not None  # The result is None only for the band frame "vehicle"
     has_ground = heights_m.isfinite()
     ground_m = torch.cat([(frame.reference[:, 2] - heights_m)[has_ground], heights_m.new_tensor([math.nan])])
     bev_scale = cloud.new_tensor([1.0, 1.0, 0.0])

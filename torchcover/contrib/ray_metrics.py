@@ -10,7 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchcover.contrib.frame_metric import BLOCKS, FrameMetric, SceneRatios, describe_number, get_rig_name
+from torchcover.contrib.frame_metric import BLOCKS, FrameMetric, SceneRatios, describe_number
+from torchcover.contrib.frame_queries import get_rig_name
 from torchcover.contrib.voxels import (
     REGION,
     VoxelGrid,
@@ -235,7 +236,7 @@ class FalseVisible(SceneRatios):
 
 
 def build_coarse_grid(grid: BevGrid, cell_m: float) -> BevGrid:
-    """Build a grid with other cells whose extent contains that of a grid, and exceeds it by less than a cell.
+    """Build a grid with other cells that contains a grid and exceeds it by less than a cell on each side.
 
     Args:
         grid: Extent and height bands.

@@ -5,7 +5,8 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, NamedTuple, TypeAlias
 
 from torchcover.contrib.comparison import MetricComparison
-from torchcover.contrib.frame_metric import FrameMetric, FrameQueryCache
+from torchcover.contrib.frame_metric import FrameMetric
+from torchcover.contrib.frame_queries import FrameQueryCache
 from torchcover.contrib.ranks import OWN, Ranking, build_rankings
 from torchcover.contrib.ratio_metrics import KCover, ObjectCoverage, PerceptionEntropy, PointDensity
 from torchcover.contrib.ray_metrics import FalseVisible, MSog, build_coarse_grid
@@ -171,7 +172,7 @@ class RunMetrics(NamedTuple):
 
     @property
     def observers(self) -> dict[str, FrameMetric]:
-        """All metrics by unique names, as the observers of a run."""
+        """Metrics of all rigs by unique names, as the observers of a run."""
         return {f"{name} of {rig}": metric for name, metrics in self.by_rig.items() for rig, metric in metrics.items()}
 
     def update_from(self, observers: Mapping[str, Any]) -> "RunMetrics":

@@ -127,7 +127,7 @@ class SMig(FrameMetric):
     def _compute_numbers(self) -> tuple[Estimate, Sequence[Number]]:
         occupancies, multiplicities = self._get_occupancies(), self._compute_multiplicities()
         prefix = "s_mig_occluded" if self.ends_at_hits else "s_mig"
-        parameters = {
+        parameters: dict[str, Any] = {
             "voxel_m": self.grid.voxel_m,
             "region_m": (self.grid.region.lower_m, self.grid.region.upper_m),
             "rays": count_rays(self.sensors),

@@ -153,20 +153,20 @@ def find_crossed_voxels(
                [1, 0, 0, 0],
                [1, 0, 0, 0]])
     """
-    origins_m, directions = np.asarray(origins_m, dtype=np.float64), np.asarray(directions, dtype=np.float64)
-    ray_ends = np.asarray(ray_ends, dtype=np.float64)
-    _check_rays(origins_m, directions, ray_ends)
-    is_ray = ~np.isnan(directions).any(axis=1)
-    origins_m = np.broadcast_to(origins_m, directions.shape)[is_ray]
-    ray_ends = np.broadcast_to(ray_ends, len(directions))[is_ray]
-    directions = directions[is_ray]
+    vectors = np.asarray(directions, dtype=np.float64)
+    starts_m, ends = np.asarray(origins_m, dtype=np.float64), np.asarray(ray_ends, dtype=np.float64)
+    _check_rays(starts_m, vectors, ends)
+    is_ray = ~np.isnan(vectors).any(axis=1)
+    starts_m = np.broadcast_to(starts_m, vectors.shape)[is_ray]
+    ends = np.broadcast_to(ends, len(vectors))[is_ray]
+    vectors = vectors[is_ray]
     if output is None:
         output = np.zeros(grid.shape, dtype=bool)
     elif output.shape != grid.shape or output.dtype != bool or not output.flags.c_contiguous:
         raise ValueError(f"crossed: a contiguous bool array of shape {grid.shape} is needed; got {output.shape}")
-    for start in range(0, len(directions), RAYS_PER_CHUNK):
-        chunk = slice(start, start + RAYS_PER_CHUNK)
-        rays = _clip_rays(grid, origins_m[chunk], directions[chunk], ray_ends[chunk])
+    for first_ray in range(0, len(vectors), RAYS_PER_CHUNK):
+        chunk = slice(first_ray, first_ray + RAYS_PER_CHUNK)
+        rays = _clip_rays(grid, starts_m[chunk], vectors[chunk], ends[chunk])
         first_indices: Float64 = rays.index_offsets + (rays.first_voxels * rays.strides).sum(axis=0)
         output.reshape(-1)[first_indices.astype(np.int64)] = True
         for axis in range(3):

@@ -102,7 +102,7 @@ def sum_area_by_block(coverage: "Coverage", region: Region, band: str) -> tuple[
 
 
 def estimate_redundancy(coverage: "Coverage", region: Region, band: str) -> Estimate:
-    """Estimate the numbers of a region with all sensors, followed by those of `list_redundancy_quantities`.
+    """Estimate the numbers of a region with all sensors, followed by its redundancy (`list_redundancy_quantities`).
 
     Args:
         coverage: Result of a metric with `sensor_names`.

@@ -64,7 +64,7 @@ class FrameInput(NamedTuple):
 
     @property
     def is_blind(self) -> bool:
-        """Whether no point of the rig counts for the radius."""
+        """True if no point of the rig counts for the radius."""
         if self.errors_m is None:
             return not any(map(len, self.sensor_clouds.values()))
         return not any(bool((error_m <= MEASURED_WITHIN_M).any()) for error_m in self.errors_m.values())

@@ -87,7 +87,7 @@ class CoverageMetric(MergeableMetric, CoverageSums):
         return super().forward(sensor, reference, **options)  # type: ignore[no-any-return]
 
     def compute(self) -> Coverage:
-        """Compute the coverage so far. Cells without any reference point are NaN with count 0.
+        """Compute the coverage over all added frames. Cells without any reference point are NaN with count 0.
 
         Warns:
             UserWarning: Once, if nearly all reference points lie in no cell.

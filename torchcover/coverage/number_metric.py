@@ -71,7 +71,7 @@ class CoverageNumberMetric(CoverageMetric):
         """Direction of improvement of the number."""
         return not self.quantity.lower_is_better
 
-    def compute(self) -> Tensor:  # type: ignore[override]  # the sums are those of the base class, the result is not
+    def compute(self) -> Tensor:  # type: ignore[override]  # another result from the sums of the base class
         """Compute the number over all frames: () float64 in meters or as a share; NaN if unknown."""
         coverage = super().compute()
         return coverage.estimate(self.region, self.band).value[coverage.quantities.index(self.quantity)]

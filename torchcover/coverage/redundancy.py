@@ -109,7 +109,7 @@ class SensorFailures(Aggregation):
         return states
 
     def update(self, sums: Mapping[str, Tensor], frame: BinnedFrame) -> None:
-        """Add the points of a frame, whose last values are those of `compute_values`."""
+        """Add the points of a frame; `compute_values` gives their last values."""
         means, weight_sums = frame.cell_means.means[-len(self.quantities) :], frame.cell_means.weight_sums
         if self.has_area_weights:
             sums["sums"].add_(means * weight_sums)

@@ -69,7 +69,8 @@ def compute_aggregated_numbers(
     selections = [all_blocks]
     if len(all_blocks) > 1:
         selections += [all_blocks[:block] + all_blocks[block + 1 :] for block in all_blocks]
-    values, quantities = [], []
+    values: list[Tensor] = []
+    quantities: list[Quantity] = []
     for aggregation in aggregations:
         quantities += aggregation.quantities
         states = aggregation.create_states(1)

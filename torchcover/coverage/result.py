@@ -6,7 +6,7 @@ from dataclasses import replace
 from difflib import get_close_matches
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from torch import Tensor
@@ -158,7 +158,7 @@ class Coverage:
         maps = {key: layer.values for key, layer in self.layers.items()}
         maps |= {f"{key}_error": values for key, values in self.errors.items()}
         maps |= {"point_counts": self.point_counts, "observed_frames": self.observed_frames}
-        axes = {
+        axes: dict[str, Any] = {
             "band": list(self.grid.heights),
             "y_m": self.grid.y_centers_m.numpy(),
             "x_m": self.grid.x_centers_m.numpy(),
@@ -335,7 +335,7 @@ class Coverage:
             `"radius_m/20m/ground"`, `"detection_0.4m/20m/ground"`, `"observed_share/20m/ground"` and so on, and
             `"visible_m2/20m/ground"` with area weights.
         """
-        values = {}
+        values: dict[str, float] = {}
         for row in self._list_rows(regions):
             values |= row.to_scalars(include_errors=self.block_sums is not None)
         return values

@@ -114,7 +114,7 @@ class BlockSums:
     def remap_cells(
         self, map_cells: Callable[[Tensor], Tensor], num_cells: int, shape: tuple[int, ...] | None = None
     ) -> Self:
-        """Add the sums of cells to those of other cells, for example of a coarser grid.
+        """Add the sums of cells to other cells, for example of a coarser grid.
 
         Args:
             map_cells: Function from (N,) cell indices to (N,) indices of the target cells.

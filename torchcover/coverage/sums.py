@@ -283,7 +283,7 @@ class CoverageSums(BlockedSums):
         return values
 
     def compute(self) -> Coverage:
-        """Compute the coverage so far. Cells without any reference point are NaN with count 0."""
+        """Compute the coverage over all added frames. Cells without any reference point are NaN with count 0."""
         num_cells, table = self.grid.num_cells, self.cell_sums
         rows = sum_rows(torch.cat([table[:, :1] % num_cells, table[:, 1:]], dim=1), self._columns.num_maxima)
         sums = self._columns.split_columns(rows[:, 1:].T)
@@ -334,7 +334,7 @@ class CoverageSums(BlockedSums):
 
     def _sum_regions(self, *, use_fine_blocks: bool) -> CellSums:
         """Compute the sums (..., B, P) of P regions and bands, in fine blocks or in blocks."""
-        # Until a block has as many frames as fine blocks, only so many fine blocks belong to it.
+        # A block with fewer frames than fine blocks consists of one fine block per frame.
         fine_per_block = 1 if use_fine_blocks else min(int(self.frames_per_block), FINE_BLOCKS_PER_BLOCK)
         num_blocks = self.num_fine_blocks if use_fine_blocks else self.num_blocks
         num_region_bands, num_columns = self._region_bands.num_region_bands, self._columns.num_columns
@@ -356,7 +356,7 @@ class CoverageSums(BlockedSums):
         return RegionSums(self.fine_block_frame_counts.clone(), sums[AreaAverage.name]["m2"], values)
 
     def estimate_regions(self, region_bands: Sequence[tuple[Region, str]], average: Average) -> list[Estimate]:
-        """Compute the numbers of regions so far, equal to those of `compute().estimate`, without computing maps.
+        """Compute the numbers of regions over all added frames as `compute().estimate`, without computing maps.
 
         Args:
             region_bands: Regions within the grid, each with the name of a band.

@@ -54,7 +54,7 @@ class Number(NamedTuple):
 
     @property
     def has_value(self) -> bool:
-        """Whether the value is known."""
+        """True if the value is known."""
         return not math.isnan(self.value)
 
 
@@ -278,7 +278,7 @@ class Estimate:
 
     @property
     def has_intervals(self) -> list[bool]:
-        """Whether each number has at least 8 effective blocks."""
+        """(Q,) True for numbers with at least 8 effective blocks."""
         result: list[bool] = (self.effective_blocks > MIN_BLOCKS - ROUND_OFF).tolist()
         return result
 

@@ -83,7 +83,7 @@ def guard_reader(content: str) -> Callable[[Reader[Arguments, Content]], Guarded
 
 @contextmanager
 def report_bad_file(path: Path, content: str) -> Iterator[None]:
-    """Convert errors to a `BadFileError` with the path, except those of missing files, folders and packages.
+    """Convert errors to a `BadFileError` with the path, except errors of missing files, folders and packages.
 
     Args:
         path: File, or folder of several files.
@@ -183,7 +183,7 @@ def check_memory(needed_bytes: int) -> None:
 
 
 def find_memory_limit_gb() -> float:
-    """Return the memory limit of an isolated reader in gigabytes: that of a file, plus that of its libraries."""
+    """Return the memory limit of an isolated reader in gigabytes: the limit of a file plus the memory of libraries."""
     return read_limit_gb(VARIABLE, DEFAULT_GB) + LIBRARIES_GB
 
 

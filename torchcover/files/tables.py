@@ -273,7 +273,7 @@ def read_npy(path: Path, check: Callable[[NpyHeader], None]) -> NDArray[Any]:
     Raises:
         ValueError: The file is not a `.npy`, contains Python objects, has another size than its array, or is too large.
     """
-    return _load_array(partial(path.open, "rb"), path.stat().st_size, check)
+    return _load_array(lambda: path.open("rb"), path.stat().st_size, check)
 
 
 def read_npz(

@@ -17,7 +17,7 @@ _SHORT_REPR = Repr()
 _SHORT_REPR.maxlevel = 2
 _SHORT_REPR.maxstring = _SHORT_REPR.maxlong = _SHORT_REPR.maxother = MAX_QUOTED
 
-# pydantic's types of errors -> what is needed; names in braces are numbers of the error.
+# Expected value by type of error of pydantic; names in braces are numbers of the error.
 _NEEDED = {
     **dict.fromkeys(("int_type", "int_parsing", "int_from_float"), "an integer"),
     **dict.fromkeys(("float_type", "float_parsing"), "a number"),
@@ -49,7 +49,7 @@ KeyPath = tuple[int | str, ...]
 def explain_validation_error(
     error: "ValidationError", suggest_key: Callable[[str], str] | None = None, max_mistakes: int = 5
 ) -> list[str]:
-    """Explain each mistake that pydantic found in one phrase: the key, what is needed, and the value that arrived.
+    """Explain each mistake that pydantic found in one phrase: the key, the expected value, and the value that arrived.
 
     Args:
         error: Error of a file or of settings.

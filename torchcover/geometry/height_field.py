@@ -133,6 +133,7 @@ def fit_height_field(
     """
     trusted_mask = np.zeros(len(heights_m), dtype=np.bool_) if trusted_mask is None else trusted_mask
     num_rounds = 4
+    compute_base_m: Callable[[Float64], Float64]
     if base_field is not None:
         compute_base_m = base_field.compute_heights_m
     else:
@@ -150,7 +151,7 @@ def fit_height_field(
             layer_residuals_m = residuals_m - layer.compute_heights_m(positions_m)
             weights = _compute_weights(layer_residuals_m, trusted_mask, cell_m, above_weight)
         residuals_m = layer_residuals_m
-        # The triangles of a scale lie within those of the scale before, so that the sum is exact.
+        # Each triangle of a scale lies within one triangle of the scale before, so that the sum is exact.
         total = layer.add_base(total.compute_heights_m)
     return total.add_base(compute_base_m)
 

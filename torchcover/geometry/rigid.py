@@ -100,7 +100,7 @@ def convert_rotation_to_euler(rotation: Matrix) -> Matrix:
     is_vertical = cos_pitch < 1e-9
     yaw = np.where(is_vertical, np.arctan2(-r[..., 0, 1], r[..., 1, 1]), np.arctan2(r[..., 1, 0], r[..., 0, 0]))
     # Near the vertical, yaw and roll are each uncertain. Computed from the rotation without this yaw, the roll has an
-    # error that cancels with that of the yaw.
+    # error that cancels with the error of the yaw.
     cos_yaw, sin_yaw = np.cos(yaw), np.sin(yaw)
     sin_roll = sin_yaw * r[..., 0, 2] - cos_yaw * r[..., 1, 2]
     cos_roll = cos_yaw * r[..., 1, 1] - sin_yaw * r[..., 0, 1]
@@ -274,7 +274,8 @@ def iterate_blocks(num_points: int) -> Iterator[slice]:
         start = stop
 
 
-# By step of round angles in degrees: number of decimals from which their value in radians is no coincidence.
+# Number of decimals from which the value of a round angle in radians is no coincidence, by step of round angles in
+# degrees.
 DECIMALS_BY_STEP_DEG = {90: 2, 15: 3, 5: 4}
 
 

@@ -68,8 +68,11 @@ class Trajectory:
             positions_m: As in the class.
             angles_deg: As in the class.
         """
-        arrays = [np.array(values, dtype=np.float64) for values in (times_s, positions_m, angles_deg)]
-        return cls(*arrays)
+        return cls(
+            np.array(times_s, dtype=np.float64),
+            np.array(positions_m, dtype=np.float64),
+            np.array(angles_deg, dtype=np.float64),
+        )
 
     @classmethod
     def create_static(cls, position_m: ArrayLike, angles_deg: ArrayLike = (0.0, 0.0, 0.0)) -> "Trajectory":
@@ -101,7 +104,7 @@ class Trajectory:
 
     @property
     def is_moving(self) -> bool:
-        """Whether the pose changes, or the body is transient."""
+        """True if the pose changes, or the body is transient."""
         if self.is_transient or len(self.times_s) == 1:
             return self.is_transient
         for poses in (self.positions_m, self.angles_deg):

@@ -166,7 +166,7 @@ class CoverageCallback(Callback):
             coverage = self._compute()
             self._logged_scalars, self._has_new_frames = self._get_scalars(coverage), False
             self._log_maps(trainer, coverage)
-        # All processes log equal values, so that the maximum is the value without rounding; Lightning requires a
+        # Since all processes log equal values, the maximum is the value without rounding; Lightning requires a
         # reduction.
         pl_module.log_dict(self._logged_scalars, on_step=False, on_epoch=True, sync_dist=True, reduce_fx="max")
 
