@@ -1,4 +1,4 @@
-"""SUMO at work: streets and traffic that are drawn, OpenDRIVE, and what it refuses."""
+"""Runs of SUMO: sampled streets and traffic, OpenDRIVE, and rejected inputs."""
 
 import hashlib
 import os
@@ -31,30 +31,30 @@ ROUTES = """<routes><vType id="car" length="5"/>{more}<vehicle id="{name}" type=
 <route edges="-1"/></vehicle></routes>"""
 
 
-def drawn(network="grid", **options):
+def make_traffic(network="grid", **options):
     return SumoTraffic(random={"layout": network, **LITTLE, **options}, duration_s=2.0, time_step_s=0.5)
 
 
-def fingerprint(world):
+def hash_scene(world):
     parts = [mesh.vertices_m for mesh in world.static_meshes]
     for actor in (world.ego, *world.objects):
         parts += [actor.trajectory.positions_m, actor.trajectory.angles_deg, actor.trajectory.times_s]
     return hashlib.sha256(b"".join(part.tobytes() for part in parts)).hexdigest()
 
 
-def test_a_seed_gives_one_world_in_every_process():
-    program = "from tests.simulation.sumo.test_drawn import *; print(fingerprint(drawn().build_scene(7)))"
+def test_scenes_are_equal_in_all_processes():
+    program = "from tests.simulation.sumo.test_drawn import *; print(hash_scene(make_traffic().build_scene(7)))"
     environment = {**os.environ, "PYTHONHASHSEED": "12345"}
     there = subprocess.run(
         [sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True, cwd=ROOT
     )
-    world = drawn().build_scene(7)
-    assert there.stdout.strip() == fingerprint(world)
+    world = make_traffic().build_scene(7)
+    assert there.stdout.strip() == hash_scene(world)
     assert len(world.objects) > 20
 
 
-def test_workers_see_the_same_frames_and_each_run_is_another_town():
-    scenario = Scenario(name="town", traffic=drawn())
+def test_workers_agree_and_runs_differ():
+    scenario = Scenario(name="town", traffic=make_traffic())
     frames = SimulatedFrames(
         scenario,
         Rig.load("front_grille_128"),
@@ -71,7 +71,7 @@ def test_workers_see_the_same_frames_and_each_run_is_another_town():
 
 
 @pytest.mark.parametrize("network", ["rand", "grid", "spider"])
-def test_drawn_streets_go_on_everywhere_and_have_all_that_was_asked_for(network, tmp_path):
+def test_sampled_streets_have_no_dead_ends(network, tmp_path):
     streets = RandomStreets(layout=network, max_lanes_per_direction=3, hill_height_std_m=0.0)
     town = read_network(streets.build_network(tmp_path, np.random.default_rng(2)))
     assert not any(lane.line_m[:, 2].any() for lane in town.lanes)
@@ -81,11 +81,11 @@ def test_drawn_streets_go_on_everywhere_and_have_all_that_was_asked_for(network,
     follow = town.find_successors("passenger")
     assert len(follow) > 10
     assert all(follow.values())
-    # Nobody has to turn round.
+    # No edge is a dead end.
     assert all({after.strip("-") for after in found} != {edge.strip("-")} for edge, found in follow.items())
 
 
-def test_drawn_traffic_has_bodies_of_all_sizes_and_lorries_and_buses_among_them(tmp_path):
+def test_sampled_traffic_has_bodies_of_all_sizes(tmp_path):
     generator, streets = np.random.default_rng(0), RandomStreets(layout="grid", buses_per_km=5.0)
     town, routes = read_network(streets.build_network(tmp_path, generator)), tmp_path / "drawn.rou.xml"
     fleet = Fleet(load_bodies(), None, generator)
@@ -98,7 +98,7 @@ def test_drawn_traffic_has_bodies_of_all_sizes_and_lorries_and_buses_among_them(
     assert all(abs(lengths_m[kind] - fleet.get_length_m(kind)) < 0.01 for kind in driven)
 
 
-def test_open_drive_brings_its_heights_and_sidewalks(tmp_path):
+def test_opendrive_heights_and_sidewalks_are_converted(tmp_path):
     (tmp_path / "road.xodr").write_text(XODR)
     (tmp_path / "r.xml").write_text(ROUTES.format(name="me", more=""))
     made = SumoTraffic(
@@ -134,7 +134,7 @@ def test_open_drive_brings_its_heights_and_sidewalks(tmp_path):
         ),
     ],
 )
-def test_losses_of_open_drive_are_reported(old, new, told, tmp_path):
+def test_unconverted_opendrive_content_is_reported(old, new, told, tmp_path):
     assert XODR.count(old) == 1
     (tmp_path / "road.xodr").write_text(XODR.replace(old, new))
     with pytest.warns(UserWarning, match=f"OpenDRIVE: SUMO's netconvert does not convert .*{told}"):
@@ -144,11 +144,11 @@ def test_losses_of_open_drive_are_reported(old, new, told, tmp_path):
         convert_opendrive(tmp_path / "road.xodr", tmp_path, omit_missing_links=False)
 
 
-MANY = " ".join(f"a{number}='1'" for number in range(1001))  # attributes, of which SUMO compares each with each
+MANY = " ".join(f"a{number}='1'" for number in range(1001))  # SUMO compares each attribute with each
 
 
-def test_projections_of_open_drive_name_no_files_and_attributes_are_few(tmp_path):
-    """PROJ would wait for a pipe without end."""
+def test_opendrive_projections_and_attribute_counts_are_checked(tmp_path):
+    """Check projections, because PROJ would wait for a pipe forever."""
     reference = "<geoReference><![CDATA[{}]]></geoReference></header>"
     (tmp_path / "road.xodr").write_text(XODR.replace("<road", f"<road {MANY}", 1))
     with pytest.raises(BadFileError, match="<road> has 1005 attributes; at most 1000 are read"):
@@ -159,7 +159,7 @@ def test_projections_of_open_drive_name_no_files_and_attributes_are_few(tmp_path
             convert_opendrive(tmp_path / "road.xodr", tmp_path, omit_missing_links=False)
 
 
-def test_links_of_open_drive_that_lead_nowhere_are_named_and_may_be_left_out(tmp_path):
+def test_missing_opendrive_links_are_named_or_omitted(tmp_path):
     link = '<link><predecessor elementType="road" elementId="7" contactPoint="end"/></link>'
     nowhere = '<junction id="8" type="direct"><connection id="0" incomingRoad="1" linkedRoad="1"/></junction>'
     (tmp_path / "road.xodr").write_text(
@@ -184,13 +184,13 @@ def test_links_of_open_drive_that_lead_nowhere_are_named_and_may_be_left_out(tmp
         ("<!DOCTYPE a [<!ENTITY e 'x'>]><OpenDRIVE>&e;</OpenDRIVE>", "without entities"),
     ],
 )
-def test_a_road_that_netconvert_refuses_ends_with_its_message(text, message, tmp_path):
+def test_errors_of_netconvert_are_reported(text, message, tmp_path):
     (tmp_path / "road.xodr").write_text(text)
     with pytest.raises(BadFileError, match=f"road.xodr: .*{message}"):
         SumoTraffic(net=tmp_path / "road.xodr", random={}, duration_s=2.0).build_scene(0)
 
 
-def test_what_sumo_says_is_passed_on_and_entities_never_get_to_it(tmp_path):
+def test_messages_of_sumo_are_reported_and_entities_rejected(tmp_path):
     net = write_net(tmp_path / "a.net.xml", street())
     routes = tmp_path / "r.xml"
     made = SumoTraffic(net=net, routes=(routes,), duration_s=2.0)
@@ -210,7 +210,7 @@ OUTPUT = "x.out"
 
 @pytest.fixture(scope="module")
 def road(tmp_path_factory):
-    """A network with one street, the edge -1."""
+    """Return a network with one street, the edge -1."""
     folder = tmp_path_factory.mktemp("road")
     (folder / "road.xodr").write_text(XODR)
     return simulating.convert_opendrive(folder / "road.xodr", folder, omit_missing_links=False)
@@ -249,7 +249,7 @@ def road(tmp_path_factory):
         ("net", '<location projParameter="+proj=utm +nadgrids=http://a/x"/>', "http://a/x' names a file; remove"),
     ],
 )
-def test_scenarios_name_no_outputs_and_no_addresses(road, tmp_path, where, added, told):
+def test_outputs_and_addresses_in_files_are_rejected(road, tmp_path, where, added, told):
     out = tmp_path / OUTPUT
     out.write_text("a user's file")
     added = added.format(out=out)
@@ -263,8 +263,8 @@ def test_scenarios_name_no_outputs_and_no_addresses(road, tmp_path, where, added
     assert [one.read_text() for one in tmp_path.glob(OUTPUT)] == ["a user's file"]
 
 
-def test_pictures_and_notes_of_scenarios_change_nothing(road, tmp_path):
-    routes = tmp_path / "a,b.xml"  # which SUMO would take for two files
+def test_pictures_and_notes_in_files_are_ignored(road, tmp_path):
+    routes = tmp_path / "a,b.xml"  # SUMO would split the name into two files
     notes = '<param key="my note" value="a/b.xml"/><param key="has.rerouting.device" value="true"/>'
     routes.write_text(
         '<routes><vType id="t" imgFile="car.png" emissionClass="PHEMlight/../x" lcStrategic="1" jmTimegapMinor="1"/>'
@@ -284,7 +284,7 @@ def test_pictures_and_notes_of_scenarios_change_nothing(road, tmp_path):
         ),
     ],
 )
-def test_a_program_writes_no_files_talks_without_end_and_may_run_out_of_memory(script, message, tmp_path, monkeypatch):
+def test_failures_of_sumo_programs_are_explained(script, message, tmp_path, monkeypatch):
     program, new = tmp_path / "bin" / "sumo", tmp_path / "new"
     program.parent.mkdir()
     program.write_text(f"#!/bin/sh\n{script.format(new=new)}")
@@ -295,41 +295,43 @@ def test_a_program_writes_no_files_talks_without_end_and_may_run_out_of_memory(s
     assert new.read_text() == ""
 
 
-def test_a_simulation_that_is_over_before_the_run_begins_is_refused(tmp_path):
+def test_simulations_that_end_too_early_are_rejected(tmp_path):
     net, routes = RandomStreets().build_network(tmp_path, np.random.default_rng(0)), tmp_path / "r.xml"
     routes.write_text("<routes/>")
     with pytest.raises(ValueError, match=r"the simulation ends before t = 60 s, where the run begins: .*begin_s"):
         SumoTraffic(net=net, routes=(routes,), duration_s=2.0).build_scene(0)
 
 
-def test_without_sumo_one_line_says_what_to_install(monkeypatch):
+def test_missing_sumo_is_reported_in_one_line(monkeypatch):
     monkeypatch.setattr(simulating, "find_spec", lambda _: None)
     monkeypatch.setattr(simulating, "which", lambda _: None)
     with pytest.raises(ImportError, match=r"^traffic of type 'sumo' needs SUMO: pip install 'torchcover\[sumo\]'$"):
-        drawn().build_scene(0)
+        make_traffic().build_scene(0)
 
 
-def test_a_net_without_ways_and_too_much_traffic_are_refused(tmp_path):
+def test_networks_without_routes_and_excess_traffic_are_rejected(tmp_path):
     net = write_net(tmp_path / "a.net.xml", street())
     with pytest.raises(ValueError, match="no street that cars may use and that leads on"):
         SumoTraffic(net=net, random={}, duration_s=2.0).build_scene(0)
     with pytest.raises(ValueError, match=r"traffic of about [\d,]+ vehicles and people; at most 20,000 are sampled"):
-        drawn(traffic_per_km=200.0, people_per_km=1000.0, cyclists_per_km=1000.0, buses_per_km=200.0).build_scene(0)
+        make_traffic(
+            traffic_per_km=200.0, people_per_km=1000.0, cyclists_per_km=1000.0, buses_per_km=200.0
+        ).build_scene(0)
 
 
-def test_an_empty_town_is_a_world_a_hundred_times_as_much_is_refused_and_who_is_left_out_is_told(monkeypatch):
+def test_density_limits_and_omissions_are_reported(monkeypatch):
     for key in LITTLE:
         with pytest.raises(ValueError, match=rf"random\.{key}: a number of at most"):
-            drawn(**{key: 1400.0})
+            make_traffic(**{key: 1400.0})
     monkeypatch.setattr(traffic, "drop_colliding_users", lambda bodies: bodies[:1])
     bare = {"built_share": 0.0, "parked_share": 0.0, "roadside_density": 0.0}
     with pytest.warns(UserWarning, match=r"^\d of \d road users of the simulation are left out"):
-        world = drawn(**dict.fromkeys(LITTLE, 0.0)).model_copy(update=bare).build_scene(0)
+        world = make_traffic(**dict.fromkeys(LITTLE, 0.0)).model_copy(update=bare).build_scene(0)
     assert not world.objects
-    assert world.num_omitted_road_users > 0  # who could have been the ego
+    assert world.num_omitted_road_users > 0  # the other candidates for the ego vehicle
 
 
-def test_a_turn_is_driven_as_slowly_as_its_tightest_piece_asks_for():
+def test_turning_speed_follows_the_tightest_part():
     angle = np.linspace(0.0, np.pi / 2, 40)
     arc_m = 6.0 * np.stack([np.sin(angle), 1 - np.cos(angle)], axis=1)
     lead_m = np.column_stack([np.linspace(-30.0, -1.0, 30), np.zeros(30)])
@@ -339,7 +341,7 @@ def test_a_turn_is_driven_as_slowly_as_its_tightest_piece_asks_for():
     assert compute_turning_speed_mps(lead_m) > 100.0
 
 
-def test_a_program_that_finds_no_end_is_ended(tmp_path, monkeypatch):
+def test_processor_time_of_programs_is_limited(tmp_path, monkeypatch):
     monkeypatch.setattr(simulating, "MAX_CPU_S", 0.5)
     with pytest.raises(ValueError, match=r"SUMO's netgenerate took more than 0\.5 s of processor time"):
         simulating.run_program("netgenerate", "--rand", "--rand.iterations", "9999999", "-o", tmp_path / "a.net.xml")

@@ -1,4 +1,4 @@
-"""The ground, the pavement and bridges."""
+"""Ground, sidewalks and bridges."""
 
 import numpy as np
 import pytest
@@ -14,27 +14,27 @@ from .towns import DRIVE, WALK, edge, street, write_net
 WAY = np.array([[50.0, 0.0], [150.0, 0.0]])
 
 
-def vicinity(folder, *edges, way_m=WAY, origin_m=(0.0, 0.0)):
+def build_vicinity(folder, *edges, way_m=WAY, origin_m=(0.0, 0.0)):
     return Vicinity(read_network(write_net(folder / "a.net.xml", *edges)), way_m, np.array(origin_m))
 
 
-def hill():
-    """Ground of random heights."""
+def build_random_ground():
+    """Build ground with random heights."""
     return GroundHeightField(
         np.array([-10.0, 5.0]), np.random.default_rng(0).normal(size=(9, 7)), np.ones((8, 6), dtype=bool)
     )
 
 
-def test_a_network_of_one_height_has_plain_ground_of_two_triangles(tmp_path):
-    ground = build_ground(vicinity(tmp_path, street(z=(3.0, 3.0))))
+def test_level_networks_have_plane_ground(tmp_path):
+    ground = build_ground(build_vicinity(tmp_path, street(z=(3.0, 3.0))))
     assert isinstance(ground, FlatGround)
     assert len(ground.build_mesh().faces) == 2
     assert (ground.build_mesh().vertices_m[:, 2] == 3.0).all()
     assert (ground.compute_heights_m(WAY) == 3.0).all()
 
 
-def test_a_street_that_climbs_takes_the_ground_with_it(tmp_path):
-    ground = build_ground(vicinity(tmp_path, street(z=(0.0, 20.0))))
+def test_ground_follows_the_height_of_streets(tmp_path):
+    ground = build_ground(build_vicinity(tmp_path, street(z=(0.0, 20.0))))
     along = np.column_stack([np.linspace(20.0, 380.0, 50), np.zeros(50)])
     np.testing.assert_allclose(ground.compute_heights_m(along), 0.05 * along[:, 0], atol=0.02)
     pitch, roll = compute_tilts_deg(ground, along, np.zeros(50), (5.0, 2.0)).T
@@ -44,8 +44,8 @@ def test_a_street_that_climbs_takes_the_ground_with_it(tmp_path):
     np.testing.assert_allclose(roll, np.rad2deg(np.arctan(0.05)), atol=0.1)  # to the south, the left side is up
 
 
-def test_bodies_stand_on_the_triangles_that_rays_hit():
-    ground, generator = hill(), np.random.default_rng(1)
+def test_ground_heights_match_the_mesh():
+    ground, generator = build_random_ground(), np.random.default_rng(1)
     places_m = generator.uniform([-10.0, 5.0], [20.0, 45.0], (200, 2))
     corners_m = ground.build_mesh().vertices_m[ground.build_mesh().faces]
     for place_m, height_m in zip(places_m, ground.compute_heights_m(places_m), strict=True):
@@ -60,15 +60,15 @@ def test_bodies_stand_on_the_triangles_that_rays_hit():
         assert height_m == pytest.approx(weights @ corners_m[first, :, 2] / weights.sum())
 
 
-def test_the_ground_faces_up_and_has_no_holes():
-    mesh = trimesh.Trimesh(*hill().build_mesh(), process=False)
+def test_ground_faces_up_without_holes():
+    mesh = trimesh.Trimesh(*build_random_ground().build_mesh(), process=False)
     assert (mesh.face_normals[:, 2] > 0).all()
     assert mesh.area_faces @ mesh.face_normals[:, 2] == pytest.approx(8 * 6 * 25.0)
 
 
 @pytest.mark.parametrize("z", [(1.0, 1.0), (0.0, 12.0)])
-def test_kerbs_are_closed_and_as_high_as_they_should_be(z, tmp_path):
-    near = vicinity(tmp_path, street(z=z))
+def test_curbs_are_closed_with_the_right_height(z, tmp_path):
+    near = build_vicinity(tmp_path, street(z=z))
     ground = build_ground(near)
     pavement = Sidewalks(near, ground)
     (mesh,) = pavement.build_meshes()
@@ -83,10 +83,10 @@ def test_kerbs_are_closed_and_as_high_as_they_should_be(z, tmp_path):
     assert not pavement.is_inside(off).any()
 
 
-def test_nobody_drives_over_a_kerb(tmp_path):
+def test_vehicles_stay_off_curbs(tmp_path):
     crossing = edge(":j_c0", (WALK, 4.0, [(100, -5, 0), (100, 5, 0)]), function="crossing")
     corner = edge(":j_w0", (WALK, 4.0, [(200, -9, 0), (240, -9, 0), (240, 1, 0), (200, 1, 0)]), function="walkingarea")
-    near = vicinity(tmp_path, street(), crossing, corner)
+    near = build_vicinity(tmp_path, street(), crossing, corner)
     pavement = Sidewalks(near, build_ground(near))
     xs = np.linspace(1.0, 399.0, 400)
     assert not pavement.is_inside(np.column_stack([xs, np.full(400, -1.7)])).any()
@@ -97,9 +97,9 @@ def test_nobody_drives_over_a_kerb(tmp_path):
         assert trimesh.Trimesh(*mesh, process=False).is_watertight
 
 
-def test_a_bridge_has_a_deck_and_the_ground_goes_below(tmp_path):
+def test_bridges_have_decks_above_the_ground(tmp_path):
     over = edge("over", (DRIVE, 7.0, [(100, -150, 0), (100, -60, 6), (100, 60, 6), (100, 150, 0)]))
-    near = vicinity(tmp_path, street(), over)
+    near = build_vicinity(tmp_path, street(), over)
     ground = build_ground(near)
     np.testing.assert_allclose(
         ground.compute_heights_m(np.array([[80.0, 0.0], [100.0, 0.0], [120.0, 0.0]])), 0.0, atol=0.05
@@ -115,6 +115,6 @@ def test_a_bridge_has_a_deck_and_the_ground_goes_below(tmp_path):
     assert deck.vertices_m[:, 1].max() > 1.75
 
 
-def test_only_what_is_near_the_way_is_there(tmp_path):
-    near = vicinity(tmp_path, street(), street("far", y=400.0), street("beyond", y=270.0))
+def test_only_streets_near_the_path_are_built(tmp_path):
+    near = build_vicinity(tmp_path, street(), street("far", y=400.0), street("beyond", y=270.0))
     assert {lane.edge_id for lane in near.lanes} == {"east", "beyond"}

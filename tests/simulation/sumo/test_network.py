@@ -1,4 +1,4 @@
-"""Networks as SUMO writes them, good and bad."""
+"""Valid and invalid networks of SUMO."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ LINE = [(0, 0, 1), (50, 0, 2)]
 CONNECTED = '<connection from="a" to="b" fromLane="0" toLane="0"/><connection from="b" to="c" fromLane="0" toLane="0"/>'
 
 
-def test_lanes_are_for_those_who_may_use_them(tmp_path):
+def test_lane_uses_follow_vehicle_classes(tmp_path):
     lanes = [
         (WALK, 2, LINE), ('disallow="all" type="parking"', 2.3, LINE), ('disallow="all"', 1, LINE),
         ('allow="rail"', 3, LINE), ('allow="bicycle"', 1.5, LINE), (DRIVE, 3.2, LINE),
@@ -34,7 +34,7 @@ def test_lanes_are_for_those_who_may_use_them(tmp_path):
     assert len(network.junctions) == 1
 
 
-def test_ways_go_on_only_where_a_class_may_drive(tmp_path):
+def test_successors_respect_vehicle_classes(tmp_path):
     path = write_net(
         tmp_path / "a.net.xml",
         edge("a", (DRIVE, 3, LINE)),
@@ -47,7 +47,7 @@ def test_ways_go_on_only_where_a_class_may_drive(tmp_path):
     assert network.find_successors("bus") == {"a": ("b",), "b": ("c",), "c": ()}
 
 
-def test_lanes_without_length_are_left_out_and_a_file_that_changes_is_read_again(tmp_path):
+def test_lanes_without_length_are_skipped_and_changes_read(tmp_path):
     path = write_net(tmp_path / "a.net.xml", street(), edge("short", (DRIVE, 3, [(7, 7), (7, 7)])))
     assert {lane.edge_id for lane in read_network(path).lanes} == {"east"}
     write_net(path, street(), street("another"))
@@ -66,7 +66,7 @@ def test_lanes_without_length_are_left_out_and_a_file_that_changes_is_read_again
         ([], "a street for vehicles is needed"),
     ],
 )
-def test_what_is_no_street_is_refused_with_the_lane(edges, message, tmp_path):
+def test_invalid_lanes_are_rejected_by_name(edges, message, tmp_path):
     with pytest.raises(BadFileError, match=f"a.net.xml: .*{message}"):
         read_network(write_net(tmp_path / "a.net.xml", *edges))
 
@@ -79,7 +79,7 @@ def test_what_is_no_street_is_refused_with_the_lane(edges, message, tmp_path):
         ("<net>", "no element found"),
     ],
 )
-def test_what_is_no_network_is_refused(text, message, tmp_path):
+def test_invalid_networks_are_rejected(text, message, tmp_path):
     path = tmp_path / "a.net.xml"
     path.write_text(text)
     with pytest.raises(BadFileError, match=f"a.net.xml: .*{message}"):

@@ -1,10 +1,10 @@
-"""Worlds from networks and floating car data that are given."""
+"""Scenes from given networks and floating car data."""
 
 import numpy as np
 import pytest
 import shapely
 
-from tests.simulation.traffic.test_separation import pieces
+from tests.simulation.traffic.test_separation import iterate_pieces
 from torchcover import Scenario
 from torchcover.simulation.sumo import SumoTraffic
 from torchcover.simulation.traffic.fleet import REAR_OF
@@ -15,51 +15,51 @@ from .towns import DRIVE, WALK, drive, edge, fcd, street, together, vehicle, wri
 UTM = (512_345.0, 5_405_678.0)
 
 
-def made(folder, *edges, steps=None, **options):
+def make_traffic(folder, *edges, steps=None, **options):
     net = write_net(folder / "a.net.xml", *(edges or (street(),)))
     (folder / "fcd.xml").write_text(fcd(steps or together(drive())))
     options = {"duration_s": 4.0, **options}
     return SumoTraffic(net=net, fcd=folder / "fcd.xml", **options)
 
 
-def test_the_ego_drives_as_it_did_there(tmp_path):
-    world = made(tmp_path, ego_id="ego").build_scene(0)
+def test_ego_follows_its_track(tmp_path):
+    world = make_traffic(tmp_path, ego_id="ego").build_scene(0)
     assert world.num_time_steps == 41
     positions_m = world.ego.trajectory.positions_m
     np.testing.assert_allclose(np.diff(positions_m[:, 0]), 1.0, atol=1e-9)
     np.testing.assert_array_equal(positions_m[:, 1:], 0.0)
-    # The ground is that of the first place's whole metres: 50 m on the street, less half of a car of 5 m.
+    # The origin has whole meters: the front is at 50 m on the street, the center of a car of 5 m is behind it.
     assert positions_m[0, 0] == pytest.approx(0.5)
 
 
-def test_coordinates_of_utm_size_change_nothing(tmp_path):
+def test_utm_coordinates_change_nothing(tmp_path):
     here, there = tmp_path / "here", tmp_path / "there"
     worlds = []
     for folder, shift in ((here, (0.0, 0.0)), (there, UTM)):
         folder.mkdir()
         steps = together(drive(shift=shift), drive("b", y=3.0, start=70.0, shift=shift))
-        worlds.append(made(folder, street(z=(0.0, 8.0), shift=shift), steps=steps, ego_id="ego").build_scene(3))
+        worlds.append(make_traffic(folder, street(z=(0.0, 8.0), shift=shift), steps=steps, ego_id="ego").build_scene(3))
     for one, other in zip(worlds[0].static_meshes, worlds[1].static_meshes, strict=True):
         np.testing.assert_allclose(one.vertices_m, other.vertices_m, atol=1e-6)
     for one, other in zip((worlds[0].ego, *worlds[0].actors), (worlds[1].ego, *worlds[1].actors), strict=True):
         np.testing.assert_allclose(one.trajectory.positions_m, other.trajectory.positions_m, atol=1e-6)
 
 
-def test_who_comes_and_goes_is_there_for_that_time_and_who_is_far_never(tmp_path):
+def test_actors_exist_only_while_present_and_near(tmp_path):
     late = {t: row for t, row in drive("late", y=3.0).items() if 1.0 <= t <= 2.0}
-    world = made(tmp_path, steps=together(drive(), late, drive("far", y=260.0)), ego_id="ego").build_scene(0)
+    world = make_traffic(tmp_path, steps=together(drive(), late, drive("far", y=260.0)), ego_id="ego").build_scene(0)
     (actor,) = world.actors
     assert (actor.category, actor.trajectory.is_transient) == ("car", True)
     there = np.isfinite(actor.trajectory.interpolate_positions_m(np.array([0.8, 1.0, 2.0, 2.2]))[:, 0])
     assert there.tolist() == [False, True, True, False]
 
 
-def test_types_have_bodies_by_class_and_length(tmp_path):
+def test_types_get_bodies_by_class_and_length(tmp_path):
     kinds = {"bus": 1, "truck": 2, "bicycle": 3, "motorcycle": 4, "pedestrian": 5, "passenger": 6, "rail": 7}
     rows = [drive()] + [drive(f"{kind}", y=5.0 * k, type=kind) for kind, k in kinds.items()]
     routes = tmp_path / "r.xml"
     routes.write_text('<routes><vType id="passenger" length="6.2"/><vType id="truck" vClass="trailer"/></routes>')
-    world = made(tmp_path, steps=together(*rows), ego_id="ego", routes=(routes,)).build_scene(0)
+    world = make_traffic(tmp_path, steps=together(*rows), ego_id="ego", routes=(routes,)).build_scene(0)
     words = [actor.name.removeprefix(REAR_OF).split() for actor in world.actors]
     assert {name: kind.partition("_")[0] for kind, name, _ in words} == {
         "bus": "bus", "truck": "truck", "bicycle": "cyclist", "motorcycle": "motorcycle", "pedestrian": "adult",
@@ -67,48 +67,50 @@ def test_types_have_bodies_by_class_and_length(tmp_path):
     }  # fmt: skip
 
 
-def test_whoever_is_where_another_one_is_is_left_out_with_a_count(tmp_path):
+def test_overlapping_road_users_are_omitted_with_a_count(tmp_path):
     pair = drive("one", start=90.0), drive("other", start=92.0)
     steps = together(drive(), drive("ghost", start=52.0), *pair, drive("free", start=120.0))
     with pytest.warns(UserWarning, match=r"^2 of 4 road users .* overlap others or curbs.* \('ghost', 'other'\)"):
-        world = made(tmp_path, steps=steps, ego_id="ego").build_scene(0)
+        world = make_traffic(tmp_path, steps=steps, ego_id="ego").build_scene(0)
     assert [actor.name.split()[1] for actor in world.actors] == ["one", "free"]
     assert world.num_omitted_road_users == 2
 
 
-def test_one_street_without_sidewalks_is_a_world_and_people_walk_where_they_are_told(tmp_path):
+def test_people_walk_along_streets_without_sidewalks(tmp_path):
     bare = edge("east", (DRIVE, 3.5, [(0.0, 0.0, 0.0), (400.0, 0.0, 0.0)]))
     walker = drive("walker", speed=1.0, start=60.0, y=3.0, tag="person")
-    rider = drive("rider", tag="person")  # and nothing else: where the ego is
-    world = made(tmp_path, bare, steps=together(drive(), walker, rider), ego_id="ego").build_scene(0)
+    rider = drive("rider", tag="person")  # at the position of the ego vehicle: a passenger
+    world = make_traffic(tmp_path, bare, steps=together(drive(), walker, rider), ego_id="ego").build_scene(0)
     (person,) = world.actors
     assert person.category == "pedestrian"
     np.testing.assert_allclose(np.ptp(person.trajectory.positions_m, axis=0), [4.0, 0.0, 0.0], atol=1e-9)
 
 
-def test_a_vehicle_that_is_told_longer_than_its_street_is_as_long_as_the_longest_body(tmp_path):
+def test_too_long_vehicles_get_the_longest_body(tmp_path):
     (tmp_path / "r.xml").write_text('<routes><vType id="train" vClass="truck" length="900"/></routes>')
     steps = together(drive(), drive("long", start=320.0, y=9.0, type="train"))
     edges = street(), street("north", y=9.0)
-    world = made(tmp_path, *edges, steps=steps, ego_id="ego", routes=(tmp_path / "r.xml",)).build_scene(0)
+    world = make_traffic(tmp_path, *edges, steps=steps, ego_id="ego", routes=(tmp_path / "r.xml",)).build_scene(0)
     assert [actor.name for actor in world.actors] in ([], ["truck long 0", "rear of truck long 0"])
     assert all(np.ptp(actor.mesh.vertices_m[:, 0]) < 14.0 for actor in world.actors)
 
 
-def test_who_is_too_wide_for_the_lane_between_two_kerbs_is_left_out(tmp_path):
+def test_vehicles_too_wide_for_a_lane_are_omitted(tmp_path):
     kerbs = [(WALK, 2.0, [(0.0, y, 0.0), (400.0, y, 0.0)]) for y in (-2.1, 2.1)]
     lane = edge("east", kerbs[0], (DRIVE, 2.2, [(0.0, 0.0, 0.0), (400.0, 0.0, 0.0)]), kerbs[1])
     steps = together(drive(), drive("bus", start=90.0, type="bus"), drive("cyclist", start=120.0, type="bicycle"))
     with pytest.warns(UserWarning, match=r"^1 of 2 road users .* \('bus'\)"):
-        world = made(tmp_path, lane, steps=steps, ego_id="ego").build_scene(0)
+        world = make_traffic(tmp_path, lane, steps=steps, ego_id="ego").build_scene(0)
     assert [actor.category for actor in world.actors] == ["cyclist"]
 
 
-def test_people_walk_on_the_pavement_and_step_down(tmp_path):
+def test_people_step_down_from_sidewalks(tmp_path):
     walks = {
         t: vehicle("p", 60.0, -3.0 + 0.5 * t, 0.0, tag="person") for t in (round(0.2 * k, 1) for k in range(31))
     }  # fmt: skip
-    world = made(tmp_path, steps=together(drive(until=6.0, y=9.0), walks), ego_id="ego", duration_s=6.0).build_scene(0)
+    world = make_traffic(
+        tmp_path, steps=together(drive(until=6.0, y=9.0), walks), ego_id="ego", duration_s=6.0
+    ).build_scene(0)
     height_m = world.actors[0].trajectory.positions_m[:, 2]
     assert height_m[0] == pytest.approx(0.15)
     assert height_m[-1] == pytest.approx(0.0)
@@ -116,59 +118,59 @@ def test_people_walk_on_the_pavement_and_step_down(tmp_path):
     assert np.abs(np.diff(height_m)).max() < 0.08
 
 
-def test_on_a_bridge_one_stands_on_its_deck(tmp_path):
+def test_bodies_on_bridges_stand_on_decks(tmp_path):
     over = edge("over", ("", 7.0, [(100, -150, 0), (100, -60, 6), (100, 60, 6), (100, 150, 0)]))
     above = {t: vehicle("up", 100.0, -20 + 10 * t, 0.0, z=6.0) for t in drive()}
-    world = made(tmp_path, street(), over, steps=together(drive(start=100.0, z=0.0), above), ego_id="ego").build_scene(
-        0
-    )
+    world = make_traffic(
+        tmp_path, street(), over, steps=together(drive(start=100.0, z=0.0), above), ego_id="ego"
+    ).build_scene(0)
     np.testing.assert_allclose(world.actors[0].trajectory.positions_m[:, 2], 6.0, atol=0.15)
     np.testing.assert_allclose(world.ego.trajectory.positions_m[:, 2], 0.0, atol=0.1)
 
 
 @pytest.mark.parametrize("z", [(0.0, 0.0), (0.0, 12.0)])
-def test_houses_stand_beside_streets_and_apart(z, tmp_path):
-    # At right angles, so that lots of either lie on the other and on its lots.
+def test_houses_keep_off_streets_and_each_other(z, tmp_path):
+    # At right angles, so that the sides of each street overlap the other one and its sides.
     north = edge("north", ("", 3.5, [(100, -200, z[1] / 4), (100, 200, z[1] / 4)]))
-    world = made(tmp_path, street(z=z), north, built_share=1.0, ego_id="ego").build_scene(0)
+    world = make_traffic(tmp_path, street(z=z), north, built_share=1.0, ego_id="ego").build_scene(0)
     ground, _, houses, _ = world.static_meshes
-    outlines_m = corners_of(houses)
+    outlines_m = find_corners(houses)
     polygons = shapely.polygons(outlines_m)
     assert len(polygons) > 25
     assert all(polygon.exterior.is_ccw for polygon in polygons)
-    # The world begins 47 m along the street.
+    # The origin is 47 m along the street.
     taken = [shapely.box(-47.0, -3.75, 353.0, 1.75), shapely.box(51.25, -200.0, 54.75, 200.0)]
     assert min(shapely.distance(polygons, piece).min() for piece in taken) > 0.4
     one, other = shapely.STRtree(polygons).query(polygons, predicate="intersects")
     assert (one == other).all()
     middles_m = outlines_m.mean(axis=1)
     east = np.abs(middles_m[:, 0] - 53.0) > 40.0
-    assert {-1.0, 1.0} == set(np.sign(middles_m[east, 1]))  # of a one-way street, too
+    assert {-1.0, 1.0} == set(np.sign(middles_m[east, 1]))  # on both sides, also of a one-way street
     heights_m = houses.vertices_m[:, 2].reshape(-1, 8)
     assert heights_m[:, 4:].min() - ground.vertices_m[:, 2].min() > 4.9
 
 
-def test_what_stands_beside_streets_keeps_off_them_and_off_houses(tmp_path):
+def test_roadside_objects_keep_off_streets_and_houses(tmp_path):
     north = edge("north", ("", 3.5, [(100, -200, 0), (100, 200, 0)]))
-    world = made(tmp_path, street(), north, built_share=0.3, ego_id="ego").build_scene(0)
+    world = make_traffic(tmp_path, street(), north, built_share=0.3, ego_id="ego").build_scene(0)
     houses, others = world.static_meshes[2:]
-    standing = [shapely.Polygon(outline) for outline, low_m, _ in pieces(others) if low_m < 0.1]
+    standing = [shapely.Polygon(outline) for outline, low_m, _ in iterate_pieces(others) if low_m < 0.1]
     assert len(standing) > 100
     around = shapely.STRtree(standing)
     streets = [shapely.box(-47.0, -3.75, 353.0, 1.75), shapely.box(51.25, -200.0, 54.75, 200.0)]
-    assert len(around.query([*streets, *shapely.polygons(corners_of(houses))], predicate="intersects")[0]) == 0
+    assert len(around.query([*streets, *shapely.polygons(find_corners(houses))], predicate="intersects")[0]) == 0
 
 
-def corners_of(houses):
+def find_corners(houses):
     return houses.vertices_m.reshape(-1, 8, 3)[:, :4, :2]
 
 
-def test_a_narrow_gap_between_carriageways_is_a_median_and_a_wide_one_is_not(tmp_path):
+def test_only_narrow_gaps_between_carriageways_are_medians(tmp_path):
     for gap, found in ((2.0, 1), (8.0, 0)):
         folder = tmp_path / str(gap)
         folder.mkdir()
         ways = [edge(name, ("", 3.5, [(0, y, 0), (400, y, 0)])) for name, y in (("a", 0.0), ("b", 3.5 + gap))]
-        world = made(folder, *ways, built_share=0.0, ego_id="ego").build_scene(0)
+        world = make_traffic(folder, *ways, built_share=0.0, ego_id="ego").build_scene(0)
         raised = [mesh for mesh in world.static_meshes[1:] if np.ptp(mesh.vertices_m[:, 2]) < 0.5]
         assert len(raised) == found
         if raised:
@@ -179,23 +181,26 @@ def test_a_narrow_gap_between_carriageways_is_a_median_and_a_wide_one_is_not(tmp
 
 
 def test_open_country_has_no_houses(tmp_path):
-    world = made(tmp_path, built_share=0.0, ego_id="ego").build_scene(0)
+    world = make_traffic(tmp_path, built_share=0.0, ego_id="ego").build_scene(0)
     assert len(world.static_meshes) == 3
     assert world.static_meshes[2].vertices_m[:, 2].max() < 12.0
-    assert len(made(tmp_path, built_share=0.0, roadside_density=0.0, ego_id="ego").build_scene(0).static_meshes) == 2
+    assert (
+        len(make_traffic(tmp_path, built_share=0.0, roadside_density=0.0, ego_id="ego").build_scene(0).static_meshes)
+        == 2
+    )
 
 
-def test_cars_are_parked_in_bays_only(tmp_path):
+def test_cars_park_only_in_bays(tmp_path):
     line = [(0, 4), (400, 4)]
     bays = edge("bays", ('type="parking" disallow="all"', 2.3, line))
     far = [edge(name, (who, 2.3, line)) for name, who in (("s", 'disallow="all"'), ("d", ""))]
-    parked = made(tmp_path, street(), bays, ego_id="ego", parked_share=1.0).build_scene(0).static_actors
+    parked = make_traffic(tmp_path, street(), bays, ego_id="ego", parked_share=1.0).build_scene(0).static_actors
     assert 40 < len(parked) < 80
     places_m = np.array([actor.trajectory.positions_m[0] for actor in parked])
     np.testing.assert_allclose(places_m[:, 1], 4.0)
     assert np.diff(np.sort(places_m[:, 0])).min() > 4.0
-    assert not made(tmp_path, street(), bays, ego_id="ego", parked_share=0.0).build_scene(0).static_actors
-    assert not made(tmp_path, street(), *far, ego_id="ego", parked_share=1.0).build_scene(0).static_actors
+    assert not make_traffic(tmp_path, street(), bays, ego_id="ego", parked_share=0.0).build_scene(0).static_actors
+    assert not make_traffic(tmp_path, street(), *far, ego_id="ego", parked_share=1.0).build_scene(0).static_actors
 
 
 @pytest.mark.parametrize(
@@ -219,14 +224,14 @@ def test_cars_are_parked_in_bays_only(tmp_path):
         ({"begin_s": 3.0}, "no car that could be the ego"),
         (
             {"ego_id": "ego", "begin_s": 2.0, "duration_s": 2.0, "steps": together(drive(start=335.0, speed=30.0))},
-            r"the ego vehicle is farther than 10 m from all streets of the network at t = 2\.6 s: it leaves them, or the data",
+            r"the ego vehicle is farther than 10 m from all streets of the network at t = 2\.6 s: it leaves them",
         ),
         ({"ego_id": "ego", "steps": together(drive(y=9000.0))}, "farther than 10 m from all streets .* t = 0 s"),
     ],
 )
-def test_without_an_ego_there_is_no_world(options, message, tmp_path):
+def test_missing_ego_is_explained(options, message, tmp_path):
     with pytest.raises(ValueError, match=message):
-        made(tmp_path, **options).build_scene(0)
+        make_traffic(tmp_path, **options).build_scene(0)
 
 
 @pytest.mark.parametrize(
@@ -244,13 +249,13 @@ def test_without_an_ego_there_is_no_world(options, message, tmp_path):
         ({}, "type: traffic is one of"),
     ],
 )
-def test_documents_that_make_no_sense_are_refused(content, message):
+def test_contradictory_settings_are_rejected(content, message):
     with pytest.raises(ValueError, match=message):
         Scenario.model_validate({"name": "s", "traffic": content})
 
 
-def test_files_lie_beside_the_document_and_count_as_content(tmp_path):
-    made(tmp_path)
+def test_files_are_relative_to_the_document(tmp_path):
+    make_traffic(tmp_path)
     document = tmp_path / "s.yaml"
     document.write_text("name: s\ntraffic: {type: sumo, net: a.net.xml, fcd: fcd.xml, duration_s: 4.0}")
     traffic = Scenario.load(document).traffic

@@ -1,4 +1,4 @@
-"""Little networks and floating car data, written by hand: SUMO is not asked."""
+"""Small networks and floating car data that are written without SUMO."""
 
 LANE = '<lane id="{edge}_{index}" index="{index}" {who} width="{width}" speed="13.9" length="9" shape="{shape}"/>'
 XODR = """<OpenDRIVE><header revMajor="1" revMinor="4"/><road name="r" length="300" id="1" junction="-1"><planView>
@@ -18,7 +18,7 @@ def places(line):
 
 
 def edge(name, *lanes, function="normal"):
-    """Lanes are (who, width, line), from the outer side inwards."""
+    """Format an edge; lanes are (permissions, width, line), from the outer side inwards."""
     rows = [
         LANE.format(edge=name, index=k, who=who, width=width, shape=places(line))
         for k, (who, width, line) in enumerate(lanes)
@@ -33,7 +33,7 @@ def write_net(path, *edges, junctions=(), more=""):
 
 
 def street(name="east", *, y=0.0, z=(0.0, 0.0), length=400.0, shift=(0.0, 0.0)):
-    """One way to the east, 3.5 m wide with its middle at y, and a sidewalk 2 m wide on its right."""
+    """Format a one-way street to the east, 3.5 m wide with its middle at y, and a sidewalk of 2 m on its right."""
     ends = [(shift[0], z[0]), (shift[0] + length, z[1])]
     line = lambda across: [(x, y + across + shift[1], height) for x, height in ends]  # noqa: E731
     return edge(name, (WALK, 2.0, line(-2.75)), (DRIVE, 3.5, line(0.0)))
@@ -46,14 +46,14 @@ def vehicle(name, x, y, angle=90.0, tag="vehicle", **more):
 
 
 def fcd(steps):
-    """Floating car data of {time: [rows]}."""
+    """Format floating car data from {time: [rows]}."""
     return "<fcd-export>" + "".join(
         f'<timestep time="{time_s}">{"".join(rows)}</timestep>' for time_s, rows in steps.items()
     ) + "</fcd-export>"  # fmt: skip
 
 
 def drive(name="ego", *, speed=10.0, start=50.0, y=0.0, until=4.0, shift=(0.0, 0.0), **more):
-    """Rows of one vehicle to the east, by time."""
+    """Format the rows by time of a vehicle that drives to the east."""
     times_s = [round(0.2 * k, 1) for k in range(round(until / 0.2) + 1)]
     return {t: vehicle(name, start + speed * t + shift[0], y + shift[1], **more) for t in times_s}
 

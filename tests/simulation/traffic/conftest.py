@@ -1,4 +1,4 @@
-"""Worlds that several tests look at, with every body a box of the built-in body's size: one convex piece a body."""
+"""Scenes of several tests; each body is a box of the size of the built-in body, so that it is convex."""
 
 from functools import cache
 
@@ -9,7 +9,7 @@ from torchcover.simulation import shapes
 from torchcover.simulation.traffic import HighwayTraffic, ParkingTraffic, UrbanTraffic
 from torchcover.simulation.traffic.fleet import load_bodies
 
-# Hills lift and tilt, and change no place: what overlaps is found out on a plain.
+# Hills only lift and tilt bodies: overlaps are tested on a plane.
 PLAIN = {"hill_height_std_m": 0.0}
 STRAIGHT = {**PLAIN, "max_bend_deg": 0.0, "turn_share": 0.0}
 KINDS = {
@@ -42,5 +42,5 @@ def bodies():
 
 @pytest.fixture(scope="session")
 def world():
-    """`world(kind, seed)`, built once."""
+    """Return the function `world(kind, seed)`, which builds each scene once."""
     return built

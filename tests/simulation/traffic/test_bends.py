@@ -1,4 +1,4 @@
-"""Streets that bend, turn and slope: the laws of alignments, and of what is built and driven along them."""
+"""Streets with bends, turns and slopes: alignments, scenery and traffic along them."""
 
 import numpy as np
 import pytest
@@ -20,7 +20,7 @@ RADIUS_M, REACH_M = 20.0, 1500.0
 STATIONS_M = np.arange(-300.0, 1200.0, 0.37)
 
 
-def drawn(seed, bend_deg=30.0, turn_share=0.5):
+def sample_street(seed, bend_deg=30.0, turn_share=0.5):
     generator = np.random.default_rng(seed)
     junctions = np.cumsum(generator.uniform(80, 130, 14)) - 250.0
     return sample_main_street(junctions, np.full(14, 5.0), bend_deg, turn_share, RADIUS_M, REACH_M, generator)
@@ -28,24 +28,24 @@ def drawn(seed, bend_deg=30.0, turn_share=0.5):
 
 @pytest.fixture(scope="module", params=[0, 1, 2])
 def street(request):
-    return drawn(request.param).alignment
+    return sample_street(request.param).alignment
 
 
-def test_a_straight_alignment_changes_nothing():
+def test_straight_alignments_change_nothing():
     x, y = STATIONS_M, np.linspace(-50.0, 50.0, len(STATIONS_M))
     poses = Alignment([0.0], [0.0]).compute_poses(x, y)
     np.testing.assert_array_equal(poses, np.stack([x, y, np.zeros_like(x)], axis=1))
 
 
-def test_a_circle_is_a_circle():
-    # Between its short ends: the centre lies to the left, a radius away.
+def test_constant_curvature_is_a_circle():
+    # Between its short transitions; the center lies to the left.
     arc = Alignment([0.0, 1e-3, 60.0, 60.001], [0.0, 1 / RADIUS_M, 1 / RADIUS_M, 0.0])
     places = arc.compute_poses(np.linspace(0.1, 59.0, 50), 3.0)[:, :2]
     np.testing.assert_allclose(np.linalg.norm(places - [5e-4, RADIUS_M], axis=1), RADIUS_M - 3.0, atol=1e-6)
 
 
-def test_it_is_as_long_as_its_stations_and_heads_where_it_goes(street):
-    # Gauss's rule is right where Simpson's, with a tenth of a knot, is.
+def test_alignment_length_and_heading_match_its_positions(street):
+    # Derivatives by central differences.
     step = 1e-3
     before, after = (street.compute_poses(STATIONS_M + shift, 0.0) for shift in (-step, step))
     moved = (after - before)[:, :2] / (2 * step)
@@ -61,7 +61,7 @@ def test_it_is_as_long_as_its_stations_and_heads_where_it_goes(street):
 
 @pytest.mark.parametrize("way", [1, -1])
 @pytest.mark.parametrize("left_m", [-12.0, 9.0])
-def test_beside_it_one_goes_as_far_as_one_gets(street, left_m, way):
+def test_offset_paths_have_exact_arc_lengths(street, left_m, way):
     line = OffsetPath(street, left_m, way, REACH_M)
     places = np.arange(REACH_M - 700.0, REACH_M + 700.0, 0.05)
     poses = line.compute_poses(places)
@@ -78,8 +78,8 @@ def test_beside_it_one_goes_as_far_as_one_gets(street, left_m, way):
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_courses_keep_within_bounds_and_away_from_themselves(seed):
-    found = drawn(seed)
+def test_main_streets_keep_limits_and_distance(seed):
+    found = sample_street(seed)
     assert found.turn_directions.any()
     assert not found.turn_directions[[0, -1]].any()
     assert (np.abs(np.cumsum(found.turn_directions)) <= 1).all()
@@ -91,7 +91,7 @@ def test_courses_keep_within_bounds_and_away_from_themselves(seed):
         < found.junction_half_lengths_m[found.turn_directions != 0]
     ).any(axis=1)
     assert curvature[~in_turn].max() <= 1 / MainStreetParams.min_radius_m + 1e-9
-    # Junctions that are passed straight on lie on straights, with their crossings.
+    # Junctions without a turn lie on straights, with their crossings.
     for middle, half in zip(
         junctions[found.turn_directions == 0], found.junction_half_lengths_m[found.turn_directions == 0], strict=True
     ):
@@ -102,12 +102,12 @@ def test_courses_keep_within_bounds_and_away_from_themselves(seed):
     assert away[far].min() >= MainStreetParams.min_clearance_m
 
 
-def test_without_bends_and_turns_a_course_is_straight():
-    assert drawn(0, bend_deg=0.0, turn_share=0.0).alignment.is_straight
+def test_main_street_without_bends_is_straight():
+    assert sample_street(0, bend_deg=0.0, turn_share=0.0).alignment.is_straight
 
 
-def test_territories_are_apart(street):
-    # Places that two stretches would both call theirs do not exist: whoever is nearest has them.
+def test_corridors_do_not_overlap(street):
+    # Each position belongs to the nearest stretch only.
     territory = StreetCorridor(street, (-400.0, 1300.0))
     station, left = np.meshgrid(np.arange(-200.0, 1100.0, 9.0), [-80.0, -40.0, 40.0, 80.0])
     station, left = station.ravel(), left.ravel()
@@ -121,7 +121,7 @@ def test_territories_are_apart(street):
     assert (nearest[~owned] < np.abs(left[~owned])).all()
 
 
-def test_cars_may_drive_as_fast_as_is_comfortable_and_brake_gently_for_it():
+def test_speed_limits_are_comfortable_and_reached_gently():
     section = CrossSection(2, 3.4)
     generator, shapes = np.random.default_rng(3), np.random.default_rng(4)
     streets = sample_street_plan(section, 25.0, 0.5, (-120.0, 900.0), 1400.0, generator, shapes)
@@ -137,13 +137,13 @@ def test_cars_may_drive_as_fast_as_is_comfortable_and_brake_gently_for_it():
     assert lane.speed_limits_mps.min() < 8.0
     braking = -np.diff(lane.speed_limits_mps**2) / (2 * SPEED_LIMIT_SPACING_M)
     assert braking.max() < 1.001 * STREETS.braking_mps2
-    # A bus keeps off the bus beside it.
+    # A bus does not touch the bus on the next lane.
     inner = section.min_turn_radius_m - (section.lanes_per_direction - 0.5) * section.lane_width_m
     corner = np.hypot(inner + 2.55 / 2, 6.0)
     assert corner < inner + section.lane_width_m - 2.55 / 2
 
 
-def test_hills_are_what_their_slopes_say_and_their_mesh_is_near():
+def test_hill_slopes_and_mesh_match_their_heights():
     hills = Hills(1.5, np.random.default_rng(1))
     places = np.random.default_rng(2).uniform(-200, 200, (500, 2))
     yaw_deg = np.linspace(0, 360, 500)
@@ -164,7 +164,7 @@ def test_hills_are_what_their_slopes_say_and_their_mesh_is_near():
     assert np.diff(np.unique(mesh.vertices_m[:, 0])).min() == 10.0
 
 
-def test_hills_of_a_motorway_are_high_and_nowhere_too_steep():
+def test_motorway_grades_are_limited():
     hills = Hills(100.0, np.random.default_rng(1), (1000.0, 2500.0), 0.04)
     places = np.random.default_rng(2).uniform(-5000, 5000, (20_000, 2))
     _, pitch, _ = hills.compute_heights_and_tilts(places, np.linspace(0, 360, 20_000)).T
@@ -173,7 +173,7 @@ def test_hills_of_a_motorway_are_high_and_nowhere_too_steep():
     assert np.ptp(hills.compute_heights_m(places)) > 10.0
 
 
-def test_a_slab_over_a_bent_net_is_closed_and_looks_outwards():
+def test_slab_over_a_bent_grid_is_closed():
     x, y = np.meshgrid(np.linspace(0, 30, 7), np.linspace(0, 8, 3), indexing="ij")
     net = Alignment([0.0, 5.0, 25.0, 30.0], [0.0, 0.04, 0.04, 0.0]).compute_poses(x, y)[..., :2]
     mesh = build_slab(net, (0.0, 0.15))
@@ -184,7 +184,7 @@ def test_a_slab_over_a_bent_net_is_closed_and_looks_outwards():
 
 @pytest.mark.parametrize("built_share", [0.0, 0.5, 1.0])
 @pytest.mark.parametrize("seed", [1, 2])
-def test_beside_streets_there_is_pavement_and_between_pavements_no_bare_ground(seed, built_share):
+def test_sidewalks_leave_no_narrow_gaps(seed, built_share):
     generator, shapes = np.random.default_rng(seed), np.random.default_rng(seed)
     seen_m, span_m = (-120.0, 700.0), (-440.0, 1020.0)
     streets = sample_street_plan(CrossSection(2), 25.0, 0.5, span_m, 1200.0, generator, shapes)
@@ -220,7 +220,7 @@ def test_beside_streets_there_is_pavement_and_between_pavements_no_bare_ground(s
         assert shapely.contains_xy(
             known, streets.main_alignment.compute_poses(along_m, side * left_m)[..., :2].reshape(-1, 2)
         ).all()
-    # Along the streets that cross it, too.
+    # Also along the streets that cross the main street.
     for (street, _, half_m), station_m, turn in zip(
         lines[1:], streets.junction_stations_m, streets.main_street.turn_directions, strict=True
     ):
@@ -236,7 +236,7 @@ def test_beside_streets_there_is_pavement_and_between_pavements_no_bare_ground(s
 
 
 @pytest.mark.parametrize("kind", ["hilly", "motorway"])
-def test_what_is_built_in_the_hills_is_closed_and_stands_on_the_ground(kind, world):
+def test_scenery_on_hills_is_closed_and_grounded(kind, world):
     w = world(kind, 0)
     for mesh in w.static_meshes[1:]:
         assert trimesh.Trimesh(mesh.vertices_m, mesh.faces, process=False).is_volume
@@ -255,7 +255,7 @@ def test_what_is_built_in_the_hills_is_closed_and_stands_on_the_ground(kind, wor
         above = positions[near, 2] - height(positions[near, :2])
         assert (above > -0.05).all()
         assert (above < (0.2 if actor.category == "pedestrian" else 0.05)).all()
-        # Its wheels stand on it, too.
+        # The wheels stand on the ground.
         if actor.category in ("car", "bus"):
             angles = np.deg2rad(actor.trajectory.angles_deg[::20][near])
             front = positions[near] + 1.4 * np.column_stack(
@@ -264,13 +264,13 @@ def test_what_is_built_in_the_hills_is_closed_and_stands_on_the_ground(kind, wor
             assert np.abs(front[:, 2] - height(front[:, :2])).max(initial=0.0) < (0.12 if actor is w.ego else 0.06)
 
 
-def test_a_city_without_bends_is_straight_and_nobody_comes_from_nowhere(world):
+def test_city_without_bends_is_straight(world):
     w = world("straight", 0)
     assert np.ptp(w.ego.trajectory.positions_m[:, 1:]) == -w.ego.trajectory.positions_m[0, 1]
     assert not any(actor.trajectory.is_transient for actor in w.actors)
 
 
-def test_the_ego_turns_at_junctions(world):
+def test_ego_turns_at_junctions(world):
     assert max(np.ptp(world("winding", seed).ego.trajectory.angles_deg[:, 0]) for seed in (0, 1)) > 60.0
     assert np.ptp(world("straight", 0).ego.trajectory.angles_deg[:, 0]) == 0.0
 

@@ -1,4 +1,4 @@
-"""Agents on lanes: lines, queues, lights, junctions."""
+"""Agents on lanes: polylines, queues, signals, junctions."""
 
 from itertools import pairwise
 
@@ -24,39 +24,39 @@ PARAMS = JunctionParams()
 LONG = Polyline(np.array([[0.0, 0.0], [2000.0, 0.0]]))
 
 
-def car(lane, place, driver=CAR):
+def make_car(lane, place, driver=CAR):
     return Agent("car", 5.0, lane, place, driver)
 
 
-def run(lanes, agents, offset=0.0, times_s=TIMES_S, **lights):
+def simulate(lanes, agents, offset=0.0, times_s=TIMES_S, **lights):
     return LaneSimulation(lanes, agents, TrafficSignals(np.array([offset]), **lights)).run(times_s)
 
 
-def test_a_queue_keeps_its_order_and_never_touches():
-    agents = [car(0, place, Driver(speed)) for place, speed in [(10, 20), (30, 25), (60, 5), (90, 30), (110, 9)]]
-    flow = run([Lane(LONG)], agents)
+def test_queues_keep_order_and_gaps():
+    agents = [make_car(0, place, Driver(speed)) for place, speed in [(10, 20), (30, 25), (60, 5), (90, 30), (110, 9)]]
+    flow = simulate([Lane(LONG)], agents)
     assert (np.diff(flow.lane_positions_m, axis=1) > 5.5).all()
-    # All end up at the speed of the slowest ahead of them.
+    # Each agent reaches the speed of the slowest one ahead.
     np.testing.assert_allclose(flow.speeds_mps[-1], [5, 5, 5, 9, 9], rtol=0.05)
 
 
-def test_who_cannot_stop_goes_on_and_is_through_before_the_others_get_green():
+def test_committed_vehicles_clear_the_junction_before_cross_green():
     for start in np.linspace(60.0, 200.0, 71):
         lanes = [Lane(LONG, (JunctionPassage(200.0, 225.0, 0, MAIN),))]
-        flow = run(lanes, [car(0, start)], green_s=(2.0, 18.0), times_s=np.arange(0.0, 12.0, 0.05))
+        flow = simulate(lanes, [make_car(0, start)], green_s=(2.0, 18.0), times_s=np.arange(0.0, 12.0, 0.05))
         changes = np.arange(0.0, 12.0, 0.05) > 8.0
         on_junction = (flow.lane_positions_m[:, 0] + 2.5 > 200.0) & (flow.lane_positions_m[:, 0] - 2.5 < 225.0)
         assert not (on_junction & changes).any()
         assert np.diff(flow.speeds_mps[:, 0]).min() / 0.05 > -6.0
 
 
-def test_waits_for_somebody_left_on_the_junction_in_spite_of_green():
+def test_agents_wait_for_vehicles_left_on_a_junction():
     lanes = [
         Lane(LONG, (JunctionPassage(200.0, 225.0, 0, MAIN),)),
         Lane(Polyline(np.array([[0.0, 0.0], [0.0, 2000.0]])), (JunctionPassage(200.0, 225.0, 0, CROSS),)),
     ]
-    stuck = car(1, 210.0, Driver(0.5))
-    flow = run(lanes, [car(0, 100.0), stuck], green_s=(50.0, 10.0))
+    stuck = make_car(1, 210.0, Driver(0.5))
+    flow = simulate(lanes, [make_car(0, 100.0), stuck], green_s=(50.0, 10.0))
     inside = flow.lane_positions_m[:, 1] - 2.5 < 225.0
     assert inside.sum() > 100
     assert (flow.lane_positions_m[inside, 0] + 2.5 <= 200.0).all()
@@ -64,33 +64,35 @@ def test_waits_for_somebody_left_on_the_junction_in_spite_of_green():
     assert flow.lane_positions_m[-1, 0] > 200.0
 
 
-def test_does_not_enter_a_junction_with_a_queue_behind_it():
+def test_agents_do_not_enter_blocked_junctions():
     lanes = [Lane(LONG, (JunctionPassage(200.0, 225.0, 0, MAIN),))]
-    flow = run(lanes, [car(0, 100.0), car(0, 232.0, Driver(1e-3, acceleration_mps2=1e-3))], green_s=(80.0, 10.0))
+    flow = simulate(
+        lanes, [make_car(0, 100.0), make_car(0, 232.0, Driver(1e-3, acceleration_mps2=1e-3))], green_s=(80.0, 10.0)
+    )
     assert (flow.lane_positions_m[:, 0] + 2.5 <= 200.0).all()
 
 
-def test_who_is_slow_to_cross_needs_green_to_be_left():
+def test_slow_agents_need_enough_remaining_green():
     gate = JunctionPassage(20.0, 40.0, 0, MAIN, min_green_s=15.0)
     walker = Driver(1.4, 0.4, 0.5, 1.0, 1.5)
-    flow = run([Lane(LONG, (gate,))], [car(0, 5.0, walker)], green_s=(20.0, 5.0))
+    flow = simulate([Lane(LONG, (gate,))], [make_car(0, 5.0, walker)], green_s=(20.0, 5.0))
     entered = TIMES_S[np.argmax(flow.lane_positions_m[:, 0] + 2.5 > 20.0)]
     assert 37.0 < entered < 40.0
 
 
-def test_a_coarse_time_step_gives_the_same_run():
+def test_frame_interval_does_not_change_the_simulation():
     lanes = [Lane(LONG, (JunctionPassage(200.0, 225.0, 0, MAIN),))]
-    agents = [car(0, 20.0), car(0, 60.0)]
-    # Green ends between two of the coarse times, and would still let the first one pass.
-    fine = run(lanes, agents, times_s=np.arange(0.0, 40.5, 0.1), green_s=(9.05, 18.0))
-    coarse = run(lanes, agents, times_s=np.arange(0.0, 40.5, 2.0), green_s=(9.05, 18.0))
+    agents = [make_car(0, 20.0), make_car(0, 60.0)]
+    # Green ends between two of the coarse frames.
+    fine = simulate(lanes, agents, times_s=np.arange(0.0, 40.5, 0.1), green_s=(9.05, 18.0))
+    coarse = simulate(lanes, agents, times_s=np.arange(0.0, 40.5, 2.0), green_s=(9.05, 18.0))
     np.testing.assert_allclose(
         fine.lane_positions_m[::20][: len(coarse.lane_positions_m)], coarse.lane_positions_m, atol=1e-6
     )
 
 
-def twin(lanes, agents, lights, times_s):
-    """(T, N) places, worked out for one agent after the other in the words of the rules."""
+def simulate_agent_by_agent(lanes, agents, lights, times_s):
+    """Compute positions (T, N) agent by agent, directly from the rules."""
     place, speed = (
         [agent.lane_position_m for agent in agents],
         LaneSimulation(lanes, agents, lights).speeds_mps.tolist(),
@@ -144,7 +146,7 @@ def twin(lanes, agents, lights, times_s):
     return np.array(found)
 
 
-def test_all_together_are_that_many_single_ones():
+def test_vectorized_simulation_matches_single_agents():
     generator = np.random.default_rng(0)
     gates = [JunctionPassage(200.0, 225.0, 0, MAIN), JunctionPassage(260.0, 285.0, 1, MAIN, min_green_s=4.0)]
     crossing = Polyline(np.array([[0.0, 0.0], [0.0, 2000.0]]))
@@ -164,12 +166,14 @@ def test_all_together_are_that_many_single_ones():
         TIMES_S[:250],
     )
     together = LaneSimulation(lanes, agents, lights).run(times_s)
-    np.testing.assert_allclose(together.lane_positions_m, twin(lanes, agents, lights, times_s), atol=1e-6)
+    np.testing.assert_allclose(
+        together.lane_positions_m, simulate_agent_by_agent(lanes, agents, lights, times_s), atol=1e-6
+    )
     held_up = (together.speeds_mps == 0.0).any(axis=0)
     assert 2 < held_up.sum() < len(agents)
 
 
-def test_green_is_exclusive_and_clearing_times_lie_between():
+def test_green_phases_are_exclusive_with_clearance():
     signals, times_s = TrafficSignals(np.array([0.0, 17.3, -211.0])), np.arange(0.0, 400.0, 0.05)
     left = signals.compute_remaining_green_s(times_s)
     green = left > 0
@@ -184,7 +188,7 @@ def test_green_is_exclusive_and_clearing_times_lie_between():
             np.testing.assert_allclose(waits, signals.yellow_s + signals.all_red_s, atol=0.11)
 
 
-def test_the_green_left_counts_down_to_the_change():
+def test_remaining_green_counts_down():
     signals = TrafficSignals(np.zeros(1), green_s=(20.0, 10.0), yellow_s=3.0, all_red_s=2.0)
     assert signals.cycle_s == 40.0
     np.testing.assert_allclose(signals.compute_remaining_green_s(0.0)[0], [20.0, -np.inf])
@@ -194,13 +198,13 @@ def test_the_green_left_counts_down_to_the_change():
     np.testing.assert_allclose(signals.compute_remaining_green_s(34.0 + 5 * 40.0)[0, CROSS], 1.0)
 
 
-def circle(radius, corners=720):
+def build_circle(radius, corners=720):
     angle = np.linspace(0, 2 * np.pi, corners + 1)
     return Polyline(radius * np.stack([np.cos(angle), np.sin(angle)], axis=1))
 
 
 @pytest.mark.parametrize("place", [-30.0, 0.0, 12.5, 100.0, 130.0])
-def test_a_straight_line_goes_on_beyond_its_ends(place):
+def test_straight_polylines_continue_beyond_their_ends(place):
     yaw = np.deg2rad(30.0)
     ends_m = np.array([1.0, 2.0]) + np.array([[0.0], [100.0]]) * [np.cos(yaw), np.sin(yaw)]
     x, y, yaw_deg = Polyline(ends_m).compute_poses(place)
@@ -210,13 +214,13 @@ def test_a_straight_line_goes_on_beyond_its_ends(place):
 
 def test_poses_on_a_circle():
     place = np.linspace(1.0, 300.0, 57)
-    poses = circle(50.0).compute_poses(place)
+    poses = build_circle(50.0).compute_poses(place)
     angle = place / 50.0
     np.testing.assert_allclose(poses[:, :2], 50 * np.stack([np.cos(angle), np.sin(angle)], axis=1), atol=0.01)
     np.testing.assert_allclose(poses[:, 2], np.rad2deg(angle) + 90, atol=0.05)
 
 
-def test_a_loop_closes_without_a_jump_and_repeats():
+def test_loops_close_smoothly_and_repeat():
     line = build_rounded_rectangle(80.0, 20.0, 6.0)
     assert line.length_m == pytest.approx(2 * (80 + 20) - 8 * 6 + 2 * np.pi * 6, rel=1e-3)
     place = np.arange(-30.0, line.length_m + 30.0, 0.1)

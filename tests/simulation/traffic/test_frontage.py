@@ -1,4 +1,4 @@
-"""What stands beside streets: off them, apart, on the ground, and as much of it as is asked for."""
+"""Roadside objects: clearance, overlaps, ground contact and densities."""
 
 import numpy as np
 import pytest
@@ -17,49 +17,53 @@ STREET = shapely.LineString(LINE_M).buffer(3.0, quad_segs=32)
 OFF = {name: 0.0 for name in KINDS if name not in HOUSES}
 
 
-def shifted(right_m):
+def offset_line(right_m):
     line = shapely.LineString(LINE_M).offset_curve(-right_m, quad_segs=64)
     return np.array(line.coords)
 
 
-def slope(places_m):
+def compute_slope_heights_m(places_m):
     return 0.05 * places_m[:, 0] + 0.02 * places_m[:, 1]
 
 
-def stood(times, zone="built", compute_heights_m=slope, sidewalk_areas=(), seed=0):
-    sides = [StreetSide("curb", shifted(3.3)), StreetSide(zone, shifted(5.3))]
+def place_objects(times, zone="built", compute_heights_m=compute_slope_heights_m, sidewalk_areas=(), seed=0):
+    sides = [StreetSide("curb", offset_line(3.3)), StreetSide(zone, offset_line(5.3))]
     return place_scenery(
         sides, [STREET], [STREET.buffer(1.9)], sidewalk_areas, compute_heights_m, times, np.random.default_rng(seed)
     )
 
 
 @pytest.fixture(scope="module")
-def usual():
-    return stood(1.0)
+def usual_objects():
+    return place_objects(1.0)
 
 
-def solids(meshes):
+def split_solids(meshes):
     return trimesh.Trimesh(*merge_meshes(list(meshes))[:2], process=False).split(only_watertight=False)
 
 
-def test_all_of_it_is_closed_and_stands_on_the_ground(usual):
-    for mesh in (*usual[0], *usual[1]):
+def test_roadside_objects_are_closed_and_grounded(usual_objects):
+    for mesh in (*usual_objects[0], *usual_objects[1]):
         assert trimesh.Trimesh(mesh.vertices_m, mesh.faces, process=False).is_volume
-    for solid in solids((*usual[0], *usual[1])):
-        foot_m = solid.vertices[:, 2].min() - slope(solid.vertices[:, :2])
-        # Some begin in the air: crowns, arms of lamps, plates of signs.
+    for solid in split_solids((*usual_objects[0], *usual_objects[1])):
+        foot_m = solid.vertices[:, 2].min() - compute_slope_heights_m(solid.vertices[:, :2])
+        # Crowns, arms of lamps and plates of signs are above the ground.
         assert foot_m.max() < 0.0 or foot_m.min() > 0.5 or len(solid.vertices) == 12
 
 
-def test_nothing_stands_on_the_street_and_houses_stand_off_the_sidewalk(usual):
-    houses, others = usual
-    feet = [shapely.MultiPoint(s.vertices[:, :2]).convex_hull for s in solids(others) if np.ptp(s.vertices[:, 2]) > 0.3]
+def test_objects_keep_off_streets_and_houses_off_sidewalks(usual_objects):
+    houses, others = usual_objects
+    feet = [
+        shapely.MultiPoint(s.vertices[:, :2]).convex_hull
+        for s in split_solids(others)
+        if np.ptp(s.vertices[:, 2]) > 0.3
+    ]
     crowns = [foot for foot in feet if foot.area > 2.0]
     assert not any(foot.intersects(STREET) for foot in feet if foot not in crowns)
-    assert min(shapely.MultiPoint(s.vertices[:, :2]).distance(STREET) for s in solids(houses)) > 1.8
+    assert min(shapely.MultiPoint(s.vertices[:, :2]).distance(STREET) for s in split_solids(houses)) > 1.8
 
 
-def test_around_a_corner_nothing_is_stretched():
+def test_objects_at_corners_are_not_stretched():
     turn = np.linspace(0.0, np.pi / 2, 8)
     around_m = 3.0 * np.column_stack([np.cos(turn), np.sin(turn)])
     line_m = np.concatenate([[[3.0, -80.0]], around_m, [[-80.0, 3.0]]])
@@ -73,34 +77,34 @@ def test_around_a_corner_nothing_is_stretched():
     assert lengths_m.max() < longest_m / 0.6
 
 
-def test_densities_are_times_as_much_down_to_none():
-    few, usual, many = (sum(len(m.faces) for m in stood(times)[1]) for times in (0.25, 1.0, 3.0))
+def test_density_factors_scale_object_counts():
+    few, usual, many = (sum(len(m.faces) for m in place_objects(times)[1]) for times in (0.25, 1.0, 3.0))
     assert 0 < few < usual < many
-    assert stood(0.0)[1] == []
-    assert stood(0.0)[0]
-    hedges = stood({**OFF, "hedge": 1.0})[1]
+    assert place_objects(0.0)[1] == []
+    assert place_objects(0.0)[0]
+    hedges = place_objects({**OFF, "hedge": 1.0})[1]
     assert len(hedges) == 1
     assert np.ptp(hedges[0].material_indices) == 0
-    assert stood({**OFF, "hedge": 1.0}, "open") == ([], [])
+    assert place_objects({**OFF, "hedge": 1.0}, "open") == ([], [])
 
 
-def test_nothing_stands_where_there_are_no_sides():
-    assert place_scenery([], [STREET], [], [], slope, 1.0, np.random.default_rng(0)) == ([], [])
+def test_no_sides_give_no_objects():
+    assert place_scenery([], [STREET], [], [], compute_slope_heights_m, 1.0, np.random.default_rng(0)) == ([], [])
 
 
-def test_lines_may_be_short_and_their_corners_coincide():
+def test_short_lines_and_repeated_corners_are_accepted():
     short = StreetSide("curb", np.array([[0.0, 0.0], [0.3, 0.0]]))
-    twice = StreetSide("open", np.repeat(shifted(5.3), 2, axis=0))
-    _, others = place_scenery([short, twice], [STREET], [], [], slope, 1.0, np.random.default_rng(0))
+    twice = StreetSide("open", np.repeat(offset_line(5.3), 2, axis=0))
+    _, others = place_scenery([short, twice], [STREET], [], [], compute_slope_heights_m, 1.0, np.random.default_rng(0))
     assert others
     assert all(np.isfinite(mesh.vertices_m).all() for mesh in others)
 
 
-def test_what_stands_on_pavement_is_a_kerb_higher_and_nothing_stands_across_its_edge():
-    flat = stood(
+def test_objects_on_sidewalks_are_raised_by_a_curb():
+    flat = place_objects(
         1.0, compute_heights_m=lambda places_m: np.zeros(len(places_m)), sidewalk_areas=[shapely.box(-50, -80, 60, 40)]
     )
-    for solid in solids((*flat[0], *flat[1])):
+    for solid in split_solids((*flat[0], *flat[1])):
         x, foot_m = solid.vertices[:, 0], solid.vertices[:, 2].min()
         if foot_m < 0.5:
             inside = (x.min() > -50) and (x.max() < 60)
@@ -108,7 +112,7 @@ def test_what_stands_on_pavement_is_a_kerb_higher_and_nothing_stands_across_its_
 
 
 @pytest.mark.parametrize("times", [-0.1, 100.0, float("nan"), {"hedge": 100.0}, {"hedges": 1.0}, {"house": 0.0}])
-def test_other_densities_are_refused(times):
+def test_invalid_density_factors_are_rejected(times):
     with pytest.raises(ValidationError):
         TypeAdapter(RoadsideDensity).validate_python(times)
     with pytest.raises(ValueError, match="UrbanTraffic: roadside_density"):

@@ -1,4 +1,4 @@
-"""Lane changes: who changes, where one may, and that nobody is ever run into."""
+"""Lane changes: decisions, permitted places and safety."""
 
 import numpy as np
 import pytest
@@ -17,8 +17,8 @@ NEAR_M = np.array([[1500.0, 2000.0], [1500.0, 2000.0]])
 LEVEL = np.array([[0.0, 1.0], [0.0, 0.0]])
 
 
-def drive(*agents, heavy=(), exits=(), side_m=FAR_M, times_s=TIMES_S, kind="car", slope=0.0):
-    """What happened, and the (T, N) lanes, of agents (lane, place, driver)."""
+def simulate(*agents, heavy=(), exits=(), side_m=FAR_M, times_s=TIMES_S, kind="car", slope=0.0):
+    """Simulate agents (lane, position, driver); return the simulation, its history and the lanes (T, N)."""
     made = [Agent(kind, 5.0, lane, place, driver) for lane, place, driver in agents]
     marked = [np.isin(np.arange(len(made)), which) for which in (heavy, exits)]
     traffic = LaneChangeSimulation(made, *marked, side_m, np.random.default_rng(0), LEVEL + np.array([[0.0], [slope]]))
@@ -29,23 +29,23 @@ def drive(*agents, heavy=(), exits=(), side_m=FAR_M, times_s=TIMES_S, kind="car"
     return traffic, flow, lanes
 
 
-def test_a_faster_one_overtakes_on_the_left_and_comes_back():
-    traffic, flow, lanes = drive((2, 0.0, CAR), (2, 150.0, SLOW))
+def test_faster_vehicles_overtake_on_the_left():
+    traffic, flow, lanes = simulate((2, 0.0, CAR), (2, 150.0, SLOW))
     assert [(change.agent_index, change.old_lane_index, change.new_lane_index) for change in traffic.lane_changes] == [
         (0, 2, 1),
         (0, 1, 2),
     ]
     assert flow.lane_positions_m[-1, 0] > flow.lane_positions_m[-1, 1] + 50.0
-    # Hardly slower for it: the model alone would have followed.
+    # It hardly slows down; without a lane change it would have followed.
     assert flow.speeds_mps[100:, 0].min() > 28.0
     passing = np.abs(flow.lane_positions_m[:, 0] - flow.lane_positions_m[:, 1]) < 5.0
     assert (lanes[passing, 0] == 1).all()
 
 
-def test_nobody_comes_back_right_in_front_of_another_however_fast_they_get_away():
+def test_overtaking_vehicles_return_with_a_minimum_headway():
     pairs = [(2, 3000.0 * pair + 3.0 * pair * slow + 100.0 * slow, SLOW if slow else CAR)
              for pair in range(16) for slow in (0, 1)]  # fmt: skip
-    traffic, flow, _ = drive(*pairs)
+    traffic, flow, _ = simulate(*pairs)
     back = [change for change in traffic.lane_changes if change.new_lane_index == 2 and change.agent_index % 2 == 0]
     assert len(back) > 8
     for change in back:
@@ -57,22 +57,22 @@ def test_nobody_comes_back_right_in_front_of_another_however_fast_they_get_away(
         assert gap_m > 0.6 * flow.speeds_mps[at, slow] - 0.1
 
 
-def test_one_keeps_to_the_right_where_nothing_is_gained_on_the_left():
-    traffic, _, _ = drive((0, 0.0, CAR), (2, 400.0, Driver(34.5)))
+def test_agents_keep_right_without_a_gain():
+    traffic, _, _ = simulate((0, 0.0, CAR), (2, 400.0, Driver(34.5)))
     assert [(change.old_lane_index, change.new_lane_index) for change in traffic.lane_changes] == [(0, 1), (1, 2)]
 
 
-def test_nobody_goes_to_the_right_to_pass_there():
-    # The second looks first, while the one ahead of it is still in its lane; the shoulder's is free.
+def test_agents_do_not_pass_on_the_right():
+    # The second agent decides first, while the one ahead is still in its lane; the right lane is free.
     drives = [
-        drive((1, 60.0, ahead), (1, 0.0, CAR), heavy=[1], times_s=TIMES_S[:15])[0] for ahead in (SLOW, Driver(40.0))
+        simulate((1, 60.0, ahead), (1, 0.0, CAR), heavy=[1], times_s=TIMES_S[:15])[0] for ahead in (SLOW, Driver(40.0))
     ]
     assert [[change[:3] for change in traffic.lane_changes] for traffic in drives] == [[], [(1, 1, 2)]]
 
 
-def test_nobody_cuts_in_where_another_would_have_to_brake_hard():
-    # A fast one comes from behind: the change waits for it.
-    traffic, flow, _ = drive((2, 100.0, CAR), (2, 160.0, SLOW), (1, 40.0, Driver(40.0)))
+def test_lane_changes_force_no_hard_braking():
+    # The change waits for a fast vehicle from behind.
+    traffic, flow, _ = simulate((2, 100.0, CAR), (2, 160.0, SLOW), (1, 40.0, Driver(40.0)))
     (first, *_) = [change for change in traffic.lane_changes if change.agent_index == 0]
     at = int(np.argmax(flow.lane_positions_m[:, 0] > first.start_m))
     assert flow.lane_positions_m[at, 2] > flow.lane_positions_m[at, 0]
@@ -80,47 +80,47 @@ def test_nobody_cuts_in_where_another_would_have_to_brake_hard():
 
 
 @pytest.mark.parametrize(("lane", "slope"), [(2, 0.04), (6, -0.04), (2, 0.03)])
-def test_a_laden_lorry_goes_up_as_fast_as_its_power_lifts_it(lane, slope):
+def test_engine_power_limits_trucks_on_grades(lane, slope):
     limit = Driver(23.6, 1.6, 3.0, 0.6)
-    _, flow, _ = drive((lane, 0.0, limit), kind="truck", slope=slope, times_s=np.arange(0.0, 400.0, 0.5))
+    _, flow, _ = simulate((lane, 0.0, limit), kind="truck", slope=slope, times_s=np.arange(0.0, 400.0, 0.5))
     speed = flow.speeds_mps[-1, 0]
     assert 9.81 * (abs(slope) + 0.006) * speed + 9e-5 * speed**3 == pytest.approx(1000 / 120, rel=0.01)
     assert 15.0 < speed < 22.0
-    # Down there, and on the level, it keeps to the limit as all do.
+    # Downhill and on the level, it keeps its desired speed.
     for kind, down in (("truck", -slope), ("truck", 0.0), ("car", slope)):
-        _, flow, _ = drive((lane, 0.0, limit), kind=kind, slope=down, times_s=np.arange(0.0, 200.0, 0.5))
+        _, flow, _ = simulate((lane, 0.0, limit), kind=kind, slope=down, times_s=np.arange(0.0, 200.0, 0.5))
         assert flow.speeds_mps[100:, 0].min() > 22.0
         assert flow.speeds_mps.max() < 1.03 * 23.6
 
 
-def test_lorries_keep_out_of_the_lane_at_the_median():
+def test_trucks_keep_off_the_median_lane():
     agents = [(1, 0.0, CAR), (1, 150.0, SLOW), (2, 150.0, SLOW)]
-    assert any(change[:3] == (0, 1, 0) for change in drive(*agents)[0].lane_changes)
-    assert not any(change[:3] == (0, 1, 0) for change in drive(*agents, heavy=[0])[0].lane_changes)
+    assert any(change[:3] == (0, 1, 0) for change in simulate(*agents)[0].lane_changes)
+    assert not any(change[:3] == (0, 1, 0) for change in simulate(*agents, heavy=[0])[0].lane_changes)
 
 
 @pytest.mark.parametrize("direction", [0, LANES])
-def test_who_enters_and_who_exits_does_so_beside_the_lanes(direction):
+def test_agents_enter_and_exit_on_auxiliary_lanes(direction):
     agents = [(SIDE_LANE, 1300.0, CAR), (2, 1000.0, CAR), (2, 900.0, CAR)]
     agents = [(lane + direction, place, driver) for lane, place, driver in agents]
-    traffic, flow, lanes = drive(*agents, exits=[1], side_m=NEAR_M)
+    traffic, flow, lanes = simulate(*agents, exits=[1], side_m=NEAR_M)
     assert (lanes[-1] - direction).tolist() == [2, SIDE_LANE, 2]
     for change in traffic.lane_changes:
         if SIDE_LANE in (change.old_lane_index - direction, change.new_lane_index - direction):
             assert 1500.0 < change.start_m < change.start_m + change.length_m < 2100.0
-    # On ramps one is slow, and slows down before.
+    # Vehicles are slow on ramps and slow down before.
     assert flow.speeds_mps[flow.lane_positions_m[:, 0] < 1490.0, 0].max() < 22.5
     assert flow.speeds_mps[flow.lane_positions_m[:, 1] > 2100.0, 1].max() < 23.5
     assert np.diff(flow.speeds_mps[:, 1]).min() / 0.1 > -2.5
 
 
-def test_who_finds_no_gap_stays_on_the_ramp():
+def test_agents_without_a_gap_stay_on_ramps():
     queue = [(2, 1200.0 + 12.0 * number, Driver(20.0)) for number in range(40)]
-    _, _, lanes = drive((SIDE_LANE, 1400.0, CAR), *queue, side_m=NEAR_M, heavy=range(41), times_s=TIMES_S[:300])
+    _, _, lanes = simulate((SIDE_LANE, 1400.0, CAR), *queue, side_m=NEAR_M, heavy=range(41), times_s=TIMES_S[:300])
     assert lanes[-1, 0] == SIDE_LANE
 
 
-def test_in_the_thick_of_it_nobody_touches_anybody_in_either_lane():
+def test_agents_never_touch_in_dense_traffic():
     generator = np.random.default_rng(3)
     agents = [
         (lane, 55.0 * number + generator.uniform(0.0, 30.0), Driver(generator.uniform(18.0, 40.0)))
@@ -128,11 +128,11 @@ def test_in_the_thick_of_it_nobody_touches_anybody_in_either_lane():
         for number in range(25)
     ]
     exits = np.flatnonzero(np.array([agent[0] for agent in agents]) % LANES == 2)[::2]
-    traffic, flow, lanes = drive(*agents, exits=exits, side_m=NEAR_M - 500.0, times_s=TIMES_S[:400:2])
+    traffic, flow, lanes = simulate(*agents, exits=exits, side_m=NEAR_M - 500.0, times_s=TIMES_S[:400:2])
     assert len(traffic.lane_changes) > 60
     in_lane = lanes[:, :, None] == lanes[:, None]
     for change in traffic.lane_changes:
-        # Until well over the line, it is in its old lane, too.
+        # During most of the change, the agent also occupies its old lane.
         place_m = flow.lane_positions_m[:, change.agent_index]
         both = (place_m >= change.start_m) & (place_m < change.start_m + 0.6 * change.length_m)
         there = lanes == change.old_lane_index
@@ -142,18 +142,18 @@ def test_in_the_thick_of_it_nobody_touches_anybody_in_either_lane():
     assert apart[in_lane].min() > 5.0
 
 
-def test_a_change_begins_and_ends_without_a_jerk_and_its_slope_is_its_slope():
+def test_lane_change_is_smooth_and_its_slope_exact():
     change = LaneChange(0, 2, 1, 100.0, 150.0)
     place_m = np.linspace(50.0, 300.0, 2501)
     done, per_m = change.compute_progress(place_m)
     assert done[0] == 0.0
     assert done[-1] == 1.0
     np.testing.assert_allclose(np.gradient(done, place_m), per_m, atol=1e-5)
-    # At 30 m/s over 5 s, a lane's width is moved to the side with less than 1 m/s2.
+    # At 30 m/s over 5 s, the lateral acceleration for a lane width stays below 1 m/s2.
     assert np.abs(np.gradient(per_m, place_m)).max() * 3.6 * 30.0**2 < 1.0
 
 
-def test_ramps_leave_gently_and_what_stands_there_keeps_off():
+def test_ramps_bend_gently_and_objects_keep_off():
     lane = AuxiliaryLane(1000.0, 1500.0)
     stations = np.arange(0.0, 2500.0, 0.5)
     away_m, slope = lane.compute_offsets_m(stations)

@@ -1,4 +1,4 @@
-"""Pieces of scenery are closed bodies of the right size, at the right place."""
+"""Meshes of scenery are closed and have the right size and position."""
 
 import numpy as np
 import pytest
@@ -29,14 +29,14 @@ PIECES = {
 
 
 @pytest.mark.parametrize("name", PIECES)
-def test_pieces_are_closed_and_have_the_volume_of_the_formula(name):
+def test_scenery_meshes_are_closed_with_exact_volume(name):
     mesh, volume = PIECES[name]
     solid = trimesh.Trimesh(mesh.vertices_m, mesh.faces, process=False)
     assert solid.is_volume
     assert solid.volume == pytest.approx(volume)
 
 
-def test_a_crown_is_closed_and_begins_where_the_trunk_ends():
+def test_tree_crown_is_closed_above_its_trunk():
     crown = trimesh.Trimesh(TREE[1].vertices_m, TREE[1].faces, process=False)
     assert crown.is_volume
     assert TREE[1].vertices_m[:, 2].min() == pytest.approx(TREE[0].vertices_m[:, 2].max())
@@ -44,7 +44,7 @@ def test_a_crown_is_closed_and_begins_where_the_trunk_ends():
     assert np.linalg.norm(TREE[1].vertices_m[:, :2] - [1, 2], axis=1).max() == pytest.approx(1.5)
 
 
-def test_the_ground_covers_its_corners_and_few_merges_by_kind():
+def test_ground_covers_corners_and_kinds_are_merged():
     mesh = build_ground_plane((-5.0, -1.0), (5.0, 1.0))
     assert np.ptp(mesh.vertices_m, axis=0).tolist() == [10.0, 2.0, 0.0]
     merged = merge_by_kind([PIECES["block"][0], PIECES["box"][0]], [], [TREE[0]])

@@ -1,7 +1,7 @@
-"""No two bodies ever interpenetrate: separating axes in plan view with overlap in height, for all, over all times.
+"""No two bodies ever overlap: separating axes in the ground plane and overlap in height, at all times.
 
-Knows nothing of how worlds are made: it takes the boxes around the actors' meshes, and the connected pieces of the
-static meshes, each of which is convex here because the bodies of the fixture are boxes.
+The test only uses the boxes around the meshes of actors and the connected pieces of static meshes, which are convex
+because the bodies of the fixture are boxes.
 """
 
 import numpy as np
@@ -22,8 +22,8 @@ CASES = [(kind, seed) for kind in ("urban", "highway", "parking") for seed in (0
 ]
 
 
-def pieces(mesh):
-    """Plan outline, lowest and highest z of each connected piece."""
+def iterate_pieces(mesh):
+    """Iterate over outline, lowest and highest z of each connected piece."""
     edges = mesh.faces[:, [0, 1, 1, 2]].reshape(-1, 2)
     count = len(mesh.vertices_m)
     graph = coo_matrix((np.ones(len(edges)), edges.T), shape=(count, count))
@@ -35,8 +35,8 @@ def pieces(mesh):
         yield corners[hull.vertices, :2], corners[:, 2].min(), corners[:, 2].max()
 
 
-def triangles(mesh):
-    """The same of a slab that bends, cut into its upper triangles: none of it is convex."""
+def iterate_triangles(mesh):
+    """Iterate over the upper triangles of a bent slab, which is not convex, in the same form."""
     corners = mesh.vertices_m[mesh.faces]
     low, high = mesh.vertices_m[:, 2].min(), mesh.vertices_m[:, 2].max()
     for triangle in corners[(corners[..., 2] == high).all(axis=1)]:
@@ -52,19 +52,19 @@ class Solids:
         self.radius = np.linalg.norm(outline - self.centre[:, None], axis=2).max(axis=1)
 
     @classmethod
-    def of_static(cls, meshes, bent=()):
-        found = [piece for mesh in meshes for piece in pieces(mesh)]
-        found += [triangle for mesh in bent for triangle in triangles(mesh)]
+    def from_meshes(cls, meshes, bent=()):
+        found = [piece for mesh in meshes for piece in iterate_pieces(mesh)]
+        found += [triangle for mesh in bent for triangle in iterate_triangles(mesh)]
         corners = max(len(outline) for outline, _, _ in found)
         outline = np.stack([o[np.minimum(np.arange(corners), len(o) - 1)] for o, _, _ in found])
         return cls(outline, np.array([low for _, low, _ in found]), np.array([high for _, _, high in found]))
 
 
 class Movers:
-    """The boxes of actors at several times, each of which is one of those of their trajectories, or not among them."""
+    """Boxes of actors at several times of their trajectories."""
 
     def __init__(self, actors, times_s):
-        self.poses = np.full((len(times_s), len(actors), 4), np.nan)  # x, y, z, yaw; NaN who is not there
+        self.poses = np.full((len(times_s), len(actors), 4), np.nan)  # x, y, z, yaw; NaN where absent
         for k, actor in enumerate(actors):
             own = actor.trajectory
             place = np.minimum(np.searchsorted(own.times_s, times_s - 1e-6), len(own.times_s) - 1)
@@ -76,7 +76,7 @@ class Movers:
         self.upper = np.stack([actor.mesh.vertices_m.max(axis=0) for actor in actors])
 
     def at(self, number):
-        """Who is there at one of the times, and their numbers."""
+        """Return the solids of the actors that are present at a time, and their indices."""
         there = np.flatnonzero(~np.isnan(self.poses[number, :, 0]))
         lower, upper, poses = self.lower[there], self.upper[there], self.poses[number, there]
         x = np.stack([lower[:, 0], upper[:, 0], upper[:, 0], lower[:, 0]], axis=1)
@@ -86,8 +86,8 @@ class Movers:
         return Solids(outline, poses[:, 2] + lower[:, 2], poses[:, 2] + upper[:, 2]), there
 
 
-def overlaps(a, b, pairs):
-    """Of the candidate pairs (P, 2), those that no axis separates."""
+def find_overlaps(a, b, pairs):
+    """Find the candidate pairs (P, 2) that no axis separates."""
     first, second = pairs.T
     in_height = np.minimum(a.high[first], b.high[second]) - np.maximum(a.low[first], b.low[second]) > TOUCHING_M
     first, second = first[in_height], second[in_height]
@@ -101,54 +101,58 @@ def overlaps(a, b, pairs):
     return [(i, j, d) for i, j, d in zip(first, second, depth, strict=True) if d > TOUCHING_M]
 
 
-def near_pairs(a, b):
-    """(P, 2) indices of those whose circles in plan view meet: nobody else can overlap."""
+def find_near_pairs(a, b):
+    """Find pairs (P, 2) whose bounding circles overlap."""
     away = np.subtract.outer(a.centre[:, 0], b.centre[:, 0]) ** 2
     away += np.subtract.outer(a.centre[:, 1], b.centre[:, 1]) ** 2
     return np.argwhere(away < np.add.outer(a.radius, b.radius) ** 2)
 
 
-def among(solids):
-    """Overlaps of solids with each other."""
-    pairs = near_pairs(solids, solids)
-    return overlaps(solids, solids, pairs[pairs[:, 0] < pairs[:, 1]])
+def find_overlaps_among(solids):
+    """Find overlaps of solids with each other."""
+    pairs = find_near_pairs(solids, solids)
+    return find_overlaps(solids, solids, pairs[pairs[:, 0] < pairs[:, 1]])
 
 
-def at_rest(world, bends):
-    """All that stands on the ground and never moves; the blocks of streets that bend apart."""
+def collect_static_solids(world, bends):
+    """Collect all static solids; the blocks of bent streets are not convex."""
     parked = [actor.mesh.transform(actor.trajectory.interpolate(0.0)) for actor in world.static_actors]
-    return Solids.of_static([*world.static_meshes[1 + bends :], *parked], world.static_meshes[1:2] if bends else ())
+    return Solids.from_meshes([*world.static_meshes[1 + bends :], *parked], world.static_meshes[1:2] if bends else ())
 
 
-def test_the_checker_finds_what_overlaps_and_only_that():
+def test_overlap_checker_finds_exactly_the_overlaps():
     square = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
     turned = square @ np.array([[1.0, 1.0], [-1.0, 1.0]]) / np.sqrt(2)
     aside, corner, beyond = np.array([2.3, 0.0]), np.array([1.9, 1.9]), np.array([2.2, 2.2])
     outline = np.stack([square, turned + aside, square + corner, turned + beyond, square])
     solids = Solids(outline, np.array([0.0, 0.0, 0.0, 0.0, 1.0]), np.array([1.0, 1.0, 1.0, 1.0, 2.0]))
-    found = {(int(i), int(j)) for i, j, _ in among(solids)}
+    found = {(int(i), int(j)) for i, j, _ in find_overlaps_among(solids)}
     assert found == {(0, 1), (0, 2), (1, 2), (1, 3), (2, 3)}
 
 
 @pytest.mark.parametrize(("kind", "seed"), CASES)
-def test_what_rests_does_not_interpenetrate(kind, seed, world):
-    static = at_rest(world(kind, seed), kind in BENT)
-    found = among(static)
+def test_static_meshes_do_not_overlap(kind, seed, world):
+    static = collect_static_solids(world(kind, seed), kind in BENT)
+    found = find_overlaps_among(static)
     assert not found, [(static.centre[i], static.centre[j], d) for i, j, d in found[:3]]
 
 
 @pytest.mark.parametrize(("kind", "seed"), CASES)
-def test_who_moves_does_not_interpenetrate(kind, seed, world):
+def test_actors_do_not_overlap(kind, seed, world):
     w = world(kind, seed)
-    static = at_rest(w, kind in BENT)
+    static = collect_static_solids(w, kind in BENT)
     everybody = (w.ego, *w.actors)
     times_s = w.ego.trajectory.times_s[::5]
     movers = Movers(everybody, times_s)
     for number, time_s in enumerate(times_s):
         moving, who = movers.at(number)
-        found = [(i, j, d) for i, j, d in among(moving) if REAR_OF + everybody[who[i]].name != everybody[who[j]].name]
+        found = [
+            (i, j, d)
+            for i, j, d in find_overlaps_among(moving)
+            if REAR_OF + everybody[who[i]].name != everybody[who[j]].name
+        ]
         assert not found, [(time_s, everybody[who[i]].name, everybody[who[j]].name, d) for i, j, d in found[:3]]
         if number % 2:
             continue
-        found = overlaps(moving, static, near_pairs(moving, static))
+        found = find_overlaps(moving, static, find_near_pairs(moving, static))
         assert not found, [(time_s, everybody[who[i]].name, static.centre[j], d) for i, j, d in found[:3]]

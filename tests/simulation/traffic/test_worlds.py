@@ -1,4 +1,4 @@
-"""Whole worlds: who is where, what is under the wheels, and that nothing is chance."""
+"""Generated scenes: positions of road users, ground contact and reproducibility."""
 
 from dataclasses import replace
 
@@ -13,8 +13,8 @@ from torchcover.simulation.traffic import HighwayTraffic, ParkingTraffic, UrbanT
 WORLDS = ["urban", "narrow", "highway", "parking"]
 
 
-def leader_distance(world):
-    """(T,) distance to the nearest vehicle on the ego's way, centre to centre; inf without one."""
+def compute_leader_distance(world):
+    """Compute distances (T,) to the nearest vehicle ahead of the ego vehicle, center to center; inf without one."""
     ego = world.ego.trajectory
     yaw = np.deg2rad(ego.angles_deg[:, 0])
     nearest = np.full(len(yaw), np.inf)
@@ -26,13 +26,13 @@ def leader_distance(world):
     return nearest
 
 
-def speeds(actor):
+def compute_speeds(actor):
     steps = np.linalg.norm(np.diff(actor.trajectory.positions_m, axis=0), axis=1)
     return steps / np.diff(actor.trajectory.times_s)
 
 
 @pytest.mark.parametrize("kind", WORLDS)
-def test_the_same_seed_gives_the_same_world_and_another_seed_another(kind, bodies):
+def test_scenes_depend_on_the_seed_alone(kind, bodies):
     model = {"urban": UrbanTraffic, "highway": HighwayTraffic, "parking": ParkingTraffic}.get(kind, UrbanTraffic)
     options = {"num_lanes": 2} if kind == "narrow" else {}
     first, again = (model(duration_s=3.0, **options).build_scene(seed, bodies=bodies) for seed in (5, 5))
@@ -48,30 +48,30 @@ def test_the_same_seed_gives_the_same_world_and_another_seed_another(kind, bodie
 
 
 @pytest.mark.parametrize("kind", WORLDS)
-def test_a_world_is_complete(kind, world):
+def test_scenes_are_complete(kind, world):
     w = world(kind, 0)
     names = [actor.name for actor in w.actors] + [w.ego.name]
     assert len(set(names)) == len(names)
     assert len({id(actor.mesh) for actor in w.actors}) == len({actor.name.split()[0] for actor in w.actors})
     for actor in [w.ego, *w.actors]:
-        # On a cross street one may come from beyond its end, or go there.
+        # Actors on a cross street may appear or disappear at its end.
         assert actor.trajectory.is_transient or actor.trajectory.times_s[0] == 0.0
         assert actor.trajectory.is_transient or actor.trajectory.times_s[-1] == pytest.approx(w.duration_s)
         np.testing.assert_allclose(np.diff(actor.trajectory.times_s), w.time_step_s)
-        # Nobody jumps, either.
-        assert speeds(actor).max() < 40.0
+        # Actors do not jump.
+        assert compute_speeds(actor).max() < 40.0
     assert sum(len(mesh.faces) for mesh in w.static_meshes) < 90_000
     assert {actor.category for actor in w.actors} >= {"car"}
 
 
 @pytest.mark.parametrize("kind", WORLDS)
-def test_the_ego_stays_on_the_road_and_tilts_a_little(kind, world):
+def test_ego_stays_on_the_road_with_small_tilt(kind, world):
     ego = world(kind, 0).ego.trajectory
     assert (ego.positions_m[:, 2] == 0.0).all()
     _, pitch, roll = ego.angles_deg.T
     assert 0.1 < np.abs(pitch).max() < 2.0
     assert 0.1 < np.abs(roll).max() < 1.5
-    # Not of who stands, maybe for long, on one bump.
+    # Standing vehicles are excluded because they may stay on one bump.
     assert (
         abs(pitch[np.gradient(ego.positions_m[:, 0]) ** 2 + np.gradient(ego.positions_m[:, 1]) ** 2 > 0.01].mean())
         < 0.1
@@ -80,9 +80,9 @@ def test_the_ego_stays_on_the_road_and_tilts_a_little(kind, world):
 
 
 @pytest.mark.parametrize(("kind", "known"), [("straight", 4), ("winding", 4), ("parking", 3)])
-def test_what_is_known_of_faces_is_what_would_be_found(kind, known, world):
+def test_stored_outward_faces_match_computed_ones(kind, known, world):
     static = [mesh for mesh in world(kind, 0).static_meshes if mesh.is_outward is not None]
-    assert len(static) == known  # the ground, pavements, houses, and what is smaller
+    assert len(static) == known  # the ground, sidewalks, houses and small objects
     for mesh in static:
         np.testing.assert_array_equal(mesh.is_outward, find_outward_faces(mesh._replace(is_outward=None)))
 
@@ -103,7 +103,7 @@ def test_rays_always_hit_the_ground(kind, world):
         limit = np.full(50_000, 1000.0, dtype=np.float32)
         hits = RayCaster(static).cast(origin, directions, limit)
         assert (hits.body_indices >= 0).all()
-        # The ground alone has no holes either, whatever stands on it.
+        # The ground alone has no holes below objects.
         on_ground = RayCaster(static[:1]).cast(origin, directions, limit)
         assert (on_ground.body_indices == 0).all()
         if kind in WORLDS:
@@ -112,7 +112,7 @@ def test_rays_always_hit_the_ground(kind, world):
 
 
 @pytest.mark.parametrize("kind", WORLDS)
-def test_nobody_floats_and_nobody_sinks(kind, world):
+def test_actors_stand_on_the_ground(kind, world):
     w = world(kind, 0)
     on_pavement = np.array([0.0, 0.15])
     for actor in w.actors:
@@ -121,20 +121,20 @@ def test_nobody_floats_and_nobody_sinks(kind, world):
             assert (z == 0.0).all()
         assert z.min() >= 0.0
         assert z.max() <= 0.15 + 1e-12
-        # Stepping up or down takes a moment; else the feet are on one of the two surfaces.
+        # Except for steps at curbs, feet are on the road or on the sidewalk.
         assert (np.abs(z[:, None] - on_pavement).min(axis=1) < 1e-9).mean() > 0.8
 
 
-def test_the_city_drives_on_the_right_and_walks_on_pavements(world):
+def test_cities_drive_on_the_right(world):
     w = world("straight", 0)
     kerb = float(np.abs(w.static_meshes[1].vertices_m[:, 1]).min())
-    middles = junction_middles(w)
+    middles = find_junction_gaps(w)
     for actor in w.actors:
         x, y, z = actor.trajectory.positions_m.T
         side = x[0] - middles[np.abs(middles - x[0]).argmin()]
         heading = np.round(actor.trajectory.angles_deg[0, 0]) % 360
         if actor.category == "pedestrian":
-            # On the carriageway of the main street only at the crossings.
+            # Pedestrians are on the carriageway of the main street only at crossings.
             on_road = np.abs(y) < kerb - 0.5
             assert (z[on_road] == 0.0).all()
             assert not on_road.any() or abs(side) < 12.0 or not middles[0] < x[0] < middles[-1]
@@ -145,26 +145,26 @@ def test_the_city_drives_on_the_right_and_walks_on_pavements(world):
             assert 0.0 < (side if heading == 90.0 else -side) < 8.0
 
 
-def junction_middles(world):
-    """x of the gaps between blocks, from the blocks' own corners."""
+def find_junction_gaps(world):
+    """Find the x bounds of the gaps between blocks."""
     edges = np.unique(np.round(world.static_meshes[1].vertices_m[:, 0], 6))
     return (edges[1:-1:2] + edges[2::2]) / 2
 
 
 @pytest.mark.parametrize(("kind", "seed"), [("urban", 0), ("urban", 1), ("urban", 2), ("narrow", 0), ("highway", 0)])
-def test_the_ego_usually_follows_somebody(kind, seed, world):
-    distance = leader_distance(world(kind, seed))
+def test_ego_usually_follows_a_vehicle(kind, seed, world):
+    distance = compute_leader_distance(world(kind, seed))
     assert (distance < (80.0 if kind == "highway" else 40.0)).mean() >= 0.6
     assert distance.min() > 4.0
 
 
-def test_city_traffic_stops_at_lights_and_moves_on(world):
-    share = [np.mean(speeds(actor) < 0.1) for actor in world("urban", 0).actors if actor.category == "car"]
+def test_city_traffic_stops_at_signals(world):
+    share = [np.mean(compute_speeds(actor) < 0.1) for actor in world("urban", 0).actors if actor.category == "car"]
     assert 0.1 < np.mean(share) < 0.7
 
 
-def motion(actor):
-    """(T,) speed, acceleration ahead and to the left, and how far the heading is from where it goes, in degrees."""
+def compute_motion(actor):
+    """Compute speeds, forward and lateral accelerations, and the slip angles in degrees (T,)."""
     own, step = actor.trajectory, 0.1
     velocity = np.gradient(own.positions_m[:, :2], step, axis=0)
     forward, left = np.gradient(velocity, step, axis=0)[3:-3].T, velocity[3:-3].T
@@ -177,31 +177,31 @@ def motion(actor):
 def test_motorway_speeds_and_directions(world):
     w = world("highway", 0)
     for actor in [w.ego, *w.actors]:
-        speed, ahead, aside, off = motion(actor)
+        speed, ahead, aside, off = compute_motion(actor)
         assert speed.min() > 15.0
-        # Lorries have limiters at 90 km/h.
+        # Trucks have speed limiters at 90 km/h.
         assert speed.max() < (25.0 if actor.category == "truck" else 42.0)
         assert ahead.min() > -3.0
         assert np.abs(aside).max() < 2.5
-        # The sides of curves, and the steps of time, are told apart from it.
+        # Tolerance for the sides of curves and for the frame interval.
         assert np.abs(off).max() < 0.5
     assert sum(actor.category == "truck" for actor in w.actors) > 5
-    assert sum(np.ptp(motion(actor)[1]) > 0.2 for actor in w.actors) > len(w.actors) / 2
+    assert sum(np.ptp(compute_motion(actor)[1]) > 0.2 for actor in w.actors) > len(w.actors) / 2
     forward = np.cos(np.deg2rad(np.array([actor.trajectory.angles_deg[0, 0] for actor in w.actors])))
     assert (np.abs(forward) > 0.9).all()
     assert (forward > 0).sum() > 20
     assert (forward < 0).sum() > 20
 
 
-def test_people_cross_the_aisles_of_the_lot_and_cars_are_slow(world):
+def test_people_cross_aisles_and_cars_are_slow(world):
     w = world("parking", 0)
     people = [actor for actor in w.actors if actor.category == "pedestrian"]
     assert sum(np.ptp(actor.trajectory.positions_m[:, 1]) > 5.0 for actor in people) > 4
-    assert speeds(w.ego).max() < 4.0
-    assert speeds(w.ego).min() > 1.0
+    assert compute_speeds(w.ego).max() < 4.0
+    assert compute_speeds(w.ego).min() > 1.0
 
 
-def test_a_lot_is_surrounded_by_what_stands_beside_streets_and_that_keeps_off_it(bodies):
+def test_roadside_objects_surround_a_parking_lot(bodies):
     full, bare = (
         ParkingTraffic(duration_s=1.0, **keys).build_scene(0, bodies=bodies)
         for keys in ({}, {"built_share": 0, "roadside_density": 0})
@@ -209,7 +209,7 @@ def test_a_lot_is_surrounded_by_what_stands_beside_streets_and_that_keeps_off_it
     *same, houses, others = full.static_meshes
     assert len(bare.static_meshes) == len(same)
     places_m = np.concatenate([houses.vertices_m, others.vertices_m])[:, :2]
-    # Crowns hang over its edge, by less than half their width.
+    # Crowns extend over the edge by less than half of their width.
     least_m = np.abs(places_m / np.array([62.0, 36.0])).max(axis=1)[places_m[:, 1] > 0.0].min()
     assert 0.95 < least_m < 1.05
     sides = [(places_m[:, axis] * sign > 40.0).any() for axis in (0, 1) for sign in (1, -1)]
@@ -228,7 +228,7 @@ def test_a_lot_is_surrounded_by_what_stands_beside_streets_and_that_keeps_off_it
         (ParkingTraffic, {"num_moving_cars": 6, "crossings_per_aisle": 8, "parked_share": 1}),
     ],
 )
-def test_extreme_parameters_still_make_a_world(model, options, bodies):
+def test_extreme_parameters_build_scenes(model, options, bodies):
     w = model(**{"duration_s": 4.0, **options}).build_scene(0, bodies=bodies)
     assert w.static_meshes
     assert w.ego.trajectory.is_moving
@@ -247,23 +247,23 @@ def test_extreme_parameters_still_make_a_world(model, options, bodies):
         (ParkingTraffic, {"speed_mps": 20}),
     ],
 )
-def test_impossible_parameters_are_errors(model, options):
+def test_impossible_parameters_are_rejected(model, options):
     with pytest.raises(ValueError, match=f"{model.__name__}: {next(iter(options))}: .* is needed; got"):
         model(**options)
 
 
-def test_a_missing_body_is_an_error_that_names_it(bodies):
+def test_missing_bodies_are_named(bodies):
     few = {kind: mesh for kind, mesh in bodies.items() if kind not in ("bus", "adult")}
     with pytest.raises(ValueError, match="none for adult, bus"):
         UrbanTraffic().build_scene(0, bodies=few)
 
 
-def test_the_ego_may_have_a_body_of_its_own(bodies):
+def test_ego_can_have_its_own_mesh(bodies):
     w = UrbanTraffic(duration_s=2.0).build_scene(0, ego_mesh=bodies["bus"], bodies=bodies)
     assert w.ego.mesh is bodies["bus"]
 
 
-def test_who_is_left_out_changes_nothing(monkeypatch, bodies):
+def test_irrelevant_agents_change_nothing(monkeypatch, bodies):
     few = UrbanTraffic(duration_s=8.0).build_scene(3, bodies=bodies)
     monkeypatch.setattr(urban, "select_relevant_agents", lambda lanes, agents, duration_s: agents)
     monkeypatch.setattr(urban, "find_nearby_agents", lambda lanes, agents, place_m: np.arange(len(agents)))
@@ -274,8 +274,8 @@ def test_who_is_left_out_changes_nothing(monkeypatch, bodies):
         np.testing.assert_array_equal(one.trajectory.angles_deg, other.trajectory.angles_deg)
 
 
-def test_nobody_is_where_the_street_is_not_built(monkeypatch, bodies):
-    # Farther on a street may come back, through what stands beside it here.
+def test_actors_stay_on_the_built_street(monkeypatch, bodies):
+    # A distant part of the street may come near again.
     small = replace(urban.PARAMS, behind_m=30.0, ahead_m=60.0, corridor_margin_m=20.0)
     monkeypatch.setattr(urban, "PARAMS", small)
     city = UrbanTraffic(max_bend_deg=0.5, turn_share=0.0, duration_s=4.0, time_step_s=0.5).build_scene(0, bodies=bodies)
@@ -287,7 +287,7 @@ def test_nobody_is_where_the_street_is_not_built(monkeypatch, bodies):
     assert x_m.max() < last_m + 81.0
 
 
-def test_cross_streets_have_a_share_of_the_traffic(bodies):
+def test_cross_traffic_share_scales_cross_streets(bodies):
     def across(share):
         city = UrbanTraffic(
             max_bend_deg=0.0, turn_share=0.0, cross_traffic_share=share, duration_s=2.0, time_step_s=0.5
