@@ -1,4 +1,4 @@
-"""When a rig detects whom it meets: geometry, and the same as looking all the time."""
+"""Detection in encounters: equal to geometry, and to exhaustive search."""
 
 import math
 from itertools import islice
@@ -9,7 +9,7 @@ import torch
 import yaml
 from matplotlib.text import Text
 
-from tests.targets.worlds import EGO, FLOOR, lidar, on_target
+from tests.targets.scenes import EGO, FLOOR, build_lidar, count_points_on_target
 from torchcover.encounters import Criterion, Encounter, EncounterSet, StagedEncounter, detect_encounter
 from torchcover.encounters.detection import (
     NEVER,
@@ -34,32 +34,34 @@ WALL = {"type": "box", "size_m": [3.0, 0.5, 3.0]}
 SOLID = BodyGeometry(Scenario.model_validate({"name": "s", "ego": EGO, "bodies": [FLOOR]}).build_ego_mesh())
 
 
-def crossing(speed_kmh=36.0, other=None, **keys):
+def build_crossing(speed_kmh=36.0, other=None, **keys):
     other = {"body": "child_120cm", "speed_kmh": 5.4, "approach_distance_m": 1.5} | (other or {})
     return Encounter.model_validate({"name": "e", "ego": {"speed_kmh": speed_kmh}, "road_user": other, **keys})
 
 
-def rig(*sensors):
-    return Rig.model_validate({"name": "small", "sensors": list(sensors) or [lidar()]})
+def build_rig(*sensors):
+    return Rig.model_validate({"name": "small", "sensors": list(sensors) or [build_lidar()]})
 
 
-def mounted(*sensors):
+def mount_rig(*sensors):
     world = build_flat_ground().model_copy(update={"ego": Scenario.model_validate(
         {"name": "s", "ego": EGO, "bodies": [FLOOR]}).ego})  # fmt: skip
-    return MountedRig(rig(*sensors), set_ego(world, {}))
+    return MountedRig(build_rig(*sensors), set_ego(world, {}))
 
 
-def sighted(mounted_rig, case, criterion, **keys):
+def detect(mounted_rig, case, criterion, **keys):
     return detect_encounter(mounted_rig, StagedEncounter(case, mounted_rig.ego_solid), criterion, **keys)
 
 
-def ahead(name="ahead", **keys):
-    """A dense LiDAR in the middle of the front."""
-    return lidar(name, mount={"x_m": 1.9, "z_m": 1.2}, columns=900, channels=11, vertical_fov_deg=[-12, 0], **keys)
+def build_front_lidar(name="ahead", **keys):
+    """Build a dense LiDAR at the center of the front."""
+    return build_lidar(
+        name, mount={"x_m": 1.9, "z_m": 1.2}, columns=900, channels=11, vertical_fov_deg=[-12, 0], **keys
+    )
 
 
-def high(name, **keys):
-    return lidar(name, **{"mount": {"x_m": 1.0, "z_m": 1.9}, "columns": 900, "vertical_fov_deg": [-20, 0]} | keys)
+def build_roof_lidar(name, **keys):
+    return build_lidar(name, **{"mount": {"x_m": 1.0, "z_m": 1.9}, "columns": 900, "vertical_fov_deg": [-20, 0]} | keys)
 
 
 @pytest.mark.parametrize("speed_kmh", [18.0, 36.0])
@@ -70,13 +72,13 @@ def test_detection_begins_when_the_wall_no_longer_occludes(speed_kmh):
     }  # fmt: skip
     walls = [{"body": WALL, "lateral_gap_m": 0.6, "longitudinal_gap_m": 1.0}]
     walker = {"body": WALKER, "approach_distance_m": 2.1}
-    one = sighted(
-        mounted(scanner),
-        crossing(speed_kmh, walker, obstacles=walls),
+    one = detect(
+        mount_rig(scanner),
+        build_crossing(speed_kmh, walker, obstacles=walls),
         Criterion(points=1, consecutive_scans=1),
         num_start_offsets=1,
     )
-    # Seconds before the ego's front is at the walker's way, which the line past (-1.01, -1.6) meets at y = ..
+    # Seconds before the ego front reaches the path of the walker, which the line past (-1.01, -1.6) crosses at y.
     before_s = np.linspace(0.3, 1.39, 100_001)
     sensor_m = -0.5 - speed_kmh / 3.6 * before_s
     opens_s = before_s[-1.5 * before_s + 0.01 >= -1.6 * sensor_m / (sensor_m + 1.01)].max()
@@ -87,11 +89,13 @@ def test_detection_begins_when_the_wall_no_longer_occludes(speed_kmh):
 @pytest.mark.parametrize("kmh", [(50, 0), (50, 50), (20, 90), (90, 3), (90, -54), (0, 30), (-15, 20), (-15, -6)])
 def test_braking_time_equals_a_simulated_stop(kmh):
     ego, other = kmh
-    case = crossing(float(ego), {"yaw_deg": 0 if other < 0 else 180, "speed_kmh": abs(other) * math.copysign(1.0, ego)})
+    case = build_crossing(
+        float(ego), {"yaw_deg": 0 if other < 0 else 180, "speed_kmh": abs(other) * math.copysign(1.0, ego)}
+    )
     criterion = Criterion(deceleration_mps2=6.0, latency_s=0.4)
     speed_mps, towards_mps = abs(ego) / 3.6, case.approach_speed_mps
     assert towards_mps == pytest.approx(other / 3.6)
-    # The least gap from which none is lost until the ego stands, or is no faster than who drives ahead.
+    # The smallest gap that remains until the ego vehicle stops, or is no faster than the vehicle ahead.
     times_s = np.linspace(0.0, 0.4 + speed_mps / 6, 100_001)
     own_mps = np.maximum(speed_mps - 6 * np.maximum(times_s - 0.4, 0.0), 0.0)
     lost_m = np.cumsum(own_mps + towards_mps) * times_s[1]
@@ -100,20 +104,22 @@ def test_braking_time_equals_a_simulated_stop(kmh):
 
 
 def test_contact_time_is_when_outlines_touch():
-    assert StagedEncounter(crossing(36.0, {"body": BOX}), SOLID).contact_time_s == pytest.approx(
+    assert StagedEncounter(build_crossing(36.0, {"body": BOX}), SOLID).contact_time_s == pytest.approx(
         1.0 - 0.5 / 10, abs=2e-6
     )
     oncoming = {"body": BOX, "yaw_deg": 180, "speed_kmh": 18, "approach_distance_m": 5}
-    assert StagedEncounter(crossing(36.0, oncoming), SOLID).contact_time_s == pytest.approx(1.0 - 1.0 / 15, abs=2e-6)
-    behind = StagedEncounter(crossing(-36.0, {"body": BOX}), SOLID)
+    assert StagedEncounter(build_crossing(36.0, oncoming), SOLID).contact_time_s == pytest.approx(
+        1.0 - 1.0 / 15, abs=2e-6
+    )
+    behind = StagedEncounter(build_crossing(-36.0, {"body": BOX}), SOLID)
     assert behind.contact_time_s == pytest.approx(1.0 - 0.5 / 10, abs=2e-6)
     assert behind.compute_vehicle_T_road_user(np.array([1.0]))[0, :2, 3] == pytest.approx([-2.0, 0.0])
-    standing = crossing(0.0, {"body": BOX, "approach_distance_m": 3})
+    standing = build_crossing(0.0, {"body": BOX, "approach_distance_m": 3})
     assert StagedEncounter(standing, SOLID).contact_time_s == pytest.approx(2.0 - (1.0 + 1.0) / 1.5, abs=2e-6)
 
 
-def grazing(overlap_m, **ego):
-    """The end of the other passes the ego's corner, which goes straight, so far inside."""
+def build_grazing_encounter(overlap_m, **ego):
+    """Build an encounter in which the rear of a straight vehicle overlaps the corner of the ego vehicle."""
     box = {"type": "box", "size_m": [2.0, 1.009, 0.5]}
     other = {
         "body": box,
@@ -125,13 +131,13 @@ def grazing(overlap_m, **ego):
 
 
 def test_contacts_shorter_than_a_millisecond_are_found():
-    staged = StagedEncounter(grazing(0.004), SOLID)
+    staged = StagedEncounter(build_grazing_encounter(0.004), SOLID)
     assert staged.contact_time_s == pytest.approx(1.5 - 0.05045, abs=1e-9)
     whole_s = np.arange(2000) / 1000
     assert not find_overlaps(
         staged.road_user_solid.bounding_box, staged.compute_vehicle_T_road_user(whole_s), SOLID.bounding_box.corners_m
     ).any()
-    bent = StagedEncounter(grazing(0.4, radius_m=8), SOLID)
+    bent = StagedEncounter(build_grazing_encounter(0.4, radius_m=8), SOLID)
     finely_s = np.linspace(bent.contact_time_s - 1e-3, bent.contact_time_s + 1e-3, 20_001)
     touching = find_overlaps(
         bent.road_user_solid.bounding_box, bent.compute_vehicle_T_road_user(finely_s), SOLID.bounding_box.corners_m
@@ -150,12 +156,12 @@ def test_obstacles_lie_before_or_beyond_the_meeting_point(speed_kmh):
         "longitudinal_gap_m": 0.3,
         "lateral_gap_m": 0.7,
     }
-    staged = StagedEncounter(crossing(speed_kmh, {"body": BOX}, obstacles=[*rows, beyond]), SOLID)
+    staged = StagedEncounter(build_crossing(speed_kmh, {"body": BOX}, obstacles=[*rows, beyond]), SOLID)
     back = -math.copysign(1.0, speed_kmh)
     placed = {
         get_shape_name(one.body) + one.side + str(one.longitudinal_gap_m): pose[:2, 3] for one, pose in staged.obstacles
     }
-    # The other is 1 m wide along x, the ego 2 m along y.
+    # The road user is 1 m wide along x, the ego vehicle 2 m along y.
     assert placed["boxright0.5"] == pytest.approx([back * (0.5 + 0.5 + 1.0), -1.0 - 1.0 - 0.5])
     assert placed["boxright0.4"] == pytest.approx([back * (0.5 + 0.5 + 2.0 + 0.4 + 1.5), -1.0 - 2.0 - 0.25])
     assert placed["boxleft0.3"] == pytest.approx([-back * (0.5 + 0.3 + 0.5), 1.0 + 0.7 + 1.0])
@@ -168,7 +174,10 @@ def test_touching_obstacles_are_valid(speed_kmh, yaw_deg):
         {"body": body, "longitudinal_gap_m": 0.0, "lateral_gap_m": 0.0, "yaw_deg": yaw_deg}
         for body in ("van", "suv", WALL, BOX)
     ]
-    assert len(StagedEncounter(crossing(speed_kmh, {"approach_distance_m": 0.7}, obstacles=row), SOLID).obstacles) == 4
+    assert (
+        len(StagedEncounter(build_crossing(speed_kmh, {"approach_distance_m": 0.7}, obstacles=row), SOLID).obstacles)
+        == 4
+    )
 
 
 def test_bends_end_at_the_meeting_point():
@@ -223,8 +232,8 @@ HIDDEN = [
 
 
 def test_points_equal_a_simulation_with_the_road_user():
-    case = crossing(obstacles=HIDDEN)
-    small = mounted(ahead(), CAMERA, RADAR)
+    case = build_crossing(obstacles=HIDDEN)
+    small = mount_rig(build_front_lidar(), CAMERA, RADAR)
     staged = StagedEncounter(case, small.ego_solid)
     looks, child = EncounterPointCounter(small, staged, 0), Target.load("child")
     child = Target("child", staged.road_user_solid.mesh)
@@ -247,15 +256,17 @@ def test_points_equal_a_simulation_with_the_road_user():
         scans = Simulator(world, {"r": small.rig}, PaperReference(rows=2, columns=2)).simulate_frame(0).scans["r"]
         for k, (sensor, scan) in enumerate(zip(small.rig.sensors, scans, strict=True)):
             points = int(looks.count_points([k], np.array([step]))[0])
-            assert points == sensor.pixels_per_sample * on_target(scan.points, child, x_m, y_m, math.radians(yaw_deg))
+            assert points == sensor.pixels_per_sample * count_points_on_target(
+                scan.points, child, x_m, y_m, math.radians(yaw_deg)
+            )
             seen[k] += points
     assert (seen > 0).all()
 
 
 def test_results_equal_exhaustive_search():
-    case, criterion = crossing(obstacles=HIDDEN), Criterion(points=12, pixels=150)
-    small = mounted(ahead(dropout=0.3), ahead("noisy", rate_hz=20, range_noise_m=0.3), CAMERA)
-    found = sighted(small, case, criterion, num_start_offsets=4, seed=3)
+    case, criterion = build_crossing(obstacles=HIDDEN), Criterion(points=12, pixels=150)
+    small = mount_rig(build_front_lidar(dropout=0.3), build_front_lidar("noisy", rate_hz=20, range_noise_m=0.3), CAMERA)
+    found = detect(small, case, criterion, num_start_offsets=4, seed=3)
     staged = StagedEncounter(case, small.ego_solid)
     looks, sensors = EncounterPointCounter(small, staged, 3), small.rig.sensors
     for k, sensor in enumerate(sensors):
@@ -271,22 +282,22 @@ def test_results_equal_exhaustive_search():
     again, another = (EncounterPointCounter(small, staged, seed).count_points([1], known) for seed in (3, 4))
     assert (again == looks.count_points([1], known)).all()
     assert (another != again).any()
-    assert (found.ttc_s == found.sensor_ttc_s.max(axis=0)).all()  # none counts with another
+    assert (found.ttc_s == found.sensor_ttc_s.max(axis=0)).all()  # each is counted alone
     assert (found.ttc_without_sensor_s[0] == found.sensor_ttc_s[1:].max(axis=0)).all()
 
 
 def test_lidars_are_counted_together_and_failures_never_help():
     assert group_sensors([0.1, None, 0.05, 0.1, None, 0.2], range(6)) == [(1,), (4,), (0, 3, 2), (2,), (5, 0, 3, 2)]
     assert group_sensors([2, None, 1], [2]) == [(2,)]
-    few = lidar("few", columns=180, channels=8, vertical_fov_deg=[-20, 0])
-    found = sighted(mounted(few, few | {"name": "same"}), crossing(), Criterion(points=6), num_start_offsets=3)
+    few = build_lidar("few", columns=180, channels=8, vertical_fov_deg=[-20, 0])
+    found = detect(mount_rig(few, few | {"name": "same"}), build_crossing(), Criterion(points=6), num_start_offsets=3)
     assert (found.ttc_without_sensor_s <= found.ttc_s).all()
     assert (found.ttc_without_sensor_s == found.sensor_ttc_s[::-1]).all()
     assert (found.ttc_s > found.sensor_ttc_s[0]).any()
     for rate_hz in (10.001, 13, 20):
-        faster = sighted(
-            mounted(few, few | {"name": "fast", "rate_hz": rate_hz}),
-            crossing(),
+        faster = detect(
+            mount_rig(few, few | {"name": "fast", "rate_hz": rate_hz}),
+            build_crossing(),
             Criterion(points=6),
             num_start_offsets=3,
         )
@@ -295,21 +306,21 @@ def test_lidars_are_counted_together_and_failures_never_help():
 
 def test_slow_sensors_are_too_late_with_a_warning():
     with pytest.warns(UserWarning, match=r"3 scans of sensor 'top' take 3 s, .* ends after 0.98"):
-        found = sighted(mounted(lidar(rate_hz=1)), crossing(), Criterion(), num_start_offsets=2)
+        found = detect(mount_rig(build_lidar(rate_hz=1)), build_crossing(), Criterion(), num_start_offsets=2)
     assert not found.ttc_s.any()
     assert found.ttc_s.max() < found.censoring_ttc_s
-    unseen = crossing(20.0, {"approach_distance_m": None, "speed_kmh": 0}, max_lead_time_s=2)
+    unseen = build_crossing(20.0, {"approach_distance_m": None, "speed_kmh": 0}, max_lead_time_s=2)
     with pytest.warns(UserWarning, match="always too late"):
-        found = sighted(mounted(lidar(rate_hz=1)), unseen, Criterion(), num_start_offsets=2)
+        found = detect(mount_rig(build_lidar(rate_hz=1)), unseen, Criterion(), num_start_offsets=2)
     assert not found.ttc_s.any()
     assert found.ttc_s.max() < found.censoring_ttc_s
 
 
 def test_fog_delays_detection_and_early_detections_are_censored():
-    far = crossing(72.0, {"approach_distance_m": None, "speed_kmh": 0}, max_lead_time_s=3)
-    sensor = lidar(channels=60, vertical_fov_deg=[-4, 0], columns=7200, max_range_m=80)
-    found = [sighted(mounted(sensor), case, Criterion(points=1), num_start_offsets=2) for case in (
-        far, far.model_copy(update={"weather": crossing(weather="fog_50m").weather}))]  # fmt: skip
+    far = build_crossing(72.0, {"approach_distance_m": None, "speed_kmh": 0}, max_lead_time_s=3)
+    sensor = build_lidar(channels=60, vertical_fov_deg=[-4, 0], columns=7200, max_range_m=80)
+    found = [detect(mount_rig(sensor), case, Criterion(points=1), num_start_offsets=2) for case in (
+        far, far.model_copy(update={"weather": build_crossing(weather="fog_50m").weather}))]  # fmt: skip
     assert found[0].ttc_s.min() >= found[0].censoring_ttc_s
     assert found[0].ttc_s.min() > 2.5
     assert found[1].ttc_s.max() < found[1].censoring_ttc_s
@@ -318,7 +329,8 @@ def test_fog_delays_detection_and_early_detections_are_censored():
 
 FAMILY = {
     "name": "f", "ego": {"speed_kmh": [20, 40]}, "road_user": {"body": "child_120cm", "speed_kmh": {"from": 3, "to": 7},
-    "impact_location": {"from": 0.2, "to": 0.8}, "approach_distance_m": 1.5}, "obstacles": [{"body": ["hatchback", "van"]}],
+    "impact_location": {"from": 0.2, "to": 0.8}, "approach_distance_m": 1.5},
+    "obstacles": [{"body": ["hatchback", "van"]}],
 }  # fmt: skip
 
 
@@ -335,7 +347,7 @@ def test_lists_are_combined_and_ranges_sampled_evenly():
 
 def test_rows_have_intervals_over_samples():
     these = EncounterSet.model_validate({"name": "s", "num_samples": 8, "encounters": [FAMILY | {"obstacles": []}]})
-    two = rig(high("ahead"), high("top", columns=40))
+    two = build_rig(build_roof_lidar("ahead"), build_roof_lidar("top", columns=40))
     found = evaluate_encounters([two], these, Criterion(points=3), num_start_offsets=3, vehicle="suv")
     rows = found.rows
     assert [(row.speed_kmh, row.sample_count, row.first_sensor) for row in rows] == [(20, 8, "ahead"), (40, 8, "ahead")]
@@ -362,21 +374,26 @@ def test_highest_timely_speed_includes_all_lower_speeds():
         {"name": "s", "encounters": [FAMILY | {"ego": {"speed_kmh": [50, 10, 30]}, "obstacles": [], "road_user":
          {"body": "child_120cm", "speed_kmh": 5, "approach_distance_m": 1.5}}]}
     )  # fmt: skip
-    partly = evaluate_encounters(rig(high("ahead")), these, num_start_offsets=5)
+    partly = evaluate_encounters(build_rig(build_roof_lidar("ahead")), these, num_start_offsets=5)
     ttc_s = np.sort(partly.detections[0].ttc_s)
     between = Criterion(deceleration_mps2=50 / 3.6 / 2 / (ttc_s[2] - 0.1), latency_s=0.1)
-    found = evaluate_encounters(rig(high("ahead")), these, between, num_start_offsets=5)
+    found = evaluate_encounters(build_rig(build_roof_lidar("ahead")), these, between, num_start_offsets=5)
     assert [row.in_time_share for row in found.rows][-1] == 0.6
     assert list(found.find_max_speeds_kmh().values()) == [30.0]
     for brakes, expected, words in ((1e6, 50.0, "50"), (1.0, math.nan, "none")):
         found = evaluate_encounters(
-            rig(high("ahead")), these, Criterion(deceleration_mps2=brakes, latency_s=0.1), num_start_offsets=5
+            build_rig(build_roof_lidar("ahead")),
+            these,
+            Criterion(deceleration_mps2=brakes, latency_s=0.1),
+            num_start_offsets=5,
         )
         assert list(found.find_max_speeds_kmh().values()) == pytest.approx([expected], nan_ok=True)
         assert found.build_tables()[0].rows[0][1].text == words
-    standing = [crossing(float(kmh), {"approach_distance_m": 3}) for kmh in (-50, 0, -20)]
+    standing = [build_crossing(float(kmh), {"approach_distance_m": 3}) for kmh in (-50, 0, -20)]
     both = EncounterSet(name="s", encounters=tuple(standing))
-    found = evaluate_encounters(rig(high("ahead")), both, Criterion(deceleration_mps2=1.0), num_start_offsets=2)
+    found = evaluate_encounters(
+        build_rig(build_roof_lidar("ahead")), both, Criterion(deceleration_mps2=1.0), num_start_offsets=2
+    )
     assert (list(found.find_max_speeds_kmh().values()), found.build_tables()[0].rows[0][1].text) == ([0.0], "0")
     assert [row.speed_kmh for row in found.rows] == [0, -20, -50]
 
@@ -386,7 +403,7 @@ def test_animation_shows_vehicles_and_points():
     these = EncounterSet.model_validate(
         {"name": "s", "encounters": [FAMILY | {"ego": {"speed_kmh": [20, 90]}, "road_user": other}]}
     )
-    two = rig(high("ahead"), high("top", columns=40))
+    two = build_rig(build_roof_lidar("ahead"), build_roof_lidar("top", columns=40))
     pictures = list(
         islice(
             plot_encounter_animation(
@@ -443,7 +460,7 @@ def test_invalid_families_are_refused_once(keys, told, tmp_path):
     path = tmp_path / "set.yaml"
     path.write_text(yaml.safe_dump({"name": "s", "encounters": [family]}))
     with pytest.raises((ValueError, FileNotFoundError), match=told) as failure:
-        evaluate_encounters(rig(high("top")), path, num_start_offsets=1)
+        evaluate_encounters(build_rig(build_roof_lidar("top")), path, num_start_offsets=1)
     assert len(str(failure.value)) < 1000
 
 
@@ -459,16 +476,16 @@ def test_families_with_equal_names_are_refused():
 @pytest.mark.parametrize(
     ("case", "told"),
     [
-        (crossing(36, {"impact_location": 3.0, "yaw_deg": 0, "approach_distance_m": 4}), "never touch"),
-        (crossing(5.4, {"yaw_deg": 0}), "overlap from the beginning|never touch"),
-        (crossing(36, {"body": BOX, "yaw_deg": 0, "speed_kmh": 36}), "overlap from the beginning"),
-        (crossing(36, obstacles=[{"body": WALL, "lateral_gap_m": -1.0}]), "'box' is in the path of the ego"),
+        (build_crossing(36, {"impact_location": 3.0, "yaw_deg": 0, "approach_distance_m": 4}), "never touch"),
+        (build_crossing(5.4, {"yaw_deg": 0}), "overlap from the beginning|never touch"),
+        (build_crossing(36, {"body": BOX, "yaw_deg": 0, "speed_kmh": 36}), "overlap from the beginning"),
+        (build_crossing(36, obstacles=[{"body": WALL, "lateral_gap_m": -1.0}]), "'box' is in the path of the ego"),
         (
-            crossing(36, {"approach_distance_m": 3}, obstacles=[{"body": WALL, "longitudinal_gap_m": -1.0}]),
+            build_crossing(36, {"approach_distance_m": 3}, obstacles=[{"body": WALL, "longitudinal_gap_m": -1.0}]),
             "'box' is in the path of the road user",
         ),
         (
-            crossing(36, obstacles=[{"body": WALL}, {"body": "van", "longitudinal_gap_m": -0.1}]),
+            build_crossing(36, obstacles=[{"body": WALL}, {"body": "van", "longitudinal_gap_m": -0.1}]),
             "'box' and 'van' are inside one anot",
         ),
     ],
@@ -480,6 +497,6 @@ def test_impossible_encounters_are_refused(case, told):
 
 def test_invalid_encounters_are_refused_before_the_first_scan(monkeypatch):
     monkeypatch.setattr(MountedRig, "get_mounted_sensors", None)
-    both = crossing(), crossing(36, {"impact_location": 3.0, "yaw_deg": 0, "approach_distance_m": 4})
+    both = build_crossing(), build_crossing(36, {"impact_location": 3.0, "yaw_deg": 0, "approach_distance_m": 4})
     with pytest.raises(ValueError, match="never touch"):
-        evaluate_encounters(rig(), EncounterSet(name="s", encounters=both))
+        evaluate_encounters(build_rig(), EncounterSet(name="s", encounters=both))

@@ -1,4 +1,4 @@
-"""Who comes near in traffic, and when he is detected: geometry, and the same as looking all the time."""
+"""Approaches in traffic and their detection: equal to geometry, and to exhaustive search."""
 
 import math
 
@@ -9,7 +9,7 @@ import torch
 from tests.recordings.drives import CAR_SIZE_M
 from tests.recordings.drives import Drive as SyntheticDrive
 from tests.recordings.layouts import LAYOUTS
-from tests.targets.worlds import FLOOR, drive, lidar, rig, world
+from tests.targets.scenes import FLOOR, build_lidar, build_rig, build_scenario, write_trajectory
 from torchcover.data import SimulatedFrames
 from torchcover.detection import Boxes
 from torchcover.encounters import Criterion, EncounterResults
@@ -33,16 +33,16 @@ WALL = {"name": "wall", "shape": {"type": "box", "size_m": [24.0, 0.2, 3.0]}, "p
 
 @pytest.fixture(scope="module")
 def scenario(tmp_path_factory):
-    """At 10 m/s past a wall, from behind which a child walks; somebody comes from behind, and one stands aside."""
+    """Drive at 10 m/s past a wall that occludes a walking child; cars follow, overtake and drive aside."""
     folder = tmp_path_factory.mktemp("drives")
 
     def actor(name, category, shape, *rows):
-        way = drive(folder, *rows, name=f"{name}.csv")
+        way = write_trajectory(folder, *rows, name=f"{name}.csv")
         return {"name": name, "category": category, "shape": shape, "trajectory": str(way)}
 
     return Scenario.model_validate({
         "name": "s", "bodies": [FLOOR, WALL], "time_step_s": STEP_S, "duration_s": 3.0,
-        "ego": {"shape": CAR, "trajectory": str(drive(folder, (0, 0, 0, 0), (3, 30, 0, 0), name="ego.csv"))},
+        "ego": {"shape": CAR, "trajectory": str(write_trajectory(folder, (0, 0, 0, 0), (3, 30, 0, 0), name="ego.csv"))},
         "actors": [
             actor("child", "pedestrian", CHILD, (0, 44, -5.4, 90), (3, 44, -0.9, 90)),
             actor("faster", "car", CAR, (0, -30, 0, 0), (3, 15, 0, 0)),
@@ -57,19 +57,23 @@ AHEAD = {"mount": {"x_m": 1.0, "z_m": 1.8}, "channels": 40, "columns": 240, "hor
 AROUND = AHEAD | {"channels": 16, "columns": 720, "horizontal_fov_deg": 360}
 CAMERA = {"type": "camera", "name": "cam", "mount": {"x_m": 2.05, "z_m": 0.9}, "width": 240, "height": 160,
           "fov_deg": 90, "stride": 2, "max_range_m": 60, "rate_hz": 10}  # fmt: skip
-SENSORS = lidar("noisy", **AHEAD, range_noise_m=0.2), lidar("slow", **AROUND, dropout=0.4, rate_hz=5), CAMERA
-TOP = lidar(**AHEAD)
+SENSORS = (
+    build_lidar("noisy", **AHEAD, range_noise_m=0.2),
+    build_lidar("slow", **AROUND, dropout=0.4, rate_hz=5),
+    CAMERA,
+)
+TOP = build_lidar(**AHEAD)
 
 
 @pytest.fixture(scope="module")
 def driven(scenario):
-    simulator = Simulator(scenario, {"small": rig(*SENSORS)}, PaperReference(rows=2, columns=2), seed=3)
+    simulator = Simulator(scenario, {"small": build_rig(*SENSORS)}, PaperReference(rows=2, columns=2), seed=3)
     return simulator, Drive.from_scene("w", simulator.get_scene_geometry(0)[0].scene)
 
 
 def test_approaches_have_geometric_times_to_collision(driven):
     child, faster = find_approaches(driven[1], Criterion())
-    # The child's side is 1.8 - 0.2 m from that of the ego's way 2 s after 1.6 s; the front has 42 - 0.2 m to go.
+    # The side of the child is 1.6 m from that of the ego path 2 s after 1.6 s; the front is 41.8 m away.
     times_s = STEP_S * np.arange(child.frame_index, child.frame_index + len(child.ttc_s))
     ahead_s, aside_s = (44 - 0.2 - 2 - 10 * times_s) / 10, (5.4 - 1.5 * times_s - 1.0 - 0.2) / 1.5
     assert child.ttc_s == pytest.approx(np.maximum(ahead_s, aside_s), abs=1e-9)
@@ -77,7 +81,7 @@ def test_approaches_have_geometric_times_to_collision(driven):
     assert child.braking_times_s == pytest.approx(10 / 18 + 0.5)
     assert (faster.name, faster.frame_index, faster.braking_times_s.tolist()) == ("from behind", 12, [0.0] * 19)
     assert faster.ttc_s == pytest.approx((30 - 4 - 5 * STEP_S * np.arange(12, 31)) / 5)
-    # Nobody knows how late it is with who was near from the beginning.
+    # Road users that are near from the beginning are excluded.
     assert "tailing" in [track.name for track in driven[1].tracks]
     assert [one.track.name for one in find_approaches(driven[1], Criterion(max_ttc_s=2.5))] == [
         "child",
@@ -153,7 +157,7 @@ def test_results_equal_exhaustive_search(driven):
                 return within_s if past == 0 else 0.0 if step == NEVER else one.ttc_s[: past + 1].min()
 
             assert found.sensor_ttc_s[:, 0].tolist() == [ttc_s(step) for step in detected]
-            assert found.ttc_s[0] == ttc_s(min(detected))  # of three rates or kinds: none counts with another
+            assert found.ttc_s[0] == ttc_s(min(detected))  # of three rates or kinds: each is counted alone
             assert found.ttc_without_sensor_s[1, 0] == ttc_s(min(detected[0], detected[2]))
             assert (found.ttc_s[0] >= found.censoring_ttc_s) == (min(detected) == one.frame_index)
             until = min(min(detected) - one.frame_index + 1, len(one.ttc_s)) if min(detected) > one.frame_index else 0
@@ -246,7 +250,7 @@ def test_smallest_time_to_collision_until_detection_counts(seen_from, ttc_s, in_
         seen_from == 0,
     )
     assert found.ttc_without_sensor_s[0, 0] == 0
-    # Whoever needs more than was asked about may have been too late before.
+    # With a braking time above the limit, braking may have been needed before.
     early = one._replace(braking_times_s=np.full(4, 4.1))
     found = detect_approach("r", there, early, eyes, Criterion(points=1, consecutive_scans=1))
     assert math.isnan(found.in_time[0]) if seen_from == 0 else found.in_time[0] == 0
@@ -255,7 +259,7 @@ def test_smallest_time_to_collision_until_detection_counts(seen_from, ttc_s, in_
 def test_occlusion_until_braking_time_is_too_late(scenario):
     soft, hard = (
         evaluate_traffic_encounters(
-            [rig(TOP)], scenario, Criterion(points=4, deceleration_mps2=brakes, latency_s=0.3), num_scenes=9
+            [build_rig(TOP)], scenario, Criterion(points=4, deceleration_mps2=brakes, latency_s=0.3), num_scenes=9
         )
         for brakes in (1.5, 4.0)
     )
@@ -266,19 +270,19 @@ def test_occlusion_until_braking_time_is_too_late(scenario):
     assert 1.8 < child["hard"].ttc_s == child["hard"].min_ttc_s < 2.6
     assert [(row.encounter, row.sample_count) for row in hard.rows] == [("on foot", 1), ("from behind", 1), ("all", 2)]
     assert child["hard"].encounters_per_hour == pytest.approx(3600 / 3.1)
-    assert math.isnan(child["hard"].interval_low)  # a world that repeats is one world
+    assert math.isnan(child["hard"].interval_low)  # a repeated scene is one scene
     (table,) = soft.build_tables()
     assert table.rows[0][3].text.endswith("too late")
 
 
 def test_recorded_encounters_equal_simulated_ones(scenario, tmp_path):
     frames = SimulatedFrames(
-        scenario, rig(TOP), num_frames=31, boxes=True, reference_sensor=PaperReference(rows=2, columns=2)
+        scenario, build_rig(TOP), num_frames=31, boxes=True, reference_sensor=PaperReference(rows=2, columns=2)
     )
     write_recording(frames, tmp_path / "drive")
     found, expected = (
         evaluate_recorded_encounters(tmp_path / "drive"),
-        evaluate_traffic_encounters([rig(TOP)], scenario),
+        evaluate_traffic_encounters([build_rig(TOP)], scenario),
     )
     assert [one.encounter.track.name for one in found.detections] == ["child", "faster"]
     for one, other in zip(found.detections, expected.detections, strict=True):
@@ -290,7 +294,7 @@ def test_recorded_encounters_equal_simulated_ones(scenario, tmp_path):
 
 
 class Closing(SyntheticDrive):
-    """At 15 m/s behind a car with 5 m/s, on which there are points from the ninth instant on."""
+    """Drive at 15 m/s behind a car at 5 m/s, with points on it from the ninth frame on."""
 
     def get_world_T_vehicle(self, index):
         return build_transform(np.eye(3), [1.5 * index, 0.0, 0.0])
@@ -336,16 +340,16 @@ def test_parked_vehicles_are_excluded_but_not_standing_people(category, met):
 
 def test_invalid_traffic_requests_are_refused(tmp_path):
     with pytest.raises(ValueError, match="nothing moves in it"):
-        evaluate_traffic_encounters([rig()], world())
+        evaluate_traffic_encounters([build_rig()], build_scenario())
     with pytest.raises(ValueError, match="num_scenes: a number >= 1"):
-        evaluate_traffic_encounters([rig()], num_scenes=0)
+        evaluate_traffic_encounters([build_rig()], num_scenes=0)
     with pytest.raises(ValueError, match="the size of the vehicle is unknown"):
         evaluate_recorded_encounters(Closing(steps=5))
     with pytest.raises(ValueError, match="none of its 1 objects is a road user, by their categories"):
         evaluate_recorded_encounters(open_recording(LAYOUTS["folder"](Closing(steps=5), tmp_path)))
-    way = drive(tmp_path, (0, 0, 0, 0), (1, 9, 0, 0))
-    alone = world(ego={"shape": CAR, "trajectory": str(way)}, duration_s=1.0)
-    far = evaluate_traffic_encounters([rig(TOP)], alone)
+    way = write_trajectory(tmp_path, (0, 0, 0, 0), (1, 9, 0, 0))
+    alone = build_scenario(ego={"shape": CAR, "trajectory": str(way)}, duration_s=1.0)
+    far = evaluate_traffic_encounters([build_rig(TOP)], alone)
     assert [(row.encounter, row.sample_count, row.max_ttc_s) for row in far.rows] == [("all", 0, 0.0)]
     (table,) = far.build_tables()
     assert table.rows[0][3].text == "-"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from tests.targets.worlds import drive, lidar, rig, world
+from tests.targets.scenes import build_lidar, build_rig, build_scenario, write_trajectory
 from torchcover.encounters import Criterion
 from torchcover.encounters.encounter import EncounterSet
 from torchcover.evaluation import Readings, Requirements, check, evaluate, evaluate_encounters, judge_requirements
@@ -203,14 +203,14 @@ def test_messages_are_about_keys_of_the_file_and_not_of_the_program(one):
 )
 def test_what_the_rig_has_not_or_nobody_can_wait_for_is_an_error(keys, message):
     with pytest.raises(ValueError, match=message):
-        check(rig(), asked({**AHEAD, **keys}), world())
+        check(build_rig(), asked({**AHEAD, **keys}), build_scenario())
 
 
 CAMERA = {"type": "camera", "name": "front", "width": 80, "height": 60, "fov_deg": 90, "stride": 2, "max_range_m": 50}
 POST = {"name": "post", "shape": {"type": "box", "size_m": [0.2, 3.0, 3.0]}, "poses": [{"x_m": 0.5}]}
-THREE = rig(
-    lidar(mount={"x_m": -1.0, "z_m": 1.4}),
-    lidar("mast", mount={"z_m": 1.2}, housing=[POST]),
+THREE = build_rig(
+    build_lidar(mount={"x_m": -1.0, "z_m": 1.4}),
+    build_lidar("mast", mount={"z_m": 1.2}, housing=[POST]),
     {**CAMERA, "mount": {"x_m": 1.8, "z_m": 1.3}},
 )
 
@@ -219,7 +219,7 @@ def test_what_is_judged_is_what_a_survey_sees():
     """Of all, of each sensor, without one that hangs there still, at the same places."""
     raster, child = Raster((3.5, 6.5), (-1.0, 1.0), 1.0), Target.load("child")
     at = {"points_m": raster.positions_m.tolist()}
-    seen = measure_target_visibility(THREE, world(), child, raster, detection_points=1)
+    seen = measure_target_visibility(THREE, build_scenario(), child, raster, detection_points=1)
     one = {
         "target": "child",
         "positions": at,
@@ -235,7 +235,7 @@ def test_what_is_judged_is_what_a_survey_sees():
         {**one, "counted_sensors": ["lidar"], "pixels": None},
         {**one, "counted_sensors": ["top", "mast"], "pixels": None, "failing_sensors": "mast"},
     )
-    found = check(THREE, requirements, world()).verdicts["small"]
+    found = check(THREE, requirements, build_scenario()).verdicts["small"]
     all_of, lidars, top = found[:5], found[5:9], found[9:]
     worst = {v.bound.key: v.value for v in all_of}
     assert worst["points"] == seen.min_points.min() > 0
@@ -257,7 +257,7 @@ def test_where_a_body_cannot_stand_a_point_is_unknown_and_an_area_goes_without()
         {**AHEAD, "positions": {"x_m": [0, 5], "y_m": [0, 0.1]}},
     )
     nowhere = {**AHEAD, "positions": {"x_m": [-1, 1], "y_m": [0, 0.1]}}
-    found = check(rig(lidar(channels=61)), asked(inside, near, nowhere), world()).verdicts["small"]
+    found = check(build_rig(build_lidar(channels=61)), asked(inside, near, nowhere), build_scenario()).verdicts["small"]
     assert [(one.state, one.undecided_count) for one in found] == [("not decided", 1), ("met", 0), ("not decided", 0)]
     assert found[0].worst_locations == ("x = 0.00, y = 0.00 m, occupied",)
     assert 0 < found[1].total_count < 2 * 26
@@ -267,15 +267,15 @@ def test_where_a_body_cannot_stand_a_point_is_unknown_and_an_area_goes_without()
 def test_it_is_said_in_how_many_steps_a_body_had_room(tmp_path):
     """A box drives over the place and is there in two of four steps."""
     passing = {"name": "p", "category": "car", "shape": {"type": "box", "size_m": [2.0, 1.0, 1.0]},
-               "trajectory": drive(tmp_path, (0, 5, 0, 0), (2, 13, 0, 0))}  # fmt: skip
-    there = world(actors=[passing], duration_s=2.0, time_step_s=0.5)
-    (found,) = check(rig(lidar(channels=61)), asked(AHEAD), there, num_frames=4).verdicts["small"]
+               "trajectory": write_trajectory(tmp_path, (0, 5, 0, 0), (2, 13, 0, 0))}  # fmt: skip
+    there = build_scenario(actors=[passing], duration_s=2.0, time_step_s=0.5)
+    (found,) = check(build_rig(build_lidar(channels=61)), asked(AHEAD), there, num_frames=4).verdicts["small"]
     assert (found.state, found.worst_locations) == ("met", ("x = 5.00, y = 0.00 m, free in 3 of 4 frames",))
 
 
 def test_a_kind_that_the_rig_has_not_sees_nothing_and_a_place_that_holds_nobody_is_not_checked():
     tight = {**AHEAD, "positions": {"within_m": 0.01}}
-    found = check(rig(), asked({**AHEAD, "counted_sensors": "camera"}, tight), world()).verdicts["small"]
+    found = check(build_rig(), asked({**AHEAD, "counted_sensors": "camera"}, tight), build_scenario()).verdicts["small"]
     assert [(one.state, one.total_count) for one in found] == [("not met", 1), ("not decided", 0)]
     assert found[0].margin == -5.0
     with pytest.raises(ValueError, match="at least one rig"):
@@ -289,10 +289,12 @@ def test_numbers_of_regions_are_those_of_evaluate():
     found = check(
         THREE,
         asked({**one, "number": "detection_0.3m", "min_value": 0.001}, {**one, "number": "radius_m", "max_value": 1e-6}, **keys),
-        world(), num_frames=12, num_workers=0,
+        build_scenario(), num_frames=12, num_workers=0,
     ).verdicts["small"]  # fmt: skip
     asking = RegionsOfInterest.model_validate(keys)
-    result = evaluate(THREE, world(), num_frames=12, num_workers=0, thresholds_m=0.3, redundancy=True, regions=asking)
+    result = evaluate(
+        THREE, build_scenario(), num_frames=12, num_workers=0, thresholds_m=0.3, redundancy=True, regions=asking
+    )
     (row,) = (row for row in result.summary if row["band"] == "ground")
     for verdict, key, worse in zip(found, ("detection_0.3m", "radius_m"), (min, max), strict=True):
         assert verdict.value == worse(row[key], row[f"{key}_without_front"]) != row[key]
@@ -304,7 +306,7 @@ def test_numbers_of_regions_are_those_of_evaluate():
 def test_requirements_of_regions_name_cameras_with_perfect_depth(more, is_named):
     camera = {"type": "camera", "name": "eye", "mount": {"z_m": 2.0}, "width": 16, "height": 12, "fov_deg": 90.0}
     found = check(
-        rig({**camera, "max_range_m": 50.0, **more}),
+        build_rig({**camera, "max_range_m": 50.0, **more}),
         asked({**NEAR, "number": "detection_0.4m", "min_value": 0.5}),
         "courtyard",
         num_frames=1,
@@ -360,7 +362,7 @@ def test_who_is_seen_from_the_beginning_may_have_been_before(box):
         "consecutive_scans": 2,
         "failing_sensors": "any",
     }
-    two = rig(lidar(), lidar("mast", mount={"z_m": 1.2}))
+    two = build_rig(build_lidar(), build_lidar("mast", mount={"z_m": 1.2}))
     brakes = {"deceleration_mps2": 9, "latency_s": 0.75}
     found = check(two, asked({**one, "ttc_s": 0.9}, {**one, "ttc_s": 1.1, "braking": brakes}), vehicle=box)
     kept, ttc, spare = found.verdicts["small"]
@@ -393,7 +395,7 @@ def test_a_camera_of_few_pixels_shows_nothing_even_if_they_were_points_enough(bo
     far = one.model_copy(update={"positions": TargetPositions(points_m=((-3.5, 0.0),), relative_to="rear")})
     coarse = {**CAMERA, "mount": {"x_m": -2.1, "z_m": 1.0, "yaw_deg": 180}, "width": 48, "height": 36, "stride": 1}
     points = far.model_copy(update={"pixels": None, "points": 5, "name": "as points"})
-    pixels, as_points = check(rig(coarse), asked(far, points), vehicle=box).verdicts["small"]
+    pixels, as_points = check(build_rig(coarse), asked(far, points), vehicle=box).verdicts["small"]
     assert (pixels.state, as_points.state, pixels.value) == ("not met", "met", as_points.value)
 
 

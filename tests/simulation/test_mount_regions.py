@@ -1,4 +1,4 @@
-"""Mount regions: their places lie on the skin of the vehicle, and a sensor on them faces outwards, level."""
+"""Mount regions: their points lie on the surface of the vehicle, and sensors on them face outwards."""
 
 from functools import cache
 from pathlib import Path
@@ -20,13 +20,13 @@ BOX = Skin(Box(type="box", size_m=(4.0, 2.0, 1.5)).build_mesh())
 
 @cache
 def loaded(name):
-    """A vehicle and its skin."""
+    """Load a vehicle and its skin."""
     vehicle = Vehicle.load(name)
     return vehicle, Skin(vehicle.build_mesh())
 
 
 def distance_m(mesh, place_m):
-    """How far a place is from the nearest triangle of a mesh."""
+    """Compute the distance of a position from the nearest triangle of a mesh."""
     triangles = mesh.vertices_m[mesh.faces]
     nearest = trimesh.triangles.closest_point(triangles, np.broadcast_to(place_m, (len(triangles), 3)))
     return np.linalg.norm(nearest - place_m, axis=1).min()
@@ -47,7 +47,7 @@ def test_mount_points_lie_on_the_surface(name):
 
 @pytest.mark.parametrize("name", VEHICLES)
 def test_regions_are_one_patch_facing_their_side(name):
-    """No place beside another lies on another part, nor on a wall that only seems to be seen from there."""
+    """Neighboring points lie on the same part of the body."""
     (vehicle, skin), shares = loaded(name), np.linspace(0.0, 1.0, 5)
     for region in vehicle.mount_regions.values():
         axis, sign = SIDE_VIEWS[region.side][:2]

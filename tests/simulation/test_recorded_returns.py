@@ -1,4 +1,4 @@
-"""A LiDAR is calibrated by which of its rays returned from a road."""
+"""LiDARs are calibrated by the rays that returned from a road."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ ROAD = Material.load("road")
 
 
 def sweep(generator, wall_m=np.inf, top_m=np.inf):
-    """What returns from a plain, with a wall across the road ahead, as high as said."""
+    """Simulate the returns from a plain with a wall of a given height across the road ahead."""
     directions = RIG.sensors[0].compute_directions().reshape(3, -1)
     range_m = HEIGHT_M / -directions[2]
     with np.errstate(divide="ignore"):
@@ -114,14 +114,14 @@ def test_fit_predicts_the_other_half_of_revolutions(sweeps):
 
 
 def test_rays_behind_walls_are_not_counted():
-    """Else what the wall hides would be road that did not return."""
+    """Otherwise the occluded road would count as missing returns."""
     rays = count_ground_rays([sweep(np.random.default_rng(1), wall_m=30.0)], RIG.sensors[0])
     ahead = np.abs(rays.azimuth_deg) < 10
     assert rays.range_m[ahead].max() < 31 < 60 < rays.range_m[~ahead].max()
 
 
 def test_rays_pass_above_low_obstacles():
-    """Behind a beam of 0.5 m the road is hidden from 30 to 30 / (1 - 0.5 / 1.9) = 41 m only."""
+    """A beam of 0.5 m occludes the road from 30 to 30 / (1 - 0.5 / 1.9) = 41 m only."""
     beam = count_ground_rays([sweep(np.random.default_rng(1), wall_m=30.0, top_m=0.5)], RIG.sensors[0])
     ahead = np.abs(beam.azimuth_deg) < 10
     assert not ((beam.range_m[ahead] > 31) & (beam.range_m[ahead] < 40)).any()
@@ -151,13 +151,13 @@ def test_points_outside_lanes_are_no_road():
 
 
 def test_near_rays_are_not_counted(sweeps):
-    """The steep ones: they return, whatever the LiDAR."""
+    """Steep rays return for any LiDAR."""
     assert np.tan(np.deg2rad(RIG.sensors[0].compute_elevations_deg())).min() < -HEIGHT_M / 5
     assert count_ground_rays(sweeps, RIG.sensors[0]).range_m.min() > RoadParams().min_range_m
 
 
 def test_near_road_does_not_determine_the_range(sweeps, tmp_path):
-    """All of it returns: any range that is long enough explains that."""
+    """All rays return, which any sufficient range explains."""
     _, [found] = calibrate(written(tmp_path, sweeps), RIG)
     rays = count_ground_rays(sweeps, RIG.sensors[0])
     fit = fit_returns(rays.select(rays.range_m < 16), ROAD)

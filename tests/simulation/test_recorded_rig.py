@@ -1,4 +1,4 @@
-"""The rig of a recording: how its LiDARs scan, where they and its cameras are."""
+"""Rigs of recordings: scan patterns of LiDARs, extrinsics of LiDARs and cameras."""
 
 import json
 import re
@@ -19,7 +19,7 @@ from torchcover.simulation.scan_estimate import estimate_scan, infer_laser_indic
 
 
 def in_a_room(lidar, seed, dropout=0.2):
-    """What a LiDAR sees in a room, where no ray is lost but by chance: points in its frame."""
+    """Simulate the points of a LiDAR in a room, in its frame; rays are lost by chance only."""
     directions = lidar.compute_directions()
     random = np.random.default_rng(seed)
     size_m = np.array([30.0, 12.0, 8.0])[:, None, None]
@@ -34,7 +34,7 @@ def test_scan_pattern_of_every_model_is_estimated(model):
     found = estimate_scan([in_a_room(lidar, seed) for seed in range(2)])
     np.testing.assert_allclose(found.elevations_deg, np.sort(lidar.compute_elevations_deg())[::-1], atol=1e-9)
     step_deg = lidar.horizontal_fov_deg / lidar.columns
-    if lidar.horizontal_fov_deg < 360 and lidar.azimuth_offsets_deg is not None:  # rows that begin at other azimuths
+    if lidar.horizontal_fov_deg < 360 and lidar.azimuth_offsets_deg is not None:  # rows begin at different azimuths
         assert found.horizontal_fov_deg / found.num_columns == pytest.approx(step_deg, rel=1e-3)
         return
     assert (found.num_columns, found.center_azimuth_deg) == (240, pytest.approx(0.0, abs=0.01))
@@ -59,7 +59,7 @@ def test_noisy_rows_are_found_but_not_blended_ones():
 
 
 class Turning(Drive):
-    """A LiDAR that turns in a street with walls, on a car at 20 m/s in a bend; its points are moved to the instant."""
+    """LiDAR in a street with walls, on a car at 20 m/s in a bend; its points are motion compensated."""
 
     lidar = Lidar.model_validate({"name": "a", "model": "velodyne_vlp16", "columns": 300})
     sensors, rigs = ("roof",), {"one": ("roof",)}
@@ -112,7 +112,9 @@ def test_rows_of_a_moving_vehicle_are_recovered(drive, said):
     rig = build_rig_document(drive)
     (lidar,) = Rig.model_validate(rig).sensors
     assert re.search(said, rig["description"])
-    assert "min_range_m" not in rig["sensors"][0]  # of the nearest return it would be blind to all that comes nearer
+    assert (
+        "min_range_m" not in rig["sensors"][0]
+    )  # a minimum range from the nearest return would exclude nearer objects
     true_deg = drive.lidar.compute_elevations_deg()
     assert len(lidar.compute_elevations_deg()) == len(true_deg)
     np.testing.assert_allclose(lidar.compute_elevations_deg(), np.sort(true_deg)[::-1], atol=0.05)
@@ -130,7 +132,7 @@ def test_motion_is_not_undone_for_distant_frames():
 
 
 def test_clouds_stored_by_laser_need_no_separable_rows():
-    # The lasers of the upper half leave 0.1 m above the others: no elevation is that of one laser.
+    # The upper half of the lasers is 0.1 m above the others: elevations of different lasers overlap.
     lidar = Lidar.model_validate({"name": "a", "model": "velodyne_hdl64e", "columns": 400})
     points_m = in_a_room(lidar, 0, 0.0)
     laser = np.repeat(np.arange(64), 400)
@@ -174,7 +176,7 @@ def nuscenes_with_camera(drive, root):
         (path / "v1.0-mini" / f"{name}.json").write_text(json.dumps(rows))
 
     def pixels(points_m):
-        # In the ego's frame; the camera looks along it.
+        # In the ego frame; the camera looks along x.
         x, y, z = (transform_points(invert(nuscenes.vehicle_T_ego), points_m) - [1.7, 0.1, 1.5]).T
         return np.stack([816.0 - 1266.0 * y / x, 491.0 - 1250.0 * z / x], axis=1)
 
@@ -230,7 +232,7 @@ camera2_T_camera0 = build_transform(convert_euler_to_rotation(0.3, 0.2, -0.4), [
 
 
 def by_kitti(points_m, raw=False):
-    """Pixels of the left color camera, by the formula of the development kit, or by OpenCV's of the raw image."""
+    """Compute pixels of the left color camera by the formula of the development kit, or of OpenCV for raw images."""
     velodyne_m = transform_points(invert(kitti.vehicle_T_velodyne), points_m)
     if raw:
         x, y, z = transform_points(camera2_T_camera0 @ camera0_T_velodyne, velodyne_m).T
@@ -292,7 +294,7 @@ CAMERAS = {
 @pytest.mark.parametrize("raw", [False, True])
 @pytest.mark.parametrize("layout", CAMERAS)
 def test_cameras_project_points_like_their_data_set(layout, raw, tmp_path):
-    """Images are released undistorted or rectified; the raw ones are those of the lenses."""
+    """Released images are undistorted or rectified; raw images have the distortion of the lenses."""
     path, name, size, pixels = CAMERAS[layout](Drive(steps=3), tmp_path)
     recording = open_recording(path, RecordingSettings(format=layout))
     models = dict.fromkeys(recording.sensors, "velodyne_vlp16")

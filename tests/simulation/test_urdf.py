@@ -1,4 +1,4 @@
-"""Robots of URDF: places of links and sensors in closed form, meshes wherever they lie, and what is no robot."""
+"""Robots of URDF files: poses of links and sensors, meshes, and invalid files."""
 
 import math
 import time
@@ -53,7 +53,7 @@ def test_sensor_pose_chains_all_joints_at_zero(robot_of):
         joint("arm", "head", turns[1][0], words[1]), on("head", LIDAR.format("l", pose, 0.0).replace("181", "1")),
     )  # fmt: skip
     expected = places[0] @ places[1] @ places[2]
-    expected[2, 3] += 0.2  # the middle of the chassis is so far above the ground
+    expected[2, 3] += 0.2  # the center of the chassis is 0.2 m above the ground
     (keys,) = robot.sensors
     rig = Rig.model_validate({"name": "a", "sensors": [keys]})
     np.testing.assert_allclose(rig.sensors[0].mount.to_matrix(), expected, atol=2e-4)
@@ -150,13 +150,13 @@ def test_housings_are_excluded_except_the_largest_body(robot_of):
 
 
 def test_posts_around_a_lidar_stay_and_block_rays(robot_of):
-    """Its bounding box holds the sensor, but it is not built into it: posts are 2 cm wide, 6 cm away."""
+    """The bounding box of the posts contains the sensor, but posts of 2 cm at 6 cm are no housing."""
     corners = [f"{x} {y} 0" for x in (-0.06, 0.06) for y in (-0.06, 0.06)]
     posts = "".join(BOX.format("0.02 0.02 0.2").replace("<geo", f"<origin xyz='{xyz}'/><geo") for xyz in corners)
     full_turn = LIDAR.format("l", "", 2 * math.pi).replace("181", "3600")
     robot = robot_of(CHASSIS, f"<link name='l'>{posts}</link>", joint("base", "l", "0 0 0.5"), on("l", full_turn))
     assert len(robot.body.vertices_m) == 5 * 8
-    # Seen from the middle, a post spans from one of its corners to the opposite one.
+    # From the center, a post spans from one of its corners to the opposite one.
     span_rad = 4 * 2 * (math.atan2(0.07, 0.05) - math.pi / 4)
     (note,) = robot.notes
     share = float(note.split("(")[1].split("%")[0])
@@ -217,7 +217,7 @@ def test_ignored_settings_are_named(robot_of):
 
 
 def test_mimic_joints_have_offsets_and_limits_are_noted(robot_of):
-    """b slides by 0.1 m; c follows b with 2 * 0.1 + 0.05 m along y; d, which excludes 0, stays there."""
+    """b slides by 0.1 m; c follows b with 2 * 0.1 + 0.05 m along y; d is at 0, outside of its limits."""
     links = "".join(f"<link name='{name}'>{BOX.format('0.1 0.1 0.1')}</link>" for name in "bcd")
     limit = "<limit lower='0.2' upper='0.6'/>"
     mimics = [f"<axis xyz='0 2 0'/><mimic joint='{of}' multiplier='2' offset='{offset}'/>"
@@ -235,7 +235,7 @@ def test_mimic_joints_have_offsets_and_limits_are_noted(robot_of):
 
 
 def test_reading_time_is_linear_in_links(robot_of):
-    """A chain and a star of 20,000 links took minutes, for each link looked at all others."""
+    """A chain and a star of 20,000 links are read in seconds."""
     names = [f"l{k}" for k in range(20_000)]
     links = "".join(f"<link name='{name}'/>" for name in names)
     joints = "".join(joint(names[k - 1] if k % 2 else names[0], names[k], "0 0 0.001") for k in range(1, len(names)))

@@ -5,10 +5,10 @@ from functools import lru_cache, partial
 import mpmath
 import numpy as np
 
-from tests.targets.worlds import EGO, FLOOR, lidar
+from tests.targets.scenes import EGO, FLOOR, build_lidar
 from torchcover.encounters import Criterion, Encounter, StagedEncounter, detect_encounter
-from torchcover.encounters.encounter import EncounterPath
 from torchcover.encounters.detection import MountedRig
+from torchcover.encounters.encounter import EncounterPath
 from torchcover.encounters.staging import compute_path_poses
 from torchcover.simulation import Rig, Scenario
 from torchcover.simulation.moving import BodyGeometry
@@ -149,7 +149,7 @@ def sights():
         "name": "front", "mount": {"x_m": 1.5, "z_m": 1.5}, "channels": 1, "vertical_fov_deg": [0, 0],
         "horizontal_fov_deg": 10, "columns": 5000, "max_range_m": 200, "rate_hz": 1000,
     }  # fmt: skip
-    one_rig = MountedRig(Rig.model_validate({"name": "r", "sensors": [lidar(**scanner)]}), scenario)
+    one_rig = MountedRig(Rig.model_validate({"name": "r", "sensors": [build_lidar(**scanner)]}), scenario)
     walls = [{"body": {"type": "box", "size_m": [3.0, 0.5, 3.0]}, "lateral_gap_m": 0.6, "longitudinal_gap_m": 1.0}]
     other = {"body": {"type": "box", "size_m": [0.02, 0.02, 2.0]}, "speed_kmh": 5.4, "approach_distance_m": 2.1}
     one = {"name": "e", "ego": {"speed_kmh": FASTEST_KMH}, "road_user": other, "obstacles": walls}

@@ -1,4 +1,4 @@
-"""What is read off a map: sides, the nearest seen place, the worst; files; the picture."""
+"""Maps of target visibility: sides, borders, worst positions, files and plots."""
 
 import csv
 import json
@@ -18,8 +18,8 @@ CAR = BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5))
 OUTLINE = np.array([[-2.0, -1.0], [2.0, -1.0], [2.0, 1.0], [-2.0, 1.0]])
 
 
-def seen_where(points, *, raster=None, state=None, share=None, detection_points=5, least=None):
-    """A map with a number of points that is a function of x and y, of two sensors that share them evenly."""
+def build_target_map(points, *, raster=None, state=None, share=None, detection_points=5, least=None):
+    """Build a map whose points are a function of x and y, half of them from each of two sensors."""
     raster = raster or Raster((-6.0, 6.0), (-5.0, 5.0), 0.5)
     x, y = raster.positions_m.T
     number = np.broadcast_to(np.asarray(points(x, y), dtype=np.float64), x.shape).reshape(raster.shape)
@@ -57,8 +57,8 @@ def seen_where(points, *, raster=None, state=None, share=None, detection_points=
 
 
 def test_detection_border_separates_detected_from_undetected_cells():
-    """Seen from 3.5 m ahead of the middle on; to the left from 2 m on, less a gap that comes later."""
-    seen = seen_where(lambda x, y: np.where((x > 3.5) | ((y > 2) & ~((y > 3) & (y < 4))), 9, 0))
+    """The target is detected beyond 3.5 m ahead, and beyond 2 m to the left except for a gap."""
+    seen = build_target_map(lambda x, y: np.where((x > 3.5) | ((y > 2) & ~((y > 3) & (y < 4))), 9, 0))
     edges = seen.compute_detection_border_m().reshape(-1, 3, 2)
     assert np.isnan(edges[:, 2]).all()
     rows, columns = seen.raster.shape
@@ -78,11 +78,11 @@ def test_detection_border_separates_detected_from_undetected_cells():
     assert {tuple(middle) for middle in edges[:, :2].mean(axis=1).round(6) + 0.0} == expected
     assert np.allclose(np.linalg.norm(edges[:, 0] - edges[:, 1], axis=1), seen.raster.cell_m)
     assert len(edges) == len(expected)
-    assert not len(seen_where(lambda x, y: 9).compute_detection_border_m())
+    assert not len(build_target_map(lambda x, y: 9).compute_detection_border_m())
 
 
 def test_sides_are_separated_at_45_degrees():
-    seen = seen_where(lambda x, y: np.where(x > 0, 9, 4))
+    seen = build_target_map(lambda x, y: np.where(x > 0, 9, 4))
     assert (np.bincount(seen.side.ravel() + 1) == [32, 104, 104, 120, 120]).all()
     by_side = {(row.side, row.max_distance_m): row for row in seen.summarize_sides()}
     assert by_side["front", 1.0].detected_share == 1.0
@@ -99,17 +99,17 @@ def test_sides_are_separated_at_45_degrees():
     half = replace(seen, detected_share=np.where(seen.free_mask, 0.5, np.nan))
     assert {row.detected_share for row in half.summarize_sides()} == {
         0.5
-    }  # in every other step, however many points the others have
+    }  # in every other frame, whatever the number of points
 
 
 def test_targets_must_be_detected_in_every_frame():
-    """Eighty points in one of sixteen steps are five in the mean."""
-    seen = seen_where(lambda x, y: 80 / 16, least=0)
+    """Eighty points in one of sixteen frames are five on average."""
+    seen = build_target_map(lambda x, y: 80 / 16, least=0)
     assert not seen.detected_mask.any()
 
 
 def test_worst_positions_have_fewest_points_and_spacing():
-    seen = seen_where(lambda x, y: np.abs(x) + np.abs(y))
+    seen = build_target_map(lambda x, y: np.abs(x) + np.abs(y))
     worst = seen.find_worst_positions(3)
     assert [place.points for place in worst] == sorted(place.points for place in worst)
     assert worst[0].points == np.nanmin(seen.points) == 1.5
@@ -119,7 +119,7 @@ def test_worst_positions_have_fewest_points_and_spacing():
 
 
 def test_files_contain_the_map(tmp_path):
-    seen = seen_where(lambda x, y: np.abs(x) + 0.5, raster=Raster((-3.0, 3.0), (-2.0, 2.0), 1.0))
+    seen = build_target_map(lambda x, y: np.abs(x) + 0.5, raster=Raster((-3.0, 3.0), (-2.0, 2.0), 1.0))
     names = [path.name for path in save_target_map(seen, tmp_path)]
     assert names == ["targets.csv", "targets.npz", "report.html", "targets.png", "summary.json"]
     with np.load(tmp_path / "targets.npz") as arrays:
@@ -141,7 +141,7 @@ def test_files_contain_the_map(tmp_path):
 
 
 def test_plot_shows_cells_at_their_positions():
-    seen = seen_where(lambda x, y: np.where(y > 0, 0, 100))
+    seen = build_target_map(lambda x, y: np.where(y > 0, 0, 100))
     figure = seen.plot()
     canvas = FigureCanvasAgg(figure)
     canvas.draw()
@@ -153,8 +153,8 @@ def test_plot_shows_cells_at_their_positions():
 
     assert at(-5.3, 4.3) == at(5.3, 1.3) == PARAMS.undetected_color
     assert at(5.3, -4.3) not in (PARAMS.undetected_color, "#ffffff")
-    assert at(1.9, 0.9) == at(-1.9, -0.9) == "#ffffff"  # the vehicle, true to scale
-    assert at(5.25, 0.0) < "#202020"  # the line between seen and not
+    assert at(1.9, 0.9) == at(-1.9, -0.9) == "#ffffff"  # the vehicle at its true size
+    assert at(5.25, 0.0) < "#202020"  # the border of detection
     assert figure.axes[0].get_legend() is not None
 
 
@@ -163,7 +163,7 @@ def test_targets_load_from_names_and_files(tmp_path):
         "name: my post\nparts: [{name: p, shape: {type: box, size_m: [0.2, 0.2, 0.5]}, poses: [{z_m: -3}]}]\n"
     )
     post = Target.load(tmp_path / "post.yaml")
-    assert (post.name, post.solid.bounding_box.lower_m[2]) == ("post", 0.0)  # it stands on the ground
+    assert (post.name, post.solid.bounding_box.lower_m[2]) == ("post", 0.0)  # the ground is the lowest point
     (tmp_path / "plate.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 3 2\nf 1 2 4\nf 1 4 3\nf 2 3 4\n")
     assert Target.load(tmp_path / "plate.obj").solid.bounding_box.size_m == (1.0, 1.0, 1.0)
     assert set_ego(build_flat_ground(), {}, tmp_path / "plate.obj").compute_ego_box().size_m == (1.0, 1.0, 1.0)

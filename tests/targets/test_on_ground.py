@@ -1,4 +1,4 @@
-"""Targets stand on the ground under them: on slopes, on decks, and nowhere where there is none."""
+"""Targets stand on the ground: on slopes and curbs, and nowhere without ground."""
 
 import math
 
@@ -16,11 +16,11 @@ EGO = {"shape": {"type": "box", "size_m": [4, 2, 1.5]}}
 FLOOR = {"name": "floor", "shape": {"type": "plane", "size_m": [60, 60]}, "ground": True}
 
 
-def scenario(*bodies, **pose):
+def build_scenario(*bodies, **pose):
     return Scenario.model_validate({"name": "s", "ego": {**EGO, "pose": pose}, "bodies": bodies})
 
 
-def instant(made):
+def build_snapshot(made):
     return SceneGeometry(made.build_scene()).get_snapshot(0)
 
 
@@ -28,13 +28,15 @@ def instant(made):
 def test_ground_heights_follow_a_tilted_plane(pitch_deg, roll_deg):
     tilted = {**FLOOR, "poses": [{"pitch_deg": pitch_deg, "roll_deg": roll_deg}]}
     places = np.random.default_rng(1).uniform(-20, 20, (200, 2))
-    normal = SceneGeometry(scenario(tilted).build_scene()).scene.static_meshes[0].vertices_m
+    normal = SceneGeometry(build_scenario(tilted).build_scene()).scene.static_meshes[0].vertices_m
     across = np.cross(normal[1] - normal[0], normal[2] - normal[0])
     np.testing.assert_allclose(
-        compute_ground_heights_m(instant(scenario(tilted)), places), -(places @ across[:2]) / across[2], atol=1e-3
+        compute_ground_heights_m(build_snapshot(build_scenario(tilted)), places),
+        -(places @ across[:2]) / across[2],
+        atol=1e-3,
     )
-    # The same from a vehicle that leans while the plane is level.
-    leaning = instant(scenario(FLOOR, pitch_deg=pitch_deg, roll_deg=roll_deg))
+    # The same for a tilted vehicle on a level plane.
+    leaning = build_snapshot(build_scenario(FLOOR, pitch_deg=pitch_deg, roll_deg=roll_deg))
     on_plane = np.column_stack([places, compute_ground_heights_m(leaning, places)])
     in_world = on_plane @ leaning.world_T_vehicle[:3, :3].T
     np.testing.assert_allclose(in_world[:, 2], 0, atol=2e-3)
@@ -43,26 +45,26 @@ def test_ground_heights_follow_a_tilted_plane(pitch_deg, roll_deg):
 def test_targets_stand_on_curbs_not_on_bridges():
     deck = {"name": "deck", "shape": {"type": "box", "size_m": [8, 8, 0.5]}, "poses": [{"x_m": 10, "z_m": 4}]}
     kerb = {"name": "kerb", "shape": {"type": "box", "size_m": [8, 8, 0.15]}, "poses": [{"x_m": -10}]}
-    made = instant(scenario(FLOOR, {**deck, "ground": True}, {**kerb, "ground": True}))
+    made = build_snapshot(build_scenario(FLOOR, {**deck, "ground": True}, {**kerb, "ground": True}))
     found = compute_ground_heights_m(made, np.array([[10.0, 0], [-10, 0], [0, 20], [50, 0]]))
     np.testing.assert_allclose(found, [0, 0.15, 0, np.nan], atol=1e-4)
 
 
 def test_slopes_below_the_vehicle_change_nothing():
     rig, pole, raster = Rig.load("front_roof_32"), Target.load("pole"), Raster((4.0, 12.0), (-2.0, 2.0), 1.0)
-    flat = measure_target_visibility(rig, scenario(FLOOR), pole, raster, num_frames=2)
+    flat = measure_target_visibility(rig, build_scenario(FLOOR), pole, raster, num_frames=2)
     tilted = {**FLOOR, "poses": [{"pitch_deg": 5.0}]}
-    along = measure_target_visibility(rig, scenario(tilted, pitch_deg=5.0), pole, raster, num_frames=2)
+    along = measure_target_visibility(rig, build_scenario(tilted, pitch_deg=5.0), pole, raster, num_frames=2)
     np.testing.assert_allclose(along.points, flat.points, atol=1.0)
     assert (flat.points > 10).any()
-    # The vehicle level above a floor that falls away: the pole is lower down, and other rays meet it.
-    below = measure_target_visibility(rig, scenario(tilted), pole, raster, num_frames=2)
+    # A level vehicle above a sloping floor: the pole is lower, and other rays hit it.
+    below = measure_target_visibility(rig, build_scenario(tilted), pole, raster, num_frames=2)
     assert np.abs(below.points - flat.points).max() > 3
 
 
 def test_positions_without_ground_are_outside():
     rig, pole = Rig.load("front_roof_32"), Target.load("pole")
-    found = measure_target_visibility(rig, scenario(FLOOR), pole, Raster((26.0, 34.0), (-2.0, 2.0), 1.0))
+    found = measure_target_visibility(rig, build_scenario(FLOOR), pole, Raster((26.0, 34.0), (-2.0, 2.0), 1.0))
     beyond = found.raster.positions_m[:, 0].reshape(found.raster.shape) > 30
     assert (found.state[beyond] == OUTSIDE).all()
     assert (found.state[~beyond] == FREE).all()

@@ -1,4 +1,4 @@
-"""Bodies beside the vehicle: what `targets` says of the same cells, whatever the budget, the processes and the side."""
+"""Targets in the near field: equal to target maps, whatever the budget, the processes and the side."""
 
 import pickle
 
@@ -15,42 +15,42 @@ from torchcover.simulation.regions_of_interest import build_near_field
 from torchcover.targets import NearFieldObserver, Raster, Target, measure_target_visibility, probing, target_frames
 from torchcover.targets.probing import NearFieldTarget
 
-from .worlds import WALL, drive, lidar, rig, world
+from .scenes import WALL, build_lidar, build_rig, build_scenario, write_trajectory
 
 LEFT, RIGHT = 2, 3
 ALL = 10_000
-TOP = rig(lidar(mount={"z_m": 1.4}, vertical_fov_deg=[-30, 5], columns=90, channels=15))
-# Right beside the vehicle, which is 2 m wide.
+TOP = build_rig(build_lidar(mount={"z_m": 1.4}, vertical_fov_deg=[-30, 5], columns=90, channels=15))
+# Next to the vehicle, which is 2 m wide.
 BLOCK = {"name": "block", "shape": {"type": "box", "size_m": [40, 4, 2]}, "poses": [{"y_m": 3.2}]}
 
 
-def simulated(scenario, num_frames=8, rigs=TOP, seed=0):
+def simulate_frames(scenario, num_frames=8, rigs=TOP, seed=0):
     return SimulatedFrames(
         scenario, rigs, num_frames=num_frames, seed=seed, reference_sensor=PaperReference(rows=2, columns=2)
     )
 
 
-def probed(frames, indices=None, body="pole", **budget):
+def observe_targets(frames, indices=None, body="pole", **budget):
     probes = NearFieldObserver(frames.simulator, [Target.load(body)], num_blocks=8, **({"frame_stride": 1} | budget))
     for index in range(len(frames)) if indices is None else indices:
         probes.update(frames[index])
     return probes
 
 
-def numbers(probes, region, rig="small"):
+def get_numbers(probes, region, rig="small"):
     bodies = probes.get_target_sums(rig)
     return list(bodies.estimate(bodies.regions[region], bodies.target_names[0]).to_numbers().values())
 
 
 @pytest.mark.parametrize(("name", "bodies"), [("child", ()), ("pole", (WALL,))], ids=["free space", "a wall"])
 def test_near_field_numbers_equal_those_of_target_maps(name, bodies, monkeypatch):
-    scenario, target = world(*bodies), Target.load(name)
-    for module in (target_frames, probing):  # its surface is looked at from random places
+    scenario, target = build_scenario(*bodies), Target.load(name)
+    for module in (target_frames, probing):  # the surface is visible from random viewpoints otherwise
         monkeypatch.setattr(
             module, "sample_reference_pose", lambda *_: build_transform(np.eye(3), np.array([0.3, 0.2, 1.3]))
         )
     found = measure_target_visibility(TOP, scenario, target, Raster.from_vehicle(scenario.compute_ego_box(), 3.0))
-    probes = probed(simulated(scenario, num_frames=1), body=name, positions_per_region=ALL)
+    probes = observe_targets(simulate_frames(scenario, num_frames=1), body=name, positions_per_region=ALL)
     x, y = (torch.from_numpy(each) for each in found.raster.positions_m.T)
     for number, region in enumerate(probes.regions):
         cells = region.mask_points(x, y).numpy().reshape(found.raster.shape)
@@ -59,12 +59,12 @@ def test_near_field_numbers_equal_those_of_target_maps(name, bodies, monkeypatch
         expected = [cells.sum(), free.sum(), found.detected_share[free].sum(), visible_m2.sum()]
         assert probes.compute()[0, 0, number, :-1].tolist() == pytest.approx(expected)
         share = np.nansum(found.surface_share[free] * visible_m2) / visible_m2.sum()
-        assert numbers(probes, number)[1].value == pytest.approx(share)
-    assert 0.1 < numbers(probes, LEFT)[0].value < 1
+        assert get_numbers(probes, number)[1].value == pytest.approx(share)
+    assert 0.1 < get_numbers(probes, LEFT)[0].value < 1
 
 
 def test_positions_of_a_region_are_sampled_uniformly():
-    vehicle = world().compute_ego_box()
+    vehicle = build_scenario().compute_ego_box()
     grid = BevGrid((-6.0, 6.0), (-5.0, 5.0), 1.0)
     pole = NearFieldTarget.from_target(Target.load("pole"), vehicle, build_near_field(vehicle.outline_m), grid)
     generator = np.random.default_rng(0)
@@ -76,33 +76,33 @@ def test_positions_of_a_region_are_sampled_uniformly():
         for region in range(4):
             own = counts[pole.region_indices == region]
             assert own.sum() == draws * places
-            # Pearson's chi-square of as many degrees of freedom, less one.
+            # Pearson's chi-square divided by its degrees of freedom plus one.
             excess = ((own - own.mean()) ** 2 / own.mean()).sum() / len(own)
             assert excess == pytest.approx(1.0, abs=5 * np.sqrt(2 / len(own)))
 
 
 def test_symmetric_rig_has_symmetric_results():
-    frames = simulated(world(), num_frames=32)
-    every = probed(frames, [0], positions_per_region=ALL)
-    assert numbers(every, LEFT)[0].value == numbers(every, RIGHT)[0].value
-    assert 0.1 < numbers(every, LEFT)[0].value < 0.9
-    some = probed(frames, positions_per_region=3)
-    (left, *_), (right, *_) = numbers(some, LEFT), numbers(some, RIGHT)
+    frames = simulate_frames(build_scenario(), num_frames=32)
+    every = observe_targets(frames, [0], positions_per_region=ALL)
+    assert get_numbers(every, LEFT)[0].value == get_numbers(every, RIGHT)[0].value
+    assert 0.1 < get_numbers(every, LEFT)[0].value < 0.9
+    some = observe_targets(frames, positions_per_region=3)
+    (left, *_), (right, *_) = get_numbers(some, LEFT), get_numbers(some, RIGHT)
     assert 0.01 < left.error < 0.15
     for one in (left, right):
-        assert abs(one.value - numbers(every, LEFT)[0].value) < 4 * one.error
+        assert abs(one.value - get_numbers(every, LEFT)[0].value) < 4 * one.error
 
 
 def test_merged_parts_equal_the_whole(tmp_path):
-    path = drive(tmp_path, (0, 0, 0, 0), (2, 20, 0, 0))
-    frames = simulated(
-        world(ego={"shape": {"type": "box", "size_m": [4, 2, 1]}, "trajectory": str(path)}), num_frames=20
+    path = write_trajectory(tmp_path, (0, 0, 0, 0), (2, 20, 0, 0))
+    frames = simulate_frames(
+        build_scenario(ego={"shape": {"type": "box", "size_m": [4, 2, 1]}, "trajectory": str(path)}), num_frames=20
     )
     whole, parts = (
-        probed(frames, frame_stride=4, positions_per_region=2),
-        [probed(frames, part, frame_stride=4, positions_per_region=2) for part in (range(10), range(10, 20))],
+        observe_targets(frames, frame_stride=4, positions_per_region=2),
+        [observe_targets(frames, part, frame_stride=4, positions_per_region=2) for part in (range(10), range(10, 20))],
     )
-    first = pickle.loads(pickle.dumps(parts[0]))  # as ranks send them
+    first = pickle.loads(pickle.dumps(parts[0]))  # as between ranks
     first.merge_state(pickle.loads(pickle.dumps(parts[1])))
     assert all(torch.equal(one, first.metric_state[name]) for name, one in whole.metric_state.items())
     assert (int(whole.num_frames), int(whole.compute()[..., TargetColumn.TRIED].sum())) == (5, 5 * 4 * 2)
@@ -115,7 +115,7 @@ def test_merged_parts_equal_the_whole(tmp_path):
 
 
 def test_numbers_are_nan_without_free_positions():
-    probes = probed(simulated(world(BLOCK), num_frames=8), body="child", positions_per_region=3)
+    probes = observe_targets(simulate_frames(build_scenario(BLOCK), num_frames=8), body="child", positions_per_region=3)
     left, right = probes.get_target_sums("small").summarize()[LEFT:]
     assert (left.num_cells, left.observed_cells, left.visible_m2) == (24, 0, pytest.approx(np.nan, nan_ok=True))
     assert all(np.isnan([one.value, one.error]).all() and one.count == 0 for one in left.numbers.values())
@@ -123,9 +123,9 @@ def test_numbers_are_nan_without_free_positions():
 
 
 def test_reused_ray_ends_equal_new_ones(tmp_path, monkeypatch):
-    path = drive(tmp_path, (0, 0, 0, 0), (2, 20, 0, 0))
+    path = write_trajectory(tmp_path, (0, 0, 0, 0), (2, 20, 0, 0))
     ego = {"shape": {"type": "box", "size_m": [4, 2, 1]}, "trajectory": str(path)}
-    frames = simulated(world(WALL, ego=ego), rigs=rig(lidar(mount={"z_m": 1.1})))
+    frames = simulate_frames(build_scenario(WALL, ego=ego), rigs=build_rig(build_lidar(mount={"z_m": 1.1})))
     frame = frames[3]
     probes = NearFieldObserver(frames.simulator, [Target.load("pole")], frame_stride=1)
     kept = probes.compute_sums(frame)

@@ -1,4 +1,4 @@
-"""A drive on a hill, and the same written down as each format does it.
+"""Drive on a hill, written in each format.
 
 `python -m tests.simulation.recorded.drives datasets/scenarios/tracks` makes the files of the built-in scenarios.
 """
@@ -21,7 +21,7 @@ ORIGIN_M = np.array([1400.0, 2200.0])
 
 
 class Somebody(NamedTuple):
-    """A box that drives straight on, or stands, in plan relative to ORIGIN_M."""
+    """Box that drives straight, or stands, with positions relative to ORIGIN_M."""
 
     name: str
     category: str
@@ -48,18 +48,18 @@ EGO = Somebody("ego", "car", (4.9, 1.94, 1.63), (0.0, 0.0), 0.0, 9.0)
 
 
 def hill_m(places_m):
-    """Heights of (N, 2) places: a street that rises and falls by metres, and leans to its side."""
+    """Compute the heights of (N, 2) positions: a street that rises and falls by meters, and leans to its side."""
     x, y = (places_m - ORIGIN_M).T
     return 31.0 + 2.5 * np.sin(x / 45.0) + 0.02 * y
 
 
 def flat_m(places_m):
-    """No heights."""
+    """Compute zero heights."""
     return np.zeros(len(places_m))
 
 
 def poses(somebody, heights=hill_m, times_s=TIMES_S):
-    """(T, 4, 4) of the middle of the bottom, on the ground and tilted with it."""
+    """Compute the (T, 4, 4) poses of the center of the bottom, on the ground and tilted with it."""
     yaw = np.deg2rad(somebody.yaw_deg)
     ahead = np.array([np.cos(yaw), np.sin(yaw)])
     plan_m = ORIGIN_M + somebody.start_m + somebody.speed_mps * times_s[:, None] * ahead
@@ -74,12 +74,12 @@ def poses(somebody, heights=hill_m, times_s=TIMES_S):
 
 
 def seen(somebody):
-    """Numbers of the instants at which it is there."""
+    """List the frames in which it is present."""
     return range(somebody.first, somebody.last + 1)
 
 
 def quaternion(matrix):
-    """w, x, y, z of any rotation by less than 180 degrees about any axis, or about z."""
+    """Compute w, x, y, z of a rotation by less than 180 degrees about any axis, or about z."""
     r = matrix[:3, :3]
     w = np.sqrt(max(1 + np.trace(r), 0.0)) / 2
     if w < 1e-6:
@@ -94,12 +94,12 @@ def _half_turn(r):
 
 
 def about_middle(world_T_bottom, size_m):
-    """The pose of the middle of a box."""
+    """Compute the pose of the center of a box."""
     return world_T_bottom @ build_transform(np.eye(3), [0.0, 0.0, size_m[2] / 2])
 
 
 def write_argoverse2(folder, others=OTHERS, heights=hill_m):
-    """A log; the poses of the ego are twice as dense as the cuboids, and begin before."""
+    """Write a log; the poses of the ego vehicle are twice as dense as the cuboids, and begin earlier."""
     import pyarrow as pa
     from pyarrow import feather
 
@@ -129,7 +129,7 @@ def _row(pose):
 
 
 def write_nuscenes(folder, others=OTHERS, heights=flat_m, scenes=("scene-0001",)):
-    """Tables; every fifth of the instants is a sample. All scenes but the first are a minute later, without others."""
+    """Write tables; every fifth frame is a sample. Scenes after the first are a minute later, without other objects."""
     names = {"car": "vehicle.car", "truck": "vehicle.truck", "bus": "vehicle.bus.rigid", "bicycle": "vehicle.bicycle",
              "pedestrian": "human.pedestrian.adult", "bollard": "movable_object.barrier"}  # fmt: skip
     tables = {name: [] for name in ("sample", "ego_pose", "sample_annotation", "instance", "category", "scene")}
@@ -159,7 +159,7 @@ def write_nuscenes(folder, others=OTHERS, heights=flat_m, scenes=("scene-0001",)
 
 
 def write_commonroad(path, others=OTHERS):
-    """Version 2020a: who stands all the time is static."""
+    """Write version 2020a: objects that never move are static."""
     parts = [f'<commonRoad timeStepSize="{STEP_S}" commonRoadVersion="2020a" benchmarkID="HILL_Drive-1_1_T-1">']
     for number, one in enumerate(others, 1):
         kind = "dynamic" if one.speed_mps else "static"
@@ -188,7 +188,7 @@ def _state(one, k):
 
 
 def write_csv(folder, others=OTHERS, heights=hill_m):
-    """`boxes.csv` and `ego.csv`; the boxes do not tilt."""
+    """Write `boxes.csv` and `ego.csv`; the boxes do not tilt."""
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / "boxes.csv").open("w", newline="") as file:
         rows = csv.writer(file)
@@ -210,13 +210,13 @@ def write_csv(folder, others=OTHERS, heights=hill_m):
 
 
 def rewrite(path, change):
-    """Change the cells of each row of a table, those of the head too; no row where it returns none."""
+    """Change the cells of each row of a table, including the header; rows for which it returns None are dropped."""
     rows = (change(line.split(",")) for line in path.read_text().splitlines())
     path.write_text("\n".join(",".join(row) for row in rows if row))
 
 
 def write_all(folder):
-    """All four, as the built-in scenarios have them."""
+    """Write all four formats, as the built-in scenarios have them."""
     write_argoverse2(folder / "argoverse2")
     write_nuscenes(folder / "nuscenes")
     write_commonroad(folder / "commonroad.xml")

@@ -1,4 +1,4 @@
-"""Recordings that cannot be shown say why, in a line that names them."""
+"""Unusable recordings are refused in one line that names them."""
 
 import json
 import re
@@ -262,7 +262,7 @@ def test_incomplete_logs_are_refused(tmp_path, monkeypatch):
 
 
 def lack_pyarrow(monkeypatch):
-    """Of the process that reads."""
+    """Run in the process that reads."""
     monkeypatch.setattr(isolated, "_processes", {})
     monkeypatch.setattr(isolated, "PROGRAM", f"import sys; sys.modules['pyarrow'] = None; {isolated.PROGRAM}")
 

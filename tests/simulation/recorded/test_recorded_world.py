@@ -1,4 +1,4 @@
-"""A drive through a small street, made a world."""
+"""A drive through a small street becomes a scenario."""
 
 import numpy as np
 import pytest
@@ -38,7 +38,7 @@ LIDAR = {
 
 
 def way(first_m, speed_mps, y_m):
-    """A trajectory along x, on the slope."""
+    """Write a trajectory along x, on the slope."""
     rows = [
         (t, first_m + speed_mps * t, y_m, np.tan(np.deg2rad(1.0)) * (first_m + speed_mps * t)) for t in (0, SECONDS)
     ]
@@ -85,11 +85,11 @@ def test_walls_are_static_and_driven_areas_free(made):
     recording, _, world = made
     first_m = recording.get_world_T_vehicle(0)[:3, 3]
     corners_m = world.static_meshes[1].vertices_m + first_m - world.ego.trajectory.positions_m[0]
-    assert (np.abs(corners_m[:, 1] - WALL_M) < 1.3).all()  # nothing else
+    assert (np.abs(corners_m[:, 1] - WALL_M) < 1.3).all()  # the wall is the only static object
     x, z = np.meshgrid(np.arange(-10.0, 10.0, 0.5), np.arange(0.8, 4.0, 0.5))
     wall_m = np.stack([x.ravel(), np.full(x.size, WALL_M), z.ravel()], axis=1)
     apart_m = np.linalg.norm(wall_m[:, None] - corners_m[None], axis=2).min(axis=1)
-    assert apart_m.max() < 1.75 * CELL_M  # to a corner of a cell
+    assert apart_m.max() < 1.75 * CELL_M  # distance to the corner of a cell
 
 
 def test_moving_objects_follow_their_tracks(made):
@@ -102,7 +102,7 @@ def test_moving_objects_follow_their_tracks(made):
     np.testing.assert_allclose(placed_m[:, 1], 4.0, atol=0.5)
     off_m = np.abs(placed_m[:, 0] - 16.0 - CAR_MPS * times_s)
     assert np.median(off_m) < 0.4
-    assert off_m.max() < 2.0  # of what is coming, only the front is seen
+    assert off_m.max() < 2.0  # only the front of oncoming vehicles is visible
     assert (np.abs(np.ptp(car.mesh.vertices_m, axis=0) - [5.0, 2.0, 2.2]) < [1.0, 0.5, 0.5]).all()
 
 
@@ -131,7 +131,7 @@ def test_cell_mesh_is_closed_with_correct_volume():
         return np.linalg.norm(crossed, axis=1).sum() / 2, (a * crossed).sum() / 6
 
     own, whole = area_and_volume(mesh.vertices_m / CELL_M, mesh.faces), area_and_volume(block.vertices_m, block.faces)
-    np.testing.assert_allclose(own, whole)  # a volume that is positive: its sides look outwards
+    np.testing.assert_allclose(own, whole)  # the volume is positive if faces point outwards
 
 
 def test_unusable_drives_are_refused():

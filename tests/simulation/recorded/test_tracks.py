@@ -1,4 +1,4 @@
-"""Recorded tracks as scenarios: where everybody is, on what ground, and what repeats."""
+"""Scenarios of recorded tracks: poses, ground and repetition."""
 
 import numpy as np
 import pytest
@@ -40,12 +40,12 @@ def scenario(path, **keys):
 
 
 def drive_of(folder, **keys):
-    """The drive that `write_csv` writes."""
+    """Scenario of the drive that `write_csv` writes."""
     return scenario(folder / "boxes.csv", ego_trajectory=str(folder / "ego.csv"), **keys)
 
 
 def raised(row, by_m, *names):
-    """A row of `boxes.csv`, higher if it is of one of some names."""
+    """Raise a row of `boxes.csv` if it has one of some names."""
     return [*row[:5], str(float(row[5]) + by_m), *row[6:]] if row[1] in names else row
 
 
@@ -85,7 +85,7 @@ def test_actor_poses_equal_a_reference_implementation(written, kind):
             name = str([EGO, *OTHERS].index(one)) if kind == "commonroad" else one.name
             actor = world.ego if one is ego else of(world, name)
             known_s = TIMES_S[one.first : one.last + 1 : round(recorded_s / STEP_S)]
-            if kind == "nuscenes":  # samples are every fifth instant
+            if kind == "nuscenes":  # samples are every fifth frame
                 known_s = np.array([time for time in TIMES_S[::5] if TIMES_S[one.first] <= time <= TIMES_S[one.last]])
             there = (one.speed_mps == 0 and kind == "commonroad") or known_s[0] <= time_s <= known_s[-1]
             at = actor.trajectory.interpolate_positions_m(np.array([time_s]))[0]
@@ -111,7 +111,7 @@ def test_runs_repeat_after_the_end_of_the_recording(written, kind):
     assert simulator.num_distinct_frames == 41
     assert [simulator.get_block_index(index) for index in (0, 1, 13, 14, 41)] == [0, 3, 39, 1, 0]
     assert simulator.get_run_index(1000) == 0
-    assert round(compute_frame_interval_s(drive, None) / 0.1) == 25  # the golden share of its instants
+    assert round(compute_frame_interval_s(drive, None) / 0.1) == 25  # the golden ratio of its frames
 
 
 def test_repeated_frames_are_counted_and_equal(written):
@@ -134,7 +134,7 @@ def test_recorded_scenes_do_not_depend_on_seeds(written):
 
 
 def heights_of(mesh, places_m):
-    """Heights of a raster's mesh."""
+    """Get the heights of a mesh of a raster."""
     corners = np.unique(mesh.vertices_m[:, 0]), np.unique(mesh.vertices_m[:, 1])
     raster = np.full((len(corners[1]), len(corners[0])), np.nan)
     raster[np.searchsorted(corners[1], mesh.vertices_m[:, 1]), np.searchsorted(corners[0], mesh.vertices_m[:, 0])] = (
@@ -146,7 +146,7 @@ def heights_of(mesh, places_m):
 
 
 def off_ground_m(world, others, heights=hill_m):
-    """How far the ground is from where each of some stood, at all times."""
+    """Compute the distance of the ground from the positions of some objects at all times."""
     places_m = np.concatenate([poses(one, heights)[one.first : one.last + 1, :3, 3] for one in others])
     return heights_of(world.static_meshes[0], places_m[:, :2]) - places_m[:, 2]
 
@@ -154,7 +154,7 @@ def off_ground_m(world, others, heights=hill_m):
 def test_ground_lies_below_tracks_within_centimeters(written):
     world = opened(written, "argoverse2")[0].build_scene()
     assert np.abs(off_ground_m(world, [EGO])).max() < 0.03
-    # Of things, nobody knows whether they stand or hang; Argoverse's bicycles are without a rider.
+    # Other objects may hang above the ground; the bicycles of Argoverse have no rider.
     off_m = np.abs(off_ground_m(world, [one for one in OTHERS if one.category not in ("bollard", "bicycle")]))
     assert off_m.max() < 0.05
     assert np.median(off_m) < 0.01
@@ -228,7 +228,7 @@ def test_bodies_are_scaled_to_boxes(written):
 def test_bodies_without_recorded_height_keep_theirs(written):
     world = opened(written, "commonroad")[0].build_scene()
     size_m = BoundingBox.from_points(of(world, "3").mesh.vertices_m).size_m
-    np.testing.assert_allclose(size_m, (9.5, 2.5, 1.07 * 3.45))  # of the lorry whose length is nearest
+    np.testing.assert_allclose(size_m, (9.5, 2.5, 1.07 * 3.45))  # the truck whose length is nearest
 
 
 def test_any_track_can_be_the_ego(written):
@@ -314,7 +314,7 @@ def test_recordings_with_boxes_become_traffic(tmp_path, layout, name, faces):
     (car,) = world.actors
     assert (drive.num_time_steps, car.name) == (5, name)
     np.testing.assert_allclose(BoundingBox.from_points(car.mesh.vertices_m).size_m, CAR_SIZE_M, atol=1e-6)
-    assert len(car.mesh.faces) >= faces  # a plain folder calls it "car, red", which is no word for a road user
+    assert len(car.mesh.faces) >= faces  # the plain folder has the category "car, red", which is no road user
     for instant, time_s in enumerate(recorded.times_s):
         wanted = invert(recorded.get_world_T_vehicle(instant)) @ recorded.world_T_car(instant)
         wanted = wanted @ build_transform(np.eye(3), [0.0, 0.0, -CAR_SIZE_M[2] / 2])
@@ -385,7 +385,7 @@ def test_sampled_scenery_avoids_recorded_tracks(written):
     for traffic, notes in ((scenario(path), []), (scenario(path, built_share=1.0), [said])):
         record = SimulatedFrames(traffic, RIG, num_frames=1, reference_sensor=FEW).reference_record
         assert [note for note in record["notes"] if "own vehicle" not in note] == notes
-    # They begin on the ground: beside hills, below the highest of them.
+    # Scenery begins on the ground, next to hills below their top.
     assert drawn.static_meshes[1].vertices_m[:, 2].min() < bare.static_meshes[0].vertices_m[:, 2].max()
 
 
