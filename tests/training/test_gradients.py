@@ -8,7 +8,7 @@ import torch
 
 from torchcover import blind_spot_radius
 
-EXAMPLE = Path(__file__).parents[2] / "examples" / "optimise_points.py"
+EXAMPLE = Path(__file__).parents[2] / "examples" / "optimize_points.py"
 
 
 def test_a_point_is_pulled_towards_those_it_is_nearest_to_and_others_feel_nothing():
@@ -35,7 +35,7 @@ def test_free_points_end_in_the_median_of_what_they_are_nearest_to():
 def test_the_example_lowers_the_mean_radius_and_draws_a_picture(tmp_path, monkeypatch, capsys):
     picture = tmp_path / "points.png"
     monkeypatch.setattr(
-        sys, "argv", ["optimise_points.py", "--points", "60", "--num-steps", "15", "--out", str(picture)]
+        sys, "argv", ["optimize_points.py", "--points", "60", "--num-steps", "15", "--out", str(picture)]
     )
     runpy.run_path(str(EXAMPLE), run_name="__main__")
     said = capsys.readouterr().out

@@ -1,4 +1,4 @@
-"""Lower the mean blind spot radius by moving points: `python examples/optimise_points.py`.
+"""Lower the mean blind spot radius by moving points: `python examples/optimize_points.py`.
 
 The radius is differentiable in the points of the sensor cloud: the gradient of each reference point's radius pulls its
 nearest sensor point towards it. Here some points of a rig's cloud, in an instant of city traffic, are set free and
@@ -57,7 +57,7 @@ def main():
     parser.add_argument("--points", type=int, default=400, help="free points")
     parser.add_argument("--num-steps", type=int, default=200, help="steps of gradient descent")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--out", type=Path, default=Path("out/optimise_points.png"))
+    parser.add_argument("--out", type=Path, default=Path("out/optimize_points.png"))
     options = parser.parse_args()
 
     console = Console()
