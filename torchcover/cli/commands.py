@@ -26,7 +26,7 @@ def study(
     assignments: options.AssignmentsOption = None,
     **option_values: Any,  # noqa: ANN401
 ) -> None:
-    """Find the fastest settings for a target error, from run time, bias and number of frames of several settings."""
+    """Find the fastest settings for a target error: run time, bias and needed frames of several settings."""
     from torchcover.cli.printing import print_study
     from torchcover.evaluation import Settings, StudyPlan, count_ranks, measure_error_against_time
     from torchcover.files import lock_folder
@@ -35,9 +35,10 @@ def study(
         raise ValueError("study measures run times, which several ranks would change: run it without torchrun")
     loaded = load_config(config, assignments or (), options.find_changed_settings(option_values))
     settings = loaded.config.get_changed_settings()
-    settings.pop("num_frames", None)
+    settings.pop("num_frames", None)  # the option of this command has a default of its own
     if unused := settings.keys() - set(STUDY_SETTINGS):
         raise ValueError(f"study does not take {', '.join(sorted(unused))}; it takes {', '.join(STUDY_SETTINGS)}")
+    # The variants cast fewer reference rays than the default of the surface reference.
     has_variants = "num_rays" not in settings and settings.get("reference") != "paper"
     plan = StudyPlan(Settings(rig, num_frames=num_frames, **settings), StudyPlan.variants if has_variants else ())
     with lock_folder(out):
@@ -107,7 +108,7 @@ def targets(
     files: options.FilesOption = options.ALL_FILES,
     **settings: Any,  # noqa: ANN401
 ) -> None:
-    """Map the visibility of a test target around the vehicle: points on it, and positions where it is not detected."""
+    """Map the points on a test target around the vehicle, and find positions where it is not detected."""
     from torchcover.cli.target_run import run_targets_command
 
     run_targets_command(
@@ -163,6 +164,7 @@ def report(
     console = Terminal()
     print_files(written, out, console)
     print_verdict(result.verdict, console)
+    # Results are saved first; then an interrupted run ends with the code of its signal.
     if result.result.run is not None:
         result.result.run.raise_failure()
 
@@ -234,12 +236,13 @@ def encounter(
         source, unused = "--scenario, which defines the traffic", {"encounters", "num_start_offsets", "animation"}
     else:
         source, unused = "a set", {"num_scenes", "max_ttc_s"}
+    # Options have defaults: only the source tells whether the user gave one that has no effect.
     for parameter in context.command.params:
         origin = context.get_parameter_source(parameter.name or "")
         if parameter.name in unused and origin is not None and origin.name == "COMMANDLINE":
             raise ValueError(f"{parameter.opts[0]}: has no effect with {source}; omit it")
     if animation is not None:
-        check_animation(animation)
+        check_animation(animation)  # an invalid file name is reported before the run
     with lock_folder(out):
         if frames is not None:
             results = evaluation.evaluate_recorded_encounters(frames, criterion)
@@ -349,7 +352,7 @@ def list_builtin(
         str | None, typer.Argument(help="Kind of items, such as `rigs`, or a text to find in names and descriptions.")
     ] = None,
 ) -> None:
-    """List the built-in rigs, scenarios, LiDAR models, vehicles, materials, weather, encounters and requirements."""
+    """List built-in rigs, scenarios, LiDAR models, vehicles, materials, weather, encounters, requirements."""
     from torchcover.cli.listing import print_builtin
 
     print_builtin(search_text)

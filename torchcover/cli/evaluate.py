@@ -54,6 +54,7 @@ def _run_evaluation(
     recording = open_frames(frames, settings, loaded.config.recording, sensors)
     rig_names = list(rigs or (() if recording is None else recording.rigs))
     weather = settings.get("weather") or ()
+    # `compare` of one rig in one weather compares the weather with clear air.
     if len(rig_names) == 1 and min_rigs > 1 and len(weather) == 1:
         weather = settings["weather"] = ["clear", *weather]
     if 0 < len(rig_names) * max(1, len(weather)) < min_rigs:
@@ -66,6 +67,7 @@ def _run_evaluation(
         settings["regions"] = regions
     with join_run(out) as ranks:
         log = open_rerun_log(loaded.config.rerun, ranks)
+        # Several scenarios have one checkpoint each; other settings do not matter here.
         checkpoint = prepare_checkpoint(out, Settings(scenario=settings.get("scenario")), resume=resume)
         result = evaluation.evaluate(
             rigs,
@@ -126,6 +128,7 @@ def compare(
         return
     defaults = {item.name: item.default for item in EVALUATION_OPTIONS}
     values = {**defaults, **option_values}
+    # Options that only affect the output are allowed; any other would need a new evaluation.
     changed = []
     for name, value in values.items():
         if value != defaults[name] and name not in ("out", "files", "explain"):
@@ -275,6 +278,7 @@ def save_and_print(
     from torchcover.cli.printing import print_result
     from torchcover.evaluation import MixedResult
 
+    # Every rank has the same result; the first one writes it.
     is_mixed = isinstance(result, MixedResult)
     results = result.scenario_results if isinstance(result, MixedResult) else {"": result}
     if ranks is None or ranks.rank == 0:

@@ -25,6 +25,7 @@ def print_builtin(search_text: str | None) -> None:
     Raises:
         ValueError: No item contains the text.
     """
+    # A pipe or file gets complete lines.
     width = shutil.get_terminal_size().columns if sys.stdout.isatty() else None
     # Kind -> function that describes the properties of an item; None for a kind without properties.
     kinds: dict[str, Callable[[Document], str] | None] = {

@@ -22,12 +22,12 @@ Command = Callable[..., None]
 
 # Headings of `--help` in their order, each with the names of its options; other options are below the last heading.
 OPTION_GROUPS = {
-    "Scene and sensors": "scenario frames sensors vehicle sensor_model weather target heading encounters requirements "
-    "num_start_offsets num_scenes",
-    "Measurement": "regions region raster thresholds_m threshold_m detection_points reference average redundancy",
-    "Accuracy": "num_frames num_rays frame_interval_s seed target_error budget num_evaluations num_held_out_scenes "
-    "frames_per_scene",
-    "Output": "out files explain animation",
+    "Scene and sensors": "scenario frames sensors vehicle sensor_model weather target heading encounters requirements",
+    "Measurement": "regions region raster thresholds_m threshold_m detection_points reference average redundancy "
+    "points pixels consecutive_scans deceleration_mps2 latency_s max_ttc_s",
+    "Accuracy": "num_frames num_rays frame_interval_s seed target_error budget num_evaluations num_scenes "
+    "num_held_out_scenes frames_per_scene num_start_offsets",
+    "Output": "out files explain animation layout",
     "Execution": "config assignments device num_workers resume",
 }
 # Types of options that are not derived from their defaults.
@@ -94,8 +94,10 @@ def build_setting_options(*names: str) -> list[inspect.Parameter]:
     options = []
     for name in names:
         field = EvaluateConfig.model_fields[name]
+        # The default None marks a setting that was not given; other settings determine its value.
         default = field.default if type(field.default) in (bool, int, str) else None
         value_type: Any = OPTION_TYPES.get(name, str if default is None else type(default))
+        # Typer rejects smaller values before any file is read.
         minimum = None
         if value_type is int:
             minimum = 0 if name in ("seed", "num_workers") else 1
@@ -168,7 +170,7 @@ AssignmentsOption = Annotated[
     list[str] | None, typer.Option("--set", help="KEY=VALUE of --config, as in cell_m=0.5 or recording.units=mm.")
 ]
 OutOption = Annotated[Path, typer.Option(help="Folder for the results.", callback=check_out)]
-FilesOption = Annotated[str, typer.Option(help="Kinds of files besides `summary.json`.", callback=_check_files)]
+FilesOption = Annotated[str, typer.Option(help="Kinds of files in addition to `summary.json`.", callback=_check_files)]
 ALL_FILES = ",".join(FILES)
 
 
@@ -240,6 +242,7 @@ def combine_regions(regions_file: Path | None, regions: Sequence[str] | None) ->
     from torchcover.simulation import RegionsOfInterest
     from torchcover.simulation.documents import explain_document_error
 
+    # Only keys of the file: all other keys keep their defaults.
     content = {} if regions_file is None else RegionsOfInterest.load(regions_file).model_dump(exclude_unset=True)
     if regions:
         content["regions"] = {}
@@ -256,7 +259,7 @@ def combine_regions(regions_file: Path | None, regions: Sequence[str] | None) ->
 
 def _parse_region(text: str) -> tuple[str, list[float]]:
     """Parse NAME:x0,x1,y0,y1."""
-    name, _, numbers = text.rpartition(":")
+    name, _, numbers = text.rpartition(":")  # a name may contain colons
     if not name:
         raise ValueError(f"--region {text}: NAME:x0,x1,y0,y1 is needed, in meters")
     try:

@@ -36,7 +36,7 @@ def record(
     frames = build_simulation_task(Settings(Rig.load(rig), num_frames=num_frames, **settings), needs_boxes=True).frames
     try:
         write_recording(frames, out, layout, resume=resume, progress=_show_progress)
-    except BaseException:
+    except BaseException:  # also Ctrl-C: complete frames stay in the folder
         if written := (read_manifest(out / RECORDING) or {}).get("steps"):
             typer.echo(
                 f"torchcover: {len(written):,} of {len(frames):,} frames are kept; continue with --resume", err=True
@@ -130,7 +130,7 @@ def calibrate(
     assignments: options.AssignmentsOption = None,
     out: Annotated[Path, typer.Option("--out", help="YAML file for the calibrated rig.")] = Path("rig.yaml"),
 ) -> None:
-    """Fit range and noise of each LiDAR of a rig to a recording, from rays with and without a return from the road."""
+    """Fit range and noise of the LiDARs of a rig to a recording, from the returns of a straight road."""
     from torchcover.simulation import Rig, calibrate
 
     opened = options.open_recording(recording, options.load_recording_settings(assignments))

@@ -57,6 +57,7 @@ def run_search_command(
     with lock_folder(out):
         report = run(space_file, out, resume=resume, **settings).report
         written = report.save(out, files=file_kinds)
+    # The page has further tables.
     print_page_tables(report.tables[:2])
     console = Terminal()
     print_files(written, out, console)
@@ -88,6 +89,7 @@ def _select(path: Path, out: Path, *, resume: bool, **settings: Any) -> Selectio
         raise ValueError(
             f"{', '.join(useless)}: has no effect, because all {SELECTION_KEY} of this file are evaluated; omit it"
         )
+    # A selection ends by itself, but every plan has a budget.
     space, plan = SelectionSpace.load(path), SearchPlan(**settings | {"budget_s": math.inf})
     with make_common_frames(space, plan, plan.seed, plan.num_scenes) as frames:
         return run_selection(

@@ -29,6 +29,7 @@ class ConvertedField(Generic[InputT, ValueT]):
         self._name = name
 
     def __get__(self, settings: object, owner: type) -> ValueT:
+        # `dataclass` reads the default from the class, where there is no object.
         value: ValueT = self._default if settings is None else vars(settings)[self._name]
         return value
 
@@ -54,6 +55,7 @@ def accept_fields(
 
         def call_with_fields(*args: Arguments.args, **kwargs: Arguments.kwargs) -> ReturnT:
             """Call the function with settings from the fields; a wrong field is an error of the function."""
+            # A wrong name is reported before any value is converted, which may read files.
             try:
                 signature.bind(*args, **kwargs)
             except TypeError as error:

@@ -154,6 +154,7 @@ class CheckpointManager:
             if not self._has_warned:
                 warnings.warn(f"{self.path}: no checkpoint was written ({error}); the run goes on", stacklevel=2)
             self._has_warned = True
+        # The share of the time for writing is limited on slow disks.
         end_s = time.monotonic()
         self._due_s = end_s + max(self.params.interval_s, (end_s - start_s) / self.params.max_time_share)
 
@@ -296,6 +297,7 @@ def _pack(value: Any, archive: zipfile.ZipFile, numbers: Iterator[int]) -> Any: 
     if isinstance(value, Tensor):
         return {"tensor": _add_tensor(value, archive, f"{next(numbers)}")}
     if isinstance(value, Mapping):
+        # JSON would convert other keys to texts, which would not come back.
         for key in value:
             if not isinstance(key, str):
                 raise TypeError(f"a state with names as keys is needed; got the key {key!r}")

@@ -69,8 +69,8 @@ class EvaluateConfig(BaseModel):
     )
     aggregations: Names = Field(
         (),
-        description="Maps and region numbers besides means, such as `maximum` or `quantiles:0.5,0.9`; any other name "
-        "lists all. Python also takes objects, as in `CoverageMetric`.",
+        description="Maps and numbers of regions in addition to means: `maximum`, `quantiles:0.5,0.9`, ...; any other "
+        "name lists all. Python also takes objects, as in `CoverageMetric`.",
     )
     reference: str | None = Field(
         None,
@@ -189,6 +189,7 @@ def load_config(
     for text in assignments:
         _apply_assignment(merged, text)
     merged |= options or {}
+    # The file was valid by itself, so a mistake is one of the assignments.
     try:
         config = EvaluateConfig.model_validate(merged)
     except ValidationError as error:
@@ -232,6 +233,7 @@ def _apply_assignment(content: dict[str, Any], text: str) -> None:
         keys = [*EvaluateConfig.model_fields, *(f"recording.{field}" for field in RecordingSettings.model_fields)]
         raise ValueError(f"--set {text}: KEY=VALUE is needed, with one of these keys: {', '.join(keys)}")
     target = content["recording"] if is_of_recording else content
+    # Lists are accepted without brackets; thresholds are the only list of numbers.
     is_list = isinstance(fields[name].default, tuple) or name == "test_targets"
     if is_list and not value.startswith("["):
         items = [item.strip() for item in value.split(",")]

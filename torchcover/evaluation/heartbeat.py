@@ -51,6 +51,7 @@ class Heartbeat:
                 self._store.set(f"alive {self._rank}", str(count))
                 for peer, previous in self._heartbeats.items():
                     heartbeat = self._store.get(f"alive {peer}") if self._store.check([f"alive {peer}"]) else b""
+                    # A rank that has left is not silent.
                     if heartbeat != previous or heartbeat == b"left":
                         self._heartbeats[peer] = heartbeat
                         self._changed_s[peer] = time.monotonic()
@@ -85,6 +86,7 @@ class Heartbeat:
             Their numbers.
         """
         latest_s = now_s - self._params.timeout_s
+        # Without the store, which is in rank 0, nothing is known about the other ranks.
         if self._exchanged_s < latest_s:
             return [] if self._rank == 0 or 0 in self._reported else [0]
         silent = [peer for peer, changed_s in self._changed_s.items() if changed_s < latest_s]

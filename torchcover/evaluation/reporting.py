@@ -247,6 +247,7 @@ def report(
     loaded_target = target if isinstance(target, Target) else Target.load(target)
     ego = task.frames.scenario.ego
     assert ego is not None  # every simulation task has an ego vehicle
+    # Test targets stand around the same vehicle as in the traffic.
     ground = build_flat_ground().model_copy(update={"ego": ActorDescription(shape=ego.shape)})
     bar_total = len(named_rigs) + (encounters is not None) + (requirements is not None) + num_frames
     with Progress(bar_total, "report", is_shown=show_progress) as bar:
@@ -263,6 +264,7 @@ def report(
         if requirements is not None:
             check_result = check(named_rigs, requirements, seed=seed, num_workers=num_workers, **vehicle_and_model)
             bar.advance(bar_total)
+        # The traffic comes last because its number of frames follows the budget.
         result = measure_coverage(task, settings, _BudgetRule(bar, bar_total, start_s + budget_s))
     return Report(result, target_maps, num_frames, encounter_results, check_result)
 

@@ -84,6 +84,7 @@ def _convert_mixture(scenario: object) -> "Mixture | None":
     Raises:
         ValueError: A repeated scenario, a recording, or weights that are not numbers, negative, or all 0.
     """
+    # A file may have a comma or an equals sign in its name.
     if isinstance(scenario, str) and ("," in scenario or "=" in scenario) and not Path(scenario).exists():
         scenario = _parse_mixture(scenario)
     if isinstance(scenario, str) or not isinstance(scenario, Mapping | Sequence):
@@ -91,6 +92,7 @@ def _convert_mixture(scenario: object) -> "Mixture | None":
     scenarios = list(scenario)
     weights = list(scenario.values()) if isinstance(scenario, Mapping) else [1.0] * len(scenarios)
     names = [_get_scenario_name(item) for item in scenarios]
+    # The results of a scenario go to a folder with its name, and some file systems ignore case.
     if len({name.lower() for name in names}) < len(names):
         raise ValueError(f"scenario: different names are needed (case is ignored); got {', '.join(names)}")
     try:
@@ -284,6 +286,7 @@ class Settings:
     ] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
+        # Settings from Python; those of files and options were checked by `EvaluateConfig`.
         if self.num_frames is not None and self.num_frames < 1:
             raise ValueError(f"num_frames: at least 1 is needed; got {self.num_frames}")
         check_memory_fits(f"{self.num_workers or 0:,} workers", BYTES_PER_WORKER * (self.num_workers or 0), "use fewer")
@@ -297,6 +300,7 @@ class Settings:
                 raise ValueError(f"{name} {value}: `{choices[0]}` or `{choices[1]}` is needed")
         if self.reference == "paper" and self.band_frame == "ground":
             raise ValueError("band_frame ground: the paper reference has height bands of the vehicle frame; omit it")
+        # `only_detection` searches no further than the threshold, so that radii are unknown.
         needs_radii = self.target_error is not None and self.target_error.radius_m is not None
         needs_clouds = self.aggregations or self.redundancy or self.metrics or self.observers
         if self.only_detection and (needs_radii or needs_clouds or not self.thresholds_m):

@@ -70,6 +70,7 @@ class Study:
         if not candidates:
             return None
         times_s = [trial.estimate_duration_s(num_frames, self.startup_s) for trial, num_frames in candidates]
+        # A small saving does not justify settings other than the user's.
         is_baseline_first = candidates[0][0] is self.trials[0]
         if is_baseline_first and (1 - self.plan.params.min_saving) * times_s[0] <= min(times_s):
             return candidates[0]
@@ -164,6 +165,7 @@ class Study:
         """Plot the largest error of each unit against the run time."""
         panels = {}
         quantities = dict.fromkeys(number.quantity for number in self.trials[0].numbers)
+        # In general the radius and the first detection rate.
         for quantity in list(quantities)[:2]:
             factor = get_display_unit(quantity.unit).factor
             lines = {}
@@ -253,6 +255,7 @@ def measure_error_against_time(plan: StudyPlan, *, show_progress: bool = False) 
         trial, coverage = _run_trial(options, run_settings, baseline, plan.params)
         trials.append(trial)
         baseline = baseline or coverage
+    # The timed command evaluates one frame.
     frame_s = trials[0].duration_s / trials[0].num_frames
     return Study(plan, trials, max(0.0, measure_command_s(plan) - frame_s))
 
@@ -269,6 +272,7 @@ def _run_trial(
 ) -> tuple[Trial, Coverage]:
     """Evaluate one setting and compare it with the baseline; None if it is the baseline."""
     task = build_simulation_task(settings)
+    # User and system time of this process and of its children, the workers.
     cpu_before_s = sum(os.times()[:4])
     result = measure_coverage(task, settings)
     cpu_s = sum(os.times()[:4]) - cpu_before_s
