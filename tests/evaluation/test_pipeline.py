@@ -484,8 +484,8 @@ def test_rates_count_the_start_and_are_means_over_rounds_of_all_workers(monkeypa
     for step in range(60):
         now_s = 8.0 + 4.0 * (step // 4)
         bar.advance(100)
-        rates.append(float(bar._rich.tasks[0].fields["rate"].split()[0]))
+        rates.append(float(bar._bar.tasks[0].fields["rate"].removesuffix("/s")))
     assert rates[0] == pytest.approx(1 / 8, abs=0.01)
     assert max(rates) < 1.35
     assert min(rates[30:]) > 0.75
-    assert bar._rich.tasks[0].fields["left"].startswith("0:00:")
+    assert bar._bar.tasks[0].fields["remaining"].startswith("0:00:")
