@@ -1,11 +1,11 @@
-"""What goes wrong when a camera with a strong lens is idealised as a pinhole: `python examples/camera_coverage.py`.
+"""Effect of a lens model on coverage: `python examples/camera_coverage.py`.
 
-Two cameras of the same intrinsics at one place look at the built-in courtyard: one through its calibrated lens, one
-through a pinhole. The difference map shows where the idealised camera claims to see what the real one does not (its
-pixels look elsewhere), and where the real one sees what the pinhole leaves out.
+Two cameras with the same intrinsics and extrinsics observe the built-in courtyard, one with its calibrated distortion
+and one as a pinhole camera. The difference map shows where the pinhole camera detects surfaces that the real one does
+not, because its pixels have other directions, and vice versa.
 
 The calibration is that of a GoPro HERO4 Session (gyroflow/lens_profiles, CC0-1.0; an OpenCV fisheye fit).
-`--calibrations FILE --camera ID` takes another from a JSON file:
+`--calibrations FILE --camera ID` reads another one from a JSON file:
 {"cameras": [{id, model, width, height, fx, fy, cx, cy, params}, ...]}.
 """
 
@@ -41,8 +41,8 @@ REGIONS = (Region("10m ahead", (2.5, 12.5), (-10.0, 10.0)), Region("40m ahead", 
 GRID = BevGrid(x_m=(-10.0, 40.0), y_m=(-20.0, 20.0), cell_m=0.25)
 
 
-def rig_of(name, calibration, lens):
-    """A rig of one camera above the windscreen, looking slightly down."""
+def build_rig(name, calibration, lens):
+    """Build a rig with one camera above the windshield, pitched down by 15 degrees."""
     width = calibration["width"]
     camera = CameraSensor(
         name="camera",
@@ -61,18 +61,18 @@ def rig_of(name, calibration, lens):
     return Rig(name=name, sensors=(camera,))
 
 
-def calibration_of(options):
-    """The chosen calibration."""
+def load_calibration(options):
+    """Load the calibration of the options."""
     if options.calibrations is None:
         return GOPRO
-    found = {entry["id"]: entry for entry in json.loads(options.calibrations.read_text())["cameras"]}
-    if options.camera not in found:
-        raise SystemExit(f"{options.calibrations} has no camera {options.camera!r}; there are {', '.join(found)}")
-    return found[options.camera]
+    cameras = {camera["id"]: camera for camera in json.loads(options.calibrations.read_text())["cameras"]}
+    if options.camera not in cameras:
+        raise SystemExit(f"{options.calibrations}: unknown camera {options.camera!r}; choose from {', '.join(cameras)}")
+    return cameras[options.camera]
 
 
 def main():
-    """Compare the two cameras; print the table, draw the maps."""
+    """Compare the two cameras: print the table and plot the maps."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--calibrations", type=Path)
     parser.add_argument("--camera", default=GOPRO["id"])
@@ -80,10 +80,10 @@ def main():
     parser.add_argument("--out", type=Path, default=Path("out/camera_coverage"))
     options = parser.parse_args()
 
-    calibration = calibration_of(options)
+    calibration = load_calibration(options)
     rigs = {
-        "real lens": rig_of("real lens", calibration, calibration["model"]),
-        "pinhole": rig_of("pinhole", calibration, "pinhole"),
+        "real lens": build_rig("real lens", calibration, calibration["model"]),
+        "pinhole": build_rig("pinhole", calibration, "pinhole"),
     }
     frames = SimulatedFrames(
         "courtyard",
@@ -97,8 +97,8 @@ def main():
     coverages = {name: observer.compute() for name, observer in observers.items()}
     console = Console()
     print_table(CoverageTable.from_coverages(coverages, REGIONS), console)
-    pictures = write_figures(plot_maps(coverages), options.out)
-    console.print(f"Wrote {len(pictures)} maps to {options.out}")
+    paths = write_figures(plot_maps(coverages), options.out)
+    console.print(f"Wrote {len(paths)} maps to {options.out}")
 
 
 if __name__ == "__main__":

@@ -1,11 +1,10 @@
-"""Lower the mean blind spot radius by moving points: `python examples/optimize_points.py`.
+"""Reduce the mean blind spot radius by gradient descent: `python examples/optimize_points.py`.
 
-The radius is differentiable in the points of the sensor cloud: the gradient of each reference point's radius pulls its
-nearest sensor point towards it. Here some points of a rig's cloud, in an instant of city traffic, are set free and
-follow that gradient (Adam), each towards the middle of the reference points that it is nearest to.
+The radius is differentiable in the sensor points: the gradient of the radius of a reference point moves its nearest
+sensor point towards it. Sampled points of a rig in one frame of city traffic follow this gradient (Adam).
 
-Free points are no sensor: nothing keeps them on rays, and nothing hides them. How a mount changes what occludes what is
-not differentiable here; see docs/training.md.
+The points are not constrained to rays and cannot be occluded. The effect of a mounting position on occlusion is not
+differentiable; see docs/training.md.
 """
 
 import argparse
@@ -22,23 +21,25 @@ from rich.progress import track
 from torchcover import blind_spot_radius
 from torchcover.data import SimulatedFrames
 
-X_M, Y_M, Z_M = (2.5, 42.5), (-12.0, 12.0), (-0.5, 2.0)
+X_M = (2.5, 42.5)
+Y_M = (-12.0, 12.0)
+Z_M = (-0.5, 2.0)
 THRESHOLD_M = 0.4
 
 
-def inside(cloud):
-    """The points of the region."""
+def crop_to_region(cloud):
+    """Select the (N, 3) points inside the region."""
     x, y, z = cloud.T
     return cloud[(x >= X_M[0]) & (x < X_M[1]) & (y >= Y_M[0]) & (y < Y_M[1]) & (z >= Z_M[0]) & (z < Z_M[1])]
 
 
-def some(cloud, count, generator):
-    """A random sample, or all if there are fewer."""
+def sample_points(cloud, count, generator):
+    """Sample points without replacement; all points if there are fewer."""
     return cloud[torch.randperm(len(cloud), generator=generator)[:count]]
 
 
-def draw(reference, before, after, path):
-    """The reference coloured by its radius, under the points, before and after."""
+def plot_radii(reference, before, after, path):
+    """Plot the reference points colored by their radius, with the sensor points, before and after."""
     figure, axes = plt.subplots(2, 1, figsize=(9.0, 11.0), layout="constrained")
     for ax, points, title in zip(axes, (before, after), ("before", "after"), strict=True):
         radius = blind_spot_radius(points, reference)
@@ -52,9 +53,9 @@ def draw(reference, before, after, path):
 
 
 def main():
-    """Optimise; print the numbers, draw the picture."""
+    """Optimize the points, print the numbers and plot the result."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--points", type=int, default=400, help="free points")
+    parser.add_argument("--points", type=int, default=400, help="number of optimized points")
     parser.add_argument("--num-steps", type=int, default=200, help="steps of gradient descent")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("out/optimize_points.png"))
@@ -63,22 +64,24 @@ def main():
     console = Console()
     generator = torch.Generator().manual_seed(options.seed)
     frame = SimulatedFrames("urban", "front_roof_32", num_frames=1, seed=options.seed)[0]
-    reference = some(inside(frame.reference), 20_000, generator)
-    before = some(inside(frame.sensor), options.points, generator)
+    reference = sample_points(crop_to_region(frame.reference), 20_000, generator)
+    before = sample_points(crop_to_region(frame.sensor), options.points, generator)
 
     points = before.clone().requires_grad_()
-    descent = torch.optim.Adam([points], lr=0.1)
+    optimizer = torch.optim.Adam([points], lr=0.1)
     for _ in track(range(options.num_steps), description="gradient steps", console=console):
-        descent.zero_grad()
+        optimizer.zero_grad()
         blind_spot_radius(points, reference).mean().backward()
-        descent.step()
+        optimizer.step()
 
     after = points.detach()
     for name, cloud in (("before", before), ("after", after)):
         radius = blind_spot_radius(cloud, reference)
-        seen = (radius <= THRESHOLD_M).float().mean()
-        console.print(f"{name}: mean radius {radius.mean():.3f} m, {seen:.1%} of the reference within {THRESHOLD_M} m")
-    draw(reference, before, after, options.out)
+        detected = (radius <= THRESHOLD_M).float().mean()
+        console.print(
+            f"{name}: mean radius {radius.mean():.3f} m, {detected:.1%} of the reference within {THRESHOLD_M} m"
+        )
+    plot_radii(reference, before, after, options.out)
     console.print(f"Wrote {options.out}")
 
 

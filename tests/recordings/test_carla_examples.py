@@ -56,7 +56,7 @@ def photographed(tmp_path_factory):
 
 def test_four_depth_images_form_one_cloud(photographed):
     paths, clouds = photographed
-    found = four_depth_cameras.clouds_of(paths, 90.0, [0.0, 0.0, HEIGHT_M])
+    found = four_depth_cameras.read_clouds(paths, 90.0, [0.0, 0.0, HEIGHT_M])
     assert list(found) == list(clouds)
     for name, cloud in clouds.items():
         assert len(found[name]) == len(cloud) > 500
@@ -67,7 +67,7 @@ def test_four_depth_images_form_one_cloud(photographed):
 def test_four_depth_images_match_an_independent_computation(photographed, capsys):
     paths, _ = photographed
     clouds = {
-        name: cloud.numpy() for name, cloud in four_depth_cameras.clouds_of(paths, 90.0, [0.0, 0.0, HEIGHT_M]).items()
+        name: cloud.numpy() for name, cloud in four_depth_cameras.read_clouds(paths, 90.0, [0.0, 0.0, HEIGHT_M]).items()
     }
     merged = np.concatenate(list(clouds.values()))
     near = cKDTree(clouds["front"]).query(merged)[0] <= 0.4
