@@ -350,7 +350,9 @@ class CommonFrames:
         for position in positions:
             shares[self.indices[position].scene_id % len(shares)].append(position)
         # The loader sends the k-th batch to the k-th process, which has built these scenes.
-        self._batches[:] = [[FrameRequest(rig, position, is_measured) for position in share] for share in shares]
+        self._batches.clear()
+        for share in shares:
+            self._batches.append([FrameRequest(rig, position, is_measured) for position in share])
         results: dict[int, Frame | MeasuredFrame | ValueError] = {}
         try:
             for share, batch in zip(shares, iterate_batches(self._loader), strict=True):
@@ -413,7 +415,7 @@ def _select_frames(simulator: Simulator, num_scenes: int, frames_per_scene: int)
         if len(selected[scene]) < frames_per_scene:
             selected[scene].append(frame_index)
         frame_index += 1
-    fewest = min(map(len, selected))
+    fewest = min(len(indices) for indices in selected)
     if fewest < frames_per_scene:
         raise ValueError(
             f"frames_per_scene: got {frames_per_scene}, but a run of {simulator.scenario.name!r} has {fewest} frames "

@@ -1,7 +1,7 @@
 """Constraints and prices of a rig in a placement search, independent of its coverage."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from itertools import combinations
+from itertools import chain, combinations
 from typing import Annotated
 
 import numpy as np
@@ -135,7 +135,7 @@ def check_prices(
         if max_cost_eur is not None:
             raise ValueError("constraints.max_cost_eur: there are no prices; add prices_eur")
         return
-    models = {model for free in free_sensors.values() for model in free.model or ()}
+    models = set(chain.from_iterable(free.model or () for free in free_sensors.values()))
     names = {MOUNT, *models, *list_builtin_names("lidars"), *(sensor.name for sensor in sensors)}
     if unknown := [key for key in prices_eur if key not in names]:
         raise ValueError(f"prices_eur: {', '.join(unknown)} is no LiDAR model, no sensor of the rig, and not {MOUNT!r}")

@@ -298,9 +298,9 @@ class FreeSensor(Document):
             if self.z_above_body_m is not None:
                 height_m = start_sensor.mount.z_m - find_vehicle_top_m(host, start_sensor.mount)
                 start_values["z_above_body_m"] = round(height_m, DECIMALS)
-        names = {variable.name for variable in self.list_variables(start_sensor.name)}
         named_values = {f"{start_sensor.name}.{key}": value for key, value in start_values.items()}
-        return {name: value for name, value in named_values.items() if name in names}
+        free_names = {variable.name for variable in self.list_variables(start_sensor.name)}
+        return {name: named_values[name] for name in named_values if name in free_names}
 
 
 def mirror_sensor(target_sensor: Sensor, source_sensor: Sensor | None) -> Sensor | None:

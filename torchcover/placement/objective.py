@@ -3,6 +3,7 @@
 import math
 import re
 from collections.abc import Mapping, Sequence
+from itertools import product
 from typing import Annotated, Any, Literal, Self
 
 import torch
@@ -179,7 +180,7 @@ class Objective(Document):
     def region_bands(self) -> tuple[tuple[str, str], ...]:
         """Pairs of region and band that the number is the mean over; empty for a requirement."""
         bands = (self.band,) if isinstance(self.band, str) else tuple(PAPER_HEIGHTS) if self.band is None else self.band
-        return tuple((region, band) for region in self._region_names for band in bands)
+        return tuple(product(self._region_names, bands))
 
     @property
     def _region_names(self) -> tuple[str, ...]:
@@ -194,8 +195,9 @@ class Objective(Document):
         Raises:
             ValueError: A region or band is unknown, or there is no band.
         """
-        if unknown := [band for _, band in self.region_bands if band not in PAPER_HEIGHTS]:
-            raise ValueError(f"band {unknown[0]!r}: give {' or '.join(map(repr, PAPER_HEIGHTS))}")
+        for _, band in self.region_bands:
+            if band not in PAPER_HEIGHTS:
+                raise ValueError(f"band {band!r}: give {' or '.join(repr(name) for name in PAPER_HEIGHTS)}")
         if not self.region_bands:
             raise ValueError("band: got none; give at least one")
         if isinstance(self.region, dict):

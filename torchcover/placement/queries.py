@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from difflib import get_close_matches
+from itertools import chain
 from typing import Any, NamedTuple, Self
 
 import torch
@@ -59,27 +60,29 @@ class Queries(NamedTuple):
         """
         named_regions = {region.name: region for region in RegionsOfInterest().build_query_plan(ego_outline_m).regions}
         names = tuple(objectives)
-        objectives = {name: objective for name, objective in objectives.items() if not objective.requirement}
+        region_objectives = {name: objectives[name] for name in names if not objectives[name].requirement}
         # Requirements alone still need frames, whose number is that of some region.
-        objectives = objectives or {"": Objective(region="20m", band="ground")}
+        region_objectives = region_objectives or {"": Objective(region="20m", band="ground")}
         regions: dict[str, Region] = {}
-        for name, objective in objectives.items():
+        heights: dict[str, tuple[float, float]] = {}
+        thresholds: set[float] = set()
+        has_no_radius = True
+        for name, objective in region_objectives.items():
             try:
                 for region in objective.resolve_regions(named_regions):
                     if regions.setdefault(region.name, region) != region:
                         raise ValueError(f"region {region.name!r}: two objectives define it differently; rename one")
             except ValueError as error:
                 raise ValueError(f"objective {name!r}: {error}") from error
-        bands = [band for objective in objectives.values() for _, band in objective.region_bands]
+            for _, band in objective.region_bands:
+                heights[band] = PAPER_HEIGHTS[band]
+            thresholds.update(float(threshold) for threshold in DETECTION_KEY.findall(objective.key))
+            has_no_radius &= DETECTION_KEY.match(objective.key) is not None
         documents = {name: _to_document(region) for name, region in regions.items()}
-        heights = {band: PAPER_HEIGHTS[band] for band in bands}
         grid = RegionsOfInterest(regions=documents, heights=heights).build_query_plan(ego_outline_m, 0.5).grid
-        keys = [objective.key for objective in objectives.values()]
-        thresholds_m = sorted({float(threshold) for key in keys for threshold in DETECTION_KEY.findall(key)})
-        has_no_radius = all(DETECTION_KEY.match(key) for key in keys) and max(thresholds_m) > 0
-        max_radius_m = max(thresholds_m) if has_no_radius else grid.diagonal_m
-        grid = _crop_grid(grid, regions.values())
-        return cls(objectives, regions, grid, max_radius_m, tuple(thresholds_m), names)
+        thresholds_m = tuple(sorted(thresholds))
+        max_radius_m = thresholds_m[-1] if has_no_radius and thresholds_m[-1] > 0 else grid.diagonal_m
+        return cls(region_objectives, regions, _crop_grid(grid, regions.values()), max_radius_m, thresholds_m, names)
 
     @property
     def search_radius_m(self) -> float | None:
@@ -138,7 +141,7 @@ class Queries(NamedTuple):
         with warnings.catch_warnings(action="ignore"):  # the observer has no frames
             coverage = queries.build_observer(rig, "area").compute()
         keys = [quantity.key for quantity in coverage.all_quantities]
-        quantities = (RADIUS, *map(make_detection_quantity, queries.thresholds_m))
+        quantities = (RADIUS, *(make_detection_quantity(threshold_m) for threshold_m in queries.thresholds_m))
         keys += [quantity.key for quantity in quantities]
         keys += [make_failure_quantity(ANY, quantity).key for quantity in quantities]
         for kind in AGGREGATIONS:
@@ -189,22 +192,22 @@ class Queries(NamedTuple):
                 same in every block.
         """
         parts = self._estimate_parts(metric)
-        steps = max((part.frame_counts for estimates in parts.values() for part in estimates), key=len)
-        missing = torch.full((len(steps),), math.nan, dtype=torch.float64, device="cpu")
+        frame_counts = max((part.frame_counts for part in chain.from_iterable(parts.values())), key=len)
+        missing = torch.full((len(frame_counts),), math.nan, dtype=torch.float64, device="cpu")
         quantities, values, values_without_block = [], [], []
         for name in self.objective_names:
             estimates = parts.get(name) or [met_shares[name]]
             quantities.append(estimates[0].quantities[0]._replace(key=name))
             values.append(torch.cat([estimate.value for estimate in estimates]).mean())
             if name in met_shares:
-                values_without_block.append(values[-1].expand(len(steps)))
-            elif all(len(estimate.jackknife_values) == len(steps) for estimate in estimates):
+                values_without_block.append(values[-1].expand(len(frame_counts)))
+            elif all(len(estimate.jackknife_values) == len(frame_counts) for estimate in estimates):
                 values_without_block.append(
                     torch.cat([estimate.jackknife_values for estimate in estimates], dim=1).mean(dim=1)
                 )
             else:
                 values_without_block.append(missing)
-        return Estimate(tuple(quantities), torch.stack(values), torch.stack(values_without_block, dim=1), steps)
+        return Estimate(tuple(quantities), torch.stack(values), torch.stack(values_without_block, dim=1), frame_counts)
 
     def _estimate_parts(self, metric: CoverageSums) -> dict[str, list[Estimate]]:
         """Return for each objective its number in each of its regions and bands."""
@@ -243,7 +246,8 @@ class Queries(NamedTuple):
 
     def _list_region_bands(self) -> list[tuple[str, str]]:
         """List the queried pairs of region and band, each once."""
-        return list(dict.fromkeys(pair for objective in self.objectives.values() for pair in objective.region_bands))
+        region_bands = chain.from_iterable(objective.region_bands for objective in self.objectives.values())
+        return list(dict.fromkeys(region_bands))
 
 
 def _needs_sensors(key: str) -> bool:
@@ -256,8 +260,8 @@ def _select_worst(estimates: Sequence[Estimate]) -> Estimate:
     quantity = estimates[0].quantities[0]
     reduce: Any = torch.amax if quantity.lower_is_better else torch.amin
     value = reduce(torch.stack([estimate.value for estimate in estimates]), dim=0)
-    left_out = reduce(torch.stack([estimate.jackknife_values for estimate in estimates]), dim=0)
-    return Estimate(estimates[0].quantities, value, left_out, estimates[0].frame_counts)
+    jackknife_values = reduce(torch.stack([estimate.jackknife_values for estimate in estimates]), dim=0)
+    return Estimate(estimates[0].quantities, value, jackknife_values, estimates[0].frame_counts)
 
 
 def _to_document(region: Region) -> RegionOfInterest:

@@ -92,7 +92,10 @@ class PlacementReport:
         for name, rig in self.rigs.items():
             output.add(name, rig.save)
         for name, rows in self.csv_tables.items():
-            output.add_text(name, format_csv([_round_digits(value) for value in row] for row in rows))
+            rounded_rows = []
+            for row in rows:
+                rounded_rows.append([_round_digits(value) for value in row])
+            output.add_text(name, format_csv(rounded_rows))
         record = json.dumps(replace_nan({**self.record, "summary": self.summary}), indent=2, allow_nan=False)
         output.add_text("search.json", f"{record}\n")
 

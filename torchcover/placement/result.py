@@ -173,7 +173,7 @@ class SearchResult(ReportMixin):
     def _describe_shortfalls(self, evaluation: Evaluation) -> str:
         """Describe the shortfalls of a candidate, the largest first; empty if it has none."""
         shortfalls = self.search.find_shortfalls(evaluation)
-        names = sorted(shortfalls, key=lambda name: -shortfalls[name])
+        names = sorted(shortfalls, key=shortfalls.__getitem__, reverse=True)
         return "; ".join(f"{shortfalls[name]:.2%} of {name}" for name in names)
 
     @property

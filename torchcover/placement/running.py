@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -297,7 +298,7 @@ def drop_torn_line(path: Path) -> None:
         ValueError: The path is a symbolic link.
     """
     data = path.read_bytes()
-    write_atomically(path, lambda file: file.write_bytes(data[: data.rfind(b"\n") + 1]))
+    write_atomically(path, partial(Path.write_bytes, data=data[: data.rfind(b"\n") + 1]))
 
 
 @guard_reader("the journal of a placement search")

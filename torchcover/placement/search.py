@@ -253,7 +253,7 @@ class PlacementSearch:
             Name of a bounded number or requirement -> shortfall, only where there is one.
         """
         shortfalls = self._compute_shortfalls(evaluation)
-        return {name: value for name, value in shortfalls.items() if value > ROUNDING} | dict(evaluation.shortfalls)
+        return {name: shortfalls[name] for name in shortfalls if shortfalls[name] > ROUNDING} | evaluation.shortfalls
 
     def find_best(self, strategies: tuple[str, ...] = (START, OPTIMIZER, RANDOM)) -> list[int]:
         """Find the candidates that no other dominates, among those with the smallest total shortfall.
@@ -269,8 +269,9 @@ class PlacementSearch:
         for number, evaluation in enumerate(self.evaluations):
             if is_known[number] and evaluation.strategy in strategies:
                 valid.append(number)
-        totals = [sum(self.find_shortfalls(self.evaluations[number]).values()) for number in valid]
-        valid = [number for number, total in zip(valid, totals, strict=True) if total <= min(totals) + ROUNDING]
+        totals = {number: sum(self.find_shortfalls(self.evaluations[number]).values()) for number in valid}
+        smallest_total = min(totals.values(), default=0.0)
+        valid = [number for number in valid if totals[number] <= smallest_total + ROUNDING]
         is_on_front = find_non_dominated(self.improvements[valid])
         return [valid[index] for index in np.flatnonzero(is_on_front)]
 
@@ -342,7 +343,7 @@ class PlacementSearch:
         if values not in evaluated:
             return strategy, values
         options = [variable.options for variable in self.space.variables if isinstance(variable, FreeChoice)]
-        combination_count = math.prod(map(len, options))
+        combination_count = math.prod(len(names) for names in options)
         if len(options) < len(self.space.variables) or combination_count > params.max_combinations:
             return RANDOM, self._sample_values(seed + 1, number)
         names = [variable.name for variable in self.space.variables]
@@ -383,7 +384,9 @@ class PlacementSearch:
             row = improvements[evaluation.number]
             targets = np.where(np.isnan(row), worst, row).tolist()
             observations.append((evaluation.values, targets, constraints[evaluation.number] or dict(infeasible)))
-        totals = [sum(max(value, 0.0) for value in limits.values()) for _, _, limits in observations]
+        totals = []
+        for _, _, limits in observations:
+            totals.append(sum(max(value, 0.0) for value in limits.values()))
         if min(totals, default=0.0) > 0:
             return [(values, [-total], {}) for (values, _, _), total in zip(observations, totals, strict=True)]
         return observations

@@ -215,7 +215,7 @@ class SelectionResult(ReportMixin):
     def _build_rows(self) -> list[tuple[TextCell, ...]]:
         """Build a row for each selected sensor, the largest effect of failure first."""
         rows = []
-        for index in sorted(self.failure_effects, key=lambda index: -self.failure_effects[index]):
+        for index in sorted(self.failure_effects, key=self.failure_effects.__getitem__, reverse=True):
             price_eur = self._compute_price_eur([index])
             texts = (
                 self.sensors[index].name,

@@ -164,8 +164,10 @@ class CandidateCoverage:
             (len(selected), Q) float64.
         """
         values = self.compute_values(selected)
-        remaining = [[index for index in selected if index != failed] for failed in selected]
-        return np.array([values - self.compute_values(indices) for indices in remaining])
+        effects = []
+        for failed in selected:
+            effects.append(values - self.compute_values([index for index in selected if index != failed]))
+        return np.array(effects)
 
 
 def select_sensors(

@@ -4,6 +4,7 @@ import warnings
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from functools import cached_property
+from itertools import chain
 from typing import ClassVar, Self
 
 import numpy as np
@@ -74,7 +75,7 @@ class SearchSpace(PlacementSpace):
                 except FileNotFoundError as error:
                     raise ValueError(f"free.{name}.model: {error}") from error
             if free.mirror_of is not None and (free.mirror_of not in self.free or self.free[free.mirror_of].mirror_of):
-                names = ", ".join(name for name, sensor in self.free.items() if sensor.mirror_of is None) or "none"
+                names = ", ".join(name for name in self.free if self.free[name].mirror_of is None) or "none"
                 raise ValueError(f"free.{name}.mirror_of: got {free.mirror_of!r}; give a free sensor, one of {names}")
         if not self.variables:
             raise ValueError("free: all numbers are fixed; give [smallest, largest] for at least one")
@@ -153,7 +154,7 @@ class SearchSpace(PlacementSpace):
     @cached_property
     def variables(self) -> tuple[Variable, ...]:
         """Free variables, in the order of the file."""
-        return tuple(variable for name, free in self.free.items() for variable in free.list_variables(name))
+        return tuple(chain.from_iterable(free.list_variables(name) for name, free in self.free.items()))
 
     @property
     def base_rig(self) -> Rig:
@@ -207,7 +208,7 @@ class SearchSpace(PlacementSpace):
         """Return the values of the start, without variables whose value in the start is unknown or not allowed."""
         variables = {variable.name: variable for variable in self.variables}
         values = self._get_all_start_values()
-        return {name: value for name, value in values.items() if variables[name].is_allowed(value)}
+        return {name: values[name] for name in values if variables[name].is_allowed(values[name])}
 
     def _get_all_start_values(self) -> dict[str, VariableValue]:
         values: dict[str, VariableValue] = {}

@@ -231,7 +231,7 @@ def _build_side_effects(
     changes: Mapping[str, Difference], objective_names: Sequence[str], parts: Mapping[str, list[str]]
 ) -> tuple[SideEffect, ...]:
     """Adjust the p values of all changes that are no objective, and sort significant deteriorations first."""
-    tested = {name: change for name, change in changes.items() if name not in objective_names}
+    tested = {name: changes[name] for name in changes if name not in objective_names}
     objective_shares: dict[str, dict[str, float]] = {name: {} for name in tested}
     for objective, part_names in parts.items():
         total = sum(changes[part].improvement for part in part_names)
@@ -281,10 +281,10 @@ def adjust_holm(p_values: Sequence[float]) -> list[float]:
         >>> adjust_holm([0.02, 0.001, math.nan, 0.9])
         [0.04, 0.003, nan, 0.9]
     """
-    ranked = sorted((p_value, index) for index, p_value in enumerate(p_values) if not math.isnan(p_value))
+    known_count = int(np.count_nonzero(~np.isnan(p_values)))
     adjusted, largest = [math.nan] * len(p_values), 0.0
-    for rank, (p_value, index) in enumerate(ranked):
-        largest = max(largest, min((len(ranked) - rank) * p_value, 1.0))
+    for rank, index in enumerate(np.argsort(p_values, kind="stable")[:known_count].tolist()):  # NaN is sorted last
+        largest = max(largest, min((known_count - rank) * p_values[index], 1.0))
         adjusted[index] = largest
     return adjusted
 
@@ -313,7 +313,7 @@ def _list_extra_objectives(
             if has_failures:
                 failure = objective.model_copy(update={"number": failure_key})
                 extra[f"{objective.description}, any one sensor failed"] = failure
-    return {name: objective for name, objective in extra.items() if name not in objectives}, parts
+    return {name: extra[name] for name in extra if name not in objectives}, parts
 
 
 def _compare_targets(

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from itertools import combinations
+from itertools import chain, combinations
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -34,7 +34,7 @@ def plot_encounters(
     across = min(len(panels), 3)
     down = -(-len(panels) // across)
     figure, grid = create_charts(down, across, (1.5 + 4.2 * across, 0.8 + 3.6 * down), title, sharey=True)
-    views = [axes for row in grid for axes in row]
+    views = list(chain.from_iterable(grid))
     for axes, (name, bands, needed) in zip(views, panels, strict=False):
         for number, (rig, band) in enumerate(bands.items()):
             speed_kmh, low_s, high_s = np.array(band).T
@@ -197,7 +197,7 @@ def _plot_panel(axes: Axes, label: str, lines: Lines) -> None:
         marker = MARKERS[index % len(MARKERS)]
         axes.plot(*zip(*points, strict=True), marker=marker, markersize=5, linewidth=1.2, color=color, label=name)
     axes.set(xlabel="run time (s)", ylabel=label)
-    if not any(math.isfinite(error) for points in lines.values() for _, error in points):
+    if not any(math.isfinite(error) for _, error in chain.from_iterable(lines.values())):
         return  # without errors there is no logarithm
     axes.set(xscale="log", yscale="log")
     for axis in (axes.xaxis, axes.yaxis):

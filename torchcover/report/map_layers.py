@@ -361,12 +361,15 @@ def compute_difference(values: Tensor, baseline: Tensor) -> Tensor:
 
 def _build_area_layers(coverages: Mapping[str, Coverage], conditions: str) -> Iterator[MapLayer]:
     first = next(iter(coverages.values()))
-    area_sums = {name: coverage.area_sums for name, coverage in coverages.items() if coverage.area_sums is not None}
+    if first.area_sums is None:
+        return
     sides = compute_square_sides(first.point_counts, first.grid.cell_m)
     # The rigs share the reference points and so the visible area.
-    first_sums = next(iter(area_sums.values()))
-    opacity = compute_opacity(first_sums, first.counts["num_frames"], sides, first.grid.cell_m)
-    ratios = {name: compute_ratios(sums, sides) for name, sums in area_sums.items()}
+    opacity = compute_opacity(first.area_sums, first.counts["num_frames"], sides, first.grid.cell_m)
+    ratios = {}
+    for name, coverage in coverages.items():
+        if coverage.area_sums is not None:
+            ratios[name] = compute_ratios(coverage.area_sums, sides)
     for index, quantity in enumerate(first.quantities):
         values = {name: rig_ratios[index] for name, rig_ratios in ratios.items()}
         yield _build_layer(make_area_quantity(quantity), values, NO_SURFACE, conditions, opacity)

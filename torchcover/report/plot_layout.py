@@ -209,7 +209,12 @@ def find_lower_left(views: Iterable[Axes]) -> Axes:
     Args:
         views: Axes of one figure.
     """
-    return min(views, key=lambda axes: (axes.get_position().y0, axes.get_position().x0))
+
+    def get_lower_left(axes: Axes) -> tuple[float, float]:
+        box = axes.get_position()
+        return box.y0, box.x0
+
+    return min(views, key=get_lower_left)
 
 
 def write_legend(axes: Axes, entries: Sequence[Artist], columns: int) -> None:

@@ -4,6 +4,7 @@ import json
 import math
 from collections.abc import Callable, Mapping
 from functools import partial
+from operator import attrgetter
 from typing import Any, NamedTuple
 
 from torchcover.coverage.averages import Average
@@ -25,7 +26,6 @@ class Column(NamedTuple):
     Args:
         key: Name of the column.
         meaning: Meaning, for the documentation.
-        get_value: Function that returns the value of a row.
         heading: Heading in tables for readers; empty hides the column there.
         format_value: Function that formats the value in these tables.
         average: Average of the tables that show it; None for all.
@@ -33,67 +33,74 @@ class Column(NamedTuple):
 
     key: str
     meaning: str
-    get_value: Callable[[CoverageTable, Row], object]
     heading: str = ""
     format_value: Callable[[Any], str] = str
     average: Average | None = None
 
 
-def _get_sensor_model(table: CoverageTable, row: Row) -> object:
-    sensor_model = table.source.get("sensor_model")
-    return sensor_model.get(row.rig) if isinstance(sensor_model, Mapping) else sensor_model
-
-
-def _get_band_m(table: CoverageTable, row: Row) -> tuple[float, float]:
-    return table.grid.heights.get(row.summary.band, (math.nan, math.nan))
-
-
 COLUMNS = (
-    Column(
-        "average",
-        "average of the numbers: `area`, `cells`, or `target_positions` of a test target",
-        lambda _, row: row.summary.average,
-    ),
+    Column("average", "average of the numbers: `area`, `cells`, or `target_positions` of a test target"),
     Column(
         "visible_m2",
         "mean area in square meters that the reference observes in a frame",
-        lambda _, row: row.summary.visible_m2,
         "visible surface\n(m2)",
         format_square_meters,
         "area",
     ),
-    Column(
-        "observed_share",
-        "share of the cells that are observed",
-        lambda _, row: row.summary.observed_share,
-        "observed cells\n(%)",
-        format_percent,
-        "cells",
-    ),
+    Column("observed_share", "share of the cells that are observed", "observed cells\n(%)", format_percent, "cells"),
     Column(
         "observed_cells",
         "number of observed cells; of a test target, number of free positions",
-        lambda _, row: row.summary.observed_cells,
         "free positions",
         average="target_positions",
     ),
-    Column("cells", "cells of the region; of a test target, tested positions", lambda _, row: row.summary.num_cells),
-    Column("cell_m", "side of a cell", lambda table, _: table.grid.cell_m),
-    Column(
-        "num_frames", "number of measured frames", lambda table, row: table.conditions[row.rig].counts["num_frames"]
-    ),
-    Column("blocks", "number of blocks for the errors", lambda table, row: table.conditions[row.rig].blocks),
-    Column("frames_per_block", "of a full block", lambda table, row: table.conditions[row.rig].frames_per_block),
-    Column("vehicle", "vehicle of the rig; empty if unknown", lambda table, _: table.source.get("vehicle")),
-    Column("sensor_model", "`ideal`, or `real` with range-limited returns; empty if unknown", _get_sensor_model),
-    Column("x_min_m", "rear end of the region", lambda _, row: row.region.x_m[0]),
-    Column("x_max_m", "front end of the region", lambda _, row: row.region.x_m[1]),
-    Column("y_min_m", "right end of the region", lambda _, row: row.region.y_m[0]),
-    Column("y_max_m", "left end of the region", lambda _, row: row.region.y_m[1]),
-    Column("band_frame", "origin of heights: `ground` or `vehicle`", lambda table, _: table.grid.band_frame),
-    Column("z_min_m", "lower end of the band", lambda table, row: _get_band_m(table, row)[0]),
-    Column("z_max_m", "upper end of the band", lambda table, row: _get_band_m(table, row)[1]),
+    Column("cells", "cells of the region; of a test target, tested positions"),
+    Column("cell_m", "side of a cell"),
+    Column("num_frames", "number of measured frames"),
+    Column("blocks", "number of blocks for the errors"),
+    Column("frames_per_block", "of a full block"),
+    Column("vehicle", "vehicle of the rig; empty if unknown"),
+    Column("sensor_model", "`ideal`, or `real` with range-limited returns; empty if unknown"),
+    Column("x_min_m", "rear end of the region"),
+    Column("x_max_m", "front end of the region"),
+    Column("y_min_m", "right end of the region"),
+    Column("y_max_m", "left end of the region"),
+    Column("band_frame", "origin of heights: `ground` or `vehicle`"),
+    Column("z_min_m", "lower end of the band"),
+    Column("z_max_m", "upper end of the band"),
 )
+
+
+def get_common_values(table: CoverageTable, row: Row) -> Record:
+    """Return the values of `COLUMNS` in a row.
+
+    Args:
+        table: Table of the row.
+        row: One region and band (or test target) of a rig.
+    """
+    summary, grid, conditions = row.summary, table.grid, table.conditions[row.rig]
+    sensor_model = table.source.get("sensor_model")
+    z_min_m, z_max_m = grid.heights.get(summary.band, (math.nan, math.nan))
+    return {
+        "average": summary.average,
+        "visible_m2": summary.visible_m2,
+        "observed_share": summary.observed_share,
+        "observed_cells": summary.observed_cells,
+        "cells": summary.num_cells,
+        "cell_m": grid.cell_m,
+        "num_frames": conditions.counts["num_frames"],
+        "blocks": conditions.blocks,
+        "frames_per_block": conditions.frames_per_block,
+        "vehicle": table.source.get("vehicle"),
+        "sensor_model": sensor_model.get(row.rig) if isinstance(sensor_model, Mapping) else sensor_model,
+        "x_min_m": row.region.x_m[0],
+        "x_max_m": row.region.x_m[1],
+        "y_min_m": row.region.y_m[0],
+        "y_max_m": row.region.y_m[1],
+        "band_frame": grid.band_frame,
+        "z_min_m": z_min_m,
+        "z_max_m": z_max_m,
+    }
 
 
 def build_records(table: CoverageTable) -> list[Record]:
@@ -107,7 +114,10 @@ def build_records(table: CoverageTable) -> list[Record]:
     for rows_by_rig in (table.rows, table.target_rows):
         for rig_rows in rows_by_rig.values():
             rows += rig_rows
-    return [{name: get_value(row) for name, get_value in columns.items()} for row in rows]
+    records = []
+    for row in rows:
+        records.append({name: get_value(row) for name, get_value in columns.items()})
+    return records
 
 
 def build_columns(table: CoverageTable) -> ColumnGetters:
@@ -122,15 +132,16 @@ def build_columns(table: CoverageTable) -> ColumnGetters:
     keys = [quantity.key for quantity in (*table.quantities, *table.target_quantities)]
     mean_keys = [quantity.key for quantity in table.mean_quantities]
     columns: ColumnGetters = {
-        "rig": lambda row: row.rig,
-        "region": lambda row: row.summary.region,
-        "band": lambda row: row.summary.band,
+        "rig": attrgetter("rig"),
+        "region": attrgetter("summary.region"),
+        "band": attrgetter("summary.band"),
     }
     for key in keys:
         columns |= _build_number_columns(key, partial(_get_number, key))
     for key in mean_keys if table.average == "area" else ():
         columns |= _build_number_columns(f"cells_{key}", partial(_get_cell_average, key))
-    columns |= {column.key: partial(column.get_value, table) for column in COLUMNS}
+    for column in COLUMNS:
+        columns[column.key] = partial(_get_common_value, table, column.key)
     for key in keys if len(table.rigs) > 1 else ():
         columns[f"{key}_best"] = partial(_is_leading, key)
         columns |= _build_number_columns(f"{key}_difference", partial(_get_difference, key))
@@ -149,6 +160,10 @@ def build_columns(table: CoverageTable) -> ColumnGetters:
             columns |= _build_number_columns(f"{name}_change", partial(_get_failure_effect, sensor, key))
             columns[f"{name}_change_significant"] = partial(_is_significant, partial(_get_failure_effect, sensor, key))
     return columns
+
+
+def _get_common_value(table: CoverageTable, key: str, row: Row) -> object:
+    return get_common_values(table, row)[key]
 
 
 def _get_number(key: str, row: Row) -> Number | None:

@@ -121,10 +121,12 @@ def print_page_tables(tables: Sequence[PageTable]) -> None:
 
 def _build_wrapped_table(table: PageTable, limit: int) -> Table:
     """Build a table without markup whose widest columns are wrapped to at most `limit` characters per line."""
-    columns = [(name, [row[index].text for row in table.rows]) for index, name in enumerate(table.headings)]
-    widths = [_find_longest([name, *cells], "\n") for name, cells in columns]
+    widths, min_widths = [], []
     max_word_chars = 10  # longer words of headings may be broken
-    min_widths = [max(min(_find_longest([name]), max_word_chars), _find_longest(cells)) for name, cells in columns]
+    for index, name in enumerate(table.headings):
+        cells = [row[index].text for row in table.rows]
+        widths.append(_find_longest([name, *cells], "\n"))
+        min_widths.append(max(min(_find_longest([name]), max_word_chars), _find_longest(cells)))
     padding = int(sum(min_widths) + 3 * len(min_widths) < limit)
     available = max(limit - 1 - (1 + 2 * padding) * len(min_widths), sum(min_widths))
     is_wrapped = sum(widths) > available
@@ -139,16 +141,19 @@ def _build_wrapped_table(table: PageTable, limit: int) -> Table:
     for index, (heading, width) in enumerate(zip(table.headings, widths, strict=True)):
         rich_table.add_column(Text(heading), justify="right" if index else "left", width=width, overflow="fold")
     previous = ""
-    for first, *cells in table.rows:
+    for first, *other_cells in table.rows:
         is_repeated = is_wrapped and first.text == previous  # a long name is printed once
-        rich_table.add_row("" if is_repeated else Text(first.text), *(Text(cell.text) for cell in cells))
+        rich_table.add_row("" if is_repeated else Text(first.text), *(Text(cell.text) for cell in other_cells))
         previous = first.text
     return rich_table
 
 
 def _find_longest(texts: Iterable[str], separator: str | None = None) -> int:
     """Return the width of the longest word, or of the longest part between separators."""
-    return max((cell_len(part) for text in texts for part in text.split(separator)), default=0)
+    longest = 0
+    for text in texts:
+        longest = max([longest, *(cell_len(part) for part in text.split(separator))])
+    return longest
 
 
 def compute_min_width(tables: Sequence[Table], folded_headings: Sequence[str] = ()) -> int:

@@ -1,6 +1,6 @@
 """Coverage table: numbers of regions, height bands and rigs as data, independent of its renderers."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -121,8 +121,10 @@ class CoverageTable:
         rows = _build_rows(coverages, list_region_bands(regions, first.grid), summaries)
         target_rows: list[dict[str, Row]] = []
         if first.target_sums:
-            target_sums = {rig: coverage.target_sums for rig, coverage in coverages.items() if coverage.target_sums}
-            target_summaries = {rig: sums.summarize() for rig, sums in target_sums.items()}
+            target_summaries: dict[str, Sequence[RegionSummary]] = {}
+            for rig, coverage in coverages.items():
+                if coverage.target_sums:
+                    target_summaries[rig] = coverage.target_sums.summarize()
             target_rows = _build_rows(coverages, first.target_sums.region_targets, target_summaries, is_target=True)
         return cls(
             quantities=(*first.quantities, *(first.aggregated_numbers.quantities if first.aggregated_numbers else ())),
@@ -130,11 +132,11 @@ class CoverageTable:
             thresholds_m=first.thresholds_m,
             max_radius_m=first.max_radius_m,
             average=first.average,
-            rows={rig: tuple(row[rig] for row in rows) for rig in coverages},
+            rows=_group_by_rig(rows, coverages),
             conditions={rig: _build_conditions(coverage, regions) for rig, coverage in coverages.items()},
             notes=tuple(notes),
             source=source or {},
-            target_rows={rig: tuple(row[rig] for row in target_rows) for rig in coverages},
+            target_rows=_group_by_rig(target_rows, coverages),
             block_ends=block_ends,
         )
 
@@ -166,8 +168,17 @@ class CoverageTable:
     @property
     def target_quantities(self) -> tuple[Quantity, ...]:
         """Quantities of each test target in each region."""
-        row = next((row for rows in self.target_rows.values() for row in rows), None)
-        return tuple(number.quantity for number in row.summary.numbers.values()) if row else ()
+        for rows in self.target_rows.values():
+            if rows:
+                return tuple(number.quantity for number in rows[0].summary.numbers.values())
+        return ()
+
+
+def _group_by_rig(rows: Sequence[Mapping[str, Row]], rigs: Iterable[str]) -> dict[str, tuple[Row, ...]]:
+    rows_by_rig = {}
+    for rig in rigs:
+        rows_by_rig[rig] = tuple(row[rig] for row in rows)
+    return rows_by_rig
 
 
 def _build_rows(
@@ -186,7 +197,7 @@ def _build_rows(
         leaders = find_leaders(coverages, region, band, is_target=is_target)
         row = {}
         for rig, summary in zip(coverages, rig_summaries, strict=True):
-            leading_keys = frozenset(key for key, leader in leaders.items() if leader == rig)
+            leading_keys = frozenset(key for key in leaders if leaders[key] == rig)
             row[rig] = Row(rig, region, summary, leading_keys, differences.get(rig, {}))
         rows.append(row)
     return rows

@@ -15,7 +15,7 @@ from torchcover.report.number_format import (
     format_heading,
     format_number,
 )
-from torchcover.report.records import COLUMNS
+from torchcover.report.records import COLUMNS, get_common_values
 from torchcover.report.table import CoverageTable, Row
 from torchcover.report.table_notes import (
     MAX_HEADING_CHARS,
@@ -88,15 +88,21 @@ def _build_number_tables(
 ) -> list[PageTable]:
     if len(table.rigs) == 1:
         headings = [fill(format_heading(quantity), MAX_HEADING_CHARS) for quantity in quantities]
-        cells = [[_format_number_cell(row, quantity) for quantity in quantities] for (row,) in rows_by_region]
+        cells = []
+        for (row,) in rows_by_region:
+            cells.append([_format_number_cell(row, quantity) for quantity in quantities])
         return [_add_common_columns(table, rows_by_region, "", headings, cells)]
     tables = []
     for quantity in quantities:
-        cells = [[_format_number_cell(row, quantity) for row in rows] for rows in rows_by_region]
+        cells = []
+        for rows in rows_by_region:
+            cells.append([_format_number_cell(row, quantity) for row in rows])
         title = capitalize(format_heading(quantity))
         tables.append(_add_common_columns(table, rows_by_region, title, table.rigs, cells))
     for quantity in quantities if table.first_conditions.blocks is not None else ():
-        cells = [[_format_difference_cell(row, quantity) for row in rows[1:]] for rows in rows_by_region]
+        cells = []
+        for rows in rows_by_region:
+            cells.append([_format_difference_cell(row, quantity) for row in rows[1:]])
         title = f"Difference to {table.rigs[0]}: {format_difference_heading(quantity)}"
         tables.append(_add_common_columns(table, rows_by_region, title, table.rigs[1:], cells))
     return tables
@@ -146,10 +152,14 @@ def _add_common_columns(
 ) -> PageTable:
     """Build a table with region and band in front of the numbers, and the shown ones of `COLUMNS` behind them."""
     average = rows_by_region[0][0].summary.average if rows_by_region else table.average
-    columns = [column for column in COLUMNS if column.heading and column.average in (None, average)]
+    columns = []
+    for column in COLUMNS:
+        if column.heading and column.average in (None, average):
+            columns.append(column)
     rows = []
     for (row, *_), cells in zip(rows_by_region, numbers, strict=True):
-        common = [TextCell(column.format_value(column.get_value(table, row))) for column in columns]
+        values = get_common_values(table, row)
+        common = [TextCell(column.format_value(values[column.key])) for column in columns]
         rows.append((TextCell(row.summary.region), TextCell(row.summary.band), *cells, *common))
     region_headings = ("region", "target") if average == "target_positions" else REGION_HEADINGS
     all_headings = [*region_headings, *headings, *(column.heading for column in columns)]

@@ -132,13 +132,7 @@ def describe_single_point_of_failure(table: CoverageTable, rig: str, params: Fai
         return "Single point of failure unknown: nothing in the regions is detected with all sensors."
     if len(sensors) == 1:
         return f"Single point of failure: {sensors[0]} is the only sensor."
-    candidates = []
-    for row in rows:
-        if _compute_lost_share(row, quantity) >= params.min_share and _is_significant(row, quantity) is not False:
-            candidates.append(row)
-    significant = [row for row in candidates if _is_significant(row, quantity)]
-    losses = [(_get_loss(row.summary.redundancy, quantity), row) for row in significant or candidates]
-    _, worst = max(losses, key=lambda pair: pair[0], default=(0.0, None))
+    worst, is_significant = _find_worst_failure(rows, quantity, params.min_share)
     if worst is None or (redundancy := worst.summary.redundancy) is None or redundancy.most_critical_sensor is None:
         min_share = f"{100 * params.min_share:g} %"
         return (
@@ -150,9 +144,23 @@ def describe_single_point_of_failure(table: CoverageTable, rig: str, params: Fai
     unit = "m" if quantity.unit == "m" else "%"
     region = f"{worst.summary.region} {worst.summary.band}"
     change = f"{quantity.title} in {region} changes from {before} to {after} {unit}"
-    if significant:
+    if is_significant:
         return f"Single point of failure: {sensor}; without it, {change}."
     return f"Largest effect of a failure: without {sensor}, {change}; its significance is unknown."
+
+
+def _find_worst_failure(rows: Sequence[Row], quantity: Quantity, min_share: float) -> tuple[Row | None, bool]:
+    """Find the row with the largest loss, and whether it is significant; significant losses come first."""
+    candidates = []
+    for row in rows:
+        if _compute_lost_share(row, quantity) >= min_share and _is_significant(row, quantity) is not False:
+            candidates.append(row)
+    significant = [row for row in candidates if _is_significant(row, quantity)]
+    worst: Row | None = None
+    for row in significant or candidates:
+        if worst is None or _get_loss(row.summary.redundancy, quantity) > _get_loss(worst.summary.redundancy, quantity):
+            worst = row
+    return worst, bool(significant)
 
 
 def _compute_lost_share(row: Row, quantity: Quantity) -> float:
@@ -302,7 +310,9 @@ def merge_notes(notes: Mapping[str, Sequence[str]]) -> list[str]:
         ['8 frames.', 'roof: Blind.']
     """
     first_notes = next(iter(notes.values()))
-    common = [note for note in first_notes if all(note in rig_notes for rig_notes in notes.values())]
+    common = list(first_notes)
+    for rig_notes in notes.values():
+        common = [note for note in common if note in rig_notes]
     merged = list(common)
     for name, rig_notes in notes.items():
         merged += [f"{name}: {note}" for note in rig_notes if note not in common]
@@ -520,11 +530,15 @@ def _describe_share(rows: Sequence[Row], key: str, *, is_sufficient: bool) -> st
             return f"{value} [{format_whole_percent(number.low)}, {format_whole_percent(number.high)}]"
         # If all blocks agree, there is no interval, and enough of them need none.
         return value if number.value in (0.0, 1.0) and is_sufficient else ""
-    leader = next((row for row in rows if key in row.leading_keys), None)
-    if leader is None:
+    leader: Row | None = None
+    second: Row | None = None
+    for row in rows:
+        if key in row.leading_keys:
+            leader = row
+        elif second is None or row.summary.numbers[key].value > second.summary.numbers[key].value:
+            second = row
+    if leader is None or second is None:
         return ""
-    followers = [row for row in rows if row is not leader]
-    second = max(followers, key=lambda row: row.summary.numbers[key].value)
     return ", ".join(f"{row.rig} {format_whole_percent(row.summary.numbers[key].value)} %" for row in (leader, second))
 
 

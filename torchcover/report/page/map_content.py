@@ -142,12 +142,15 @@ def build_map_content(page: Page, cells: CellBuffer) -> dict[str, Any]:
     for page_map in page.maps:
         raster = raster_keys.index((page_map.x, page_map.y, page_map.cell_m))
         maps.append(_build_map(page_map, raster, cells))
+    rigs = []
+    for rig in page.rigs:
+        rigs.append({"name": rig.name, "sensors": [_build_sensor(view) for view in rig.sensors]})
     return {
         "maps": maps,
         "arrays": cells.arrays,
         "rasters": [_build_raster(raster_maps) for raster_maps in rasters.values()],
         "luts": {name: _build_lookup_table(name) for name in sorted(colormap_names)},
-        "rigs": [{"name": rig.name, "sensors": [_build_sensor(view) for view in rig.sensors]} for rig in page.rigs],
+        "rigs": rigs,
         "ego": None if page.ego_outline_m is None else _round_points(page.ego_outline_m),
         "outlines": _build_lines(page.outlines),
         "views": _build_views(page),

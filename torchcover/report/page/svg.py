@@ -183,8 +183,16 @@ def build_sensor_table(sensors: Sequence[SensorView]) -> PageTable:
         position = ", ".join(f"{value:.2f}" for value in view.position_m)
         low, high = view.vertical_fov_deg
         angles = ", ".join(f"{round(angle, 1) + 0.0:.1f}" for angle in (view.yaw_deg, *view.tilt_deg))
-        extents = f"{view.horizontal_fov_deg:.1f}", f"{low:.1f} to {high:.1f}", f"{view.range_m:g}"
-        rows.append(tuple(map(TextCell, (f"{index + 1}  {view.name}", position, angles, *extents))))
+        rows.append(
+            (
+                TextCell(f"{index + 1}  {view.name}"),
+                TextCell(position),
+                TextCell(angles),
+                TextCell(f"{view.horizontal_fov_deg:.1f}"),
+                TextCell(f"{low:.1f} to {high:.1f}"),
+                TextCell(f"{view.range_m:g}"),
+            )
+        )
     return PageTable("", headings, rows)
 
 
