@@ -25,7 +25,7 @@ def metric(values, draws=None, name="metric"):
     return Ranking.from_values(Quantity(name, name, "share", lower_is_better=False), values, "published", draws)
 
 
-def test_a_metric_that_is_the_truth_has_rank_1_and_one_that_is_its_negative_minus_1():
+def test_perfect_metrics_have_rank_correlation_1():
     truth = judged_by([[3.0, 1.0, 4.0, 1.5, 5.0], [3.5, 0.0, 4.5, 2.0, 6.0]])
     found = correlate_rankings([metric(truth.mean, name="same"), metric(-truth.mean, name="opposite")], truth)
     for row, value in zip(found.correlations, (1.0, -1.0), strict=True):
@@ -35,7 +35,7 @@ def test_a_metric_that_is_the_truth_has_rank_1_and_one_that_is_its_negative_minu
     assert found.best_p_value == pytest.approx(2 / 120)  # the same order, or the opposite one
 
 
-def test_what_does_not_vary_has_no_rank_and_is_not_counted_among_those_looked_at():
+def test_constant_metrics_have_no_rank_correlation():
     truth = judged_by([[1.0, 2.0, 3.0, 4.0]])
     found = correlate_rankings([metric([7.0] * 4, name="rays"), metric([1.0, 3.0, 2.0, 4.0], name="other")], truth)
     assert np.isnan(
@@ -47,7 +47,7 @@ def test_what_does_not_vary_has_no_rank_and_is_not_counted_among_those_looked_at
     assert np.isnan([nothing.best_p_value, nothing.chance_threshold]).all()
 
 
-def test_the_p_of_the_best_of_many_is_uniform_where_nothing_is_there_to_be_found():
+def test_best_p_values_are_uniform_under_chance():
     generator = np.random.default_rng(0)
     many, values = [metric(generator.normal(size=4)) for _ in range(6)], generator.normal(size=4)
     # A truth that has nothing to do with the metrics is any of its orders, each as likely.
@@ -67,7 +67,7 @@ def test_the_p_of_the_best_of_many_is_uniform_where_nothing_is_there_to_be_found
         assert (alone.min(axis=1) <= level).mean() > 2 * level
 
 
-def test_intervals_are_over_judges_over_worlds_and_over_placements_if_they_are_drawn():
+def test_intervals_resample_raters_scenes_and_placements():
     generator = np.random.default_rng(2)
     values = np.arange(6.0)
     alike, unlike = judged_by([values] * 4), judged_by(values + generator.normal(0, 2, (4, 6)))
@@ -84,7 +84,7 @@ def test_intervals_are_over_judges_over_worlds_and_over_placements_if_they_are_d
     assert width(sure, unlike, resample_placements=True) > width(sure, unlike)
 
 
-def test_the_lead_is_the_difference_and_what_is_shared_cancels_out():
+def test_shared_variation_cancels_in_correlation_differences():
     generator = np.random.default_rng(3)
     truth = judged_by(np.arange(6.0) + generator.normal(0, 2, (4, 6)))
     first, second = metric(np.arange(6.0)), metric(generator.permutation(6))
@@ -93,7 +93,7 @@ def test_the_lead_is_the_difference_and_what_is_shared_cancels_out():
     assert compare_correlations(first, metric(first.scores**3), truth, resample_placements=True) == (0.0, 0.0, 0.0)
 
 
-def test_another_number_of_placements_or_of_draws_is_refused():
+def test_other_numbers_of_placements_are_refused():
     truth = judged_by([[1.0, 2.0, 3.0]])
     with pytest.raises(ValueError, match="a value of each of 3 placements"):
         correlate_rankings([metric([1.0, 2.0])], truth)
@@ -104,7 +104,7 @@ def test_another_number_of_placements_or_of_draws_is_refused():
 # Results of papers.
 
 
-def test_the_tables_of_place3d_are_there_with_the_means_and_ceilings_that_follow_from_them():
+def test_place3d_tables_have_the_published_means():
     cars = PLACE3D["map", "car"]
     assert dict(zip(cars.placements, cars.mean.round(3).tolist(), strict=True)) == {
         "center": 52.525, "line": 49.65, "pyramid": 52.175, "square": 49.95, "trapezoid": 50.925,
@@ -164,7 +164,7 @@ def test_placements_can_be_chosen_but_not_made_up():
         ("a,map,net,car,high\n", "a finite number is needed; got 'high'"),
     ],
 )
-def test_a_table_that_is_not_whole_is_refused_by_name(tmp_path, rows, words):
+def test_incomplete_tables_are_refused_by_name(tmp_path, rows, words):
     path = tmp_path / "results.csv"
     path.write_text(HEADER + rows)
     with pytest.raises(BadFileError, match=words) as told:

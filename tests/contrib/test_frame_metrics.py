@@ -68,7 +68,7 @@ def test_late_fusion_is_sharper_than_the_sharpest():
     assert fuse_standard_deviations(sigmas) < min(sigmas)
 
 
-def test_points_of_cameras_and_of_lidars_of_a_rig_are_told_apart():
+def test_camera_and_lidar_points_are_distinguished():
     camera = CameraSensor(name="eye", width=8, height=8, fov_deg=90, max_range_m=50)
     lidar = Lidar(name="roof", channels=2, vertical_fov_deg=(-9, 0), columns=8, horizontal_fov_deg=90, max_range_m=50)
     inside = [[10.0, 0.0, 1.0]] * 8
@@ -100,7 +100,7 @@ def test_the_share_of_an_object_weighs_square_metres():
     assert {number.count for number in metric.compute() if not number.has_value} == {0}
 
 
-def test_an_object_that_nobody_can_see_counts_for_hits_only_and_a_far_one_for_nothing():
+def test_hidden_objects_count_for_hits_only():
     hidden, far = [20.0, 0.0, 1.0, 4.0, 2.0, 2.0, 0.0], [90.0, 0.0, 1.0, 4.0, 2.0, 2.0, 0.0]
     metric = ObjectCoverage()
     metric.update(frame_of([[8.0, 0.0, 0.5]], [[8.0, 0.0, 0.5], [88.0, 0.0, 0.5]], [CAR, hidden, far]))
@@ -109,7 +109,7 @@ def test_an_object_that_nobody_can_see_counts_for_hits_only_and_a_far_one_for_no
     assert (numbers["objects_hit_1"].value, numbers["objects_hit_1"].count) == (0.5, 2)
 
 
-def test_uniformity_is_one_of_even_points_and_one_over_the_cells_of_a_heap():
+def test_uniformity_ranges_from_one_cell_to_even_points():
     even = [[x + 0.5, y + 0.5, 0.0] for x in range(8) for y in range(4)]
     for cloud, uniformity in ((even, 1.0), ([[0.5, 0.5, 0.0]] * 7, 1 / 32)):
         metric = PointDensity(GRID, [Region("near", (0.0, 2.0), (0.0, 4.0))])
@@ -120,7 +120,7 @@ def test_uniformity_is_one_of_even_points_and_one_over_the_cells_of_a_heap():
         assert found["points"] == len(cloud)
 
 
-def test_a_cloud_without_points_has_density_0_and_no_uniformity():
+def test_empty_clouds_have_density_0_without_uniformity():
     metric = PointDensity(GRID, ())
     metric.update(frame_of([]))
     found = values(metric)
@@ -136,7 +136,7 @@ def lidar(**changes):
     return Lidar(**{**usual, "horizontal_fov_deg": 0.001, "max_range_m": 50, **changes})
 
 
-def test_a_ray_crosses_the_cells_down_to_the_ground():
+def test_rays_cross_cells_down_to_the_ground():
     grid = BevGrid(x_m=(-1.0, 5.0), y_m=(-1.0, 1.0), cell_m=0.25, heights={"low": (-0.1, 0.5), "high": (0.5, 2.0)})
     seen = compute_field_of_view([lidar(mount=Pose(x_m=0.05, y_m=0.1, z_m=1.0))], grid)
     low, high = (set((grid.x_centers_m[band.nonzero()[:, 1]]).tolist()) for band in seen)
@@ -161,7 +161,7 @@ def test_no_cell_that_a_ray_crosses_is_missed():
     assert (seen & ~found).sum() < 0.01 * found.sum()  # of which a ray cuts off less than a centimetre
 
 
-def test_what_points_at_the_vehicle_sees_nothing_and_range_ends_a_ray():
+def test_rays_end_at_the_vehicle_and_at_range():
     grid = BevGrid(x_m=(0.0, 8.0), y_m=(-1.0, 1.0), cell_m=0.5)
     bonnet = Box(type="box", size_m=(1.0, 2.0, 0.8)).build_mesh()
     assert not compute_field_of_view([lidar(mount=Pose(x_m=0.0, z_m=1.0))], grid, bonnet).any()
@@ -171,7 +171,7 @@ def test_what_points_at_the_vehicle_sees_nothing_and_range_ends_a_ray():
     assert compute_field_of_view([blind], grid)[1].any(dim=0).nonzero().squeeze(1).tolist() == [4, 5, 6]
 
 
-def test_false_visible_is_a_share_of_what_is_not_seen():
+def test_false_visible_is_a_share_of_blind_cells():
     sensors = [lidar(vertical_fov_deg=(0.0, 0.0), mount=Pose(x_m=0.0, y_m=0.5, z_m=1.0), max_range_m=5.0)]
     grid = BevGrid(x_m=(0.0, 8.0), y_m=(0.0, 1.0), cell_m=1.0, heights={"high": (0.5, 2.0)})
     metric = FalseVisible(sensors, None, grid)
@@ -182,7 +182,7 @@ def test_false_visible_is_a_share_of_what_is_not_seen():
     assert (number.value, number.count) == (0.75, 4)
 
 
-def test_a_rig_that_sees_all_has_no_false_visible_number():
+def test_rigs_without_blind_cells_have_no_false_visible():
     metric = FalseVisible([lidar()], None, GRID)
     metric.update(frame_of([[0.5, 0.5, 0.0]], [[0.5, 0.5, 0.0]]))
     assert [number.has_value for number in metric.compute()] == [False, False]
@@ -191,7 +191,7 @@ def test_a_rig_that_sees_all_has_no_false_visible_number():
 # Slow twins.
 
 
-def test_k_cover_is_what_a_loop_over_points_and_sensors_finds():
+def test_k_cover_equals_a_loop_over_sensors():
     generator = np.random.default_rng(0)
     cloud, reference = (
         generator.uniform((0, 0, 0), (8, 4, 2), (60, 3)),
@@ -238,9 +238,7 @@ def test_frames_of_one_world_are_no_more_worlds():
 @pytest.mark.parametrize(
     ("worlds", "with_objects", "known"), [(10, 7, False), (10, 8, True), (5, 4, False), (5, 5, True)]
 )
-def test_a_number_that_few_worlds_know_has_no_error_and_none_to_race_with_unless_all_know_it(
-    worlds, with_objects, known
-):
+def test_numbers_of_few_scenes_have_no_error(worlds, with_objects, known):
     metric = ObjectCoverage()
     for index in range(worlds):
         there = index < with_objects
@@ -250,7 +248,7 @@ def test_a_number_that_few_worlds_know_has_no_error_and_none_to_race_with_unless
     assert math.isfinite(metric.compute()[at].error) == (known and worlds >= 8)
 
 
-def test_what_a_draw_of_worlds_gives_is_what_the_metric_gives_over_them():
+def test_resampled_metrics_equal_metrics_over_resampled_scenes():
     case = CASES["object coverage"]
     estimate = case.over(case.frames).estimate()
     assert len(estimate.frame_counts) == len(case.frames)  # a world each
@@ -262,7 +260,7 @@ def test_what_a_draw_of_worlds_gives_is_what_the_metric_gives_over_them():
 
 
 @pytest.mark.parametrize("name", OF_FRAMES)
-def test_without_a_world_it_is_what_the_other_frames_say_and_errors_come_from_that(name):
+def test_jackknife_values_equal_metrics_without_the_scene(name):
     case = CASES[name]
     telling = [step["frame"] for step in case.frames if case.over([step]).compute()[0].has_value]
     frames = [
@@ -290,7 +288,7 @@ def test_without_a_world_it_is_what_the_other_frames_say_and_errors_come_from_th
 
 
 @EVERY
-def test_the_order_of_points_boxes_and_frames_does_not_matter(case):
+def test_order_of_points_boxes_frames_does_not_matter(case):
     def shuffled(step):
         frame = step["frame"]
         generator = torch.Generator().manual_seed(7)
@@ -314,7 +312,7 @@ def test_the_order_of_points_boxes_and_frames_does_not_matter(case):
 
 
 @EVERY
-def test_metrics_that_share_a_search_find_what_each_finds_alone(case):
+def test_shared_queries_give_equal_numbers(case):
     query_cache = FrameQueryCache()
     together = {name: CASES[name].make() for name in OF_FRAMES}
     for metric in together.values():
@@ -330,7 +328,7 @@ def test_metrics_that_share_a_search_find_what_each_finds_alone(case):
 
 
 @EVERY
-def test_an_unknown_number_is_nan_with_a_count_of_0_and_nothing_else_is(case):
+def test_only_unknown_numbers_are_nan_with_count_0(case):
     for metric in (case.over([case.bland]), case.over(case.frames[:1]), case.over(case.frames)):
         for number in metric.compute():
             assert math.isnan(number.value) == (number.count == 0), number.quantity.key
@@ -338,7 +336,7 @@ def test_an_unknown_number_is_nan_with_a_count_of_0_and_nothing_else_is(case):
 
 
 @pytest.mark.parametrize("name", ["object coverage", "perception entropy"])
-def test_frames_without_boxes_are_refused_with_the_way_to_them(name):
+def test_frames_without_boxes_are_refused_with_a_remedy(name):
     metric = CASES[name].make()
     with pytest.raises(ValueError, match=r"no boxes.*SimulatedFrames\(\.\.\., boxes=True\)"):
         metric.update(replace(CASES[name].frames[0]["frame"], boxes=None))
@@ -358,7 +356,7 @@ def test_sensors_that_nobody_can_tell_apart_are_refused():
         CASES["k-cover"].make().update(replace(CASES["k-cover"].frames[0]["frame"], sensor_point_counts=None))
 
 
-def test_a_rig_of_which_nobody_knows_the_sensors_has_no_field_of_view():
+def test_rigs_without_sensors_have_no_field_of_view():
     with pytest.raises(ValueError, match="YAML file"):
         FalseVisible((), None, GRID)
 

@@ -59,7 +59,7 @@ def test_points_vote_and_a_draw_is_the_category():
     assert metric.label_counts.sum(dim=(0, 2)).tolist() == [1, 2]
 
 
-def test_it_is_that_of_a_slow_twin_and_its_error_the_jackknife_by_hand():
+def test_m_sog_equals_a_slow_implementation():
     generator = np.random.default_rng(7)
     sensors, frames = [beam(z_m=1.0, columns=24), beam("low", z_m=0.3, x_m=1.0, columns=9)], []
     for index in range(16):
@@ -124,7 +124,7 @@ def test_parameters_that_cannot_be_are_refused(options, message):
         MSog(**{"sensors": [beam()], "region": REGION, **options})
 
 
-def test_a_frame_without_boxes_is_refused_and_adds_nothing():
+def test_frames_without_boxes_are_refused_without_effect():
     metric = MSog([AHEAD], region=REGION)
     with pytest.raises(ValueError, match="has no boxes"):
         metric.update(frame(0, None, reference=seen(ON_CAR)))

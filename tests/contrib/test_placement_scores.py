@@ -11,7 +11,7 @@ from torchcover.data import RegionsOfInterest
 RIGS = {name: f"place3d2024_{name}" for name in ("center", "line", "pyramid")}
 
 
-def test_own_numbers_are_those_of_compare_over_both_measures():
+def test_coverage_scores_equal_those_of_evaluate():
     region = Region("front", (0.0, 20.0), (-10.0, 10.0))
     scores = score_placements(RIGS, "courtyard", region=region, metrics=[], num_frames=8, seed=3)
     asked = {
@@ -49,7 +49,7 @@ def test_the_region_is_a_circle():
     assert area_m2 / 2 == pytest.approx(np.pi * 50**2, rel=1e-3)
 
 
-def test_two_placements_and_metrics_that_there_are_none_of_are_refused():
+def test_two_placements_and_unknown_metrics_are_refused():
     with pytest.raises(ValueError, match="three or more"):
         score_placements({"a": "kitti", "b": "waymo"})
     with pytest.raises(ValueError, match="s_mag"):

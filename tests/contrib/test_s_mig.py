@@ -30,7 +30,7 @@ def value(metric, name=":car"):
     return next(number for number in metric.compute() if number.quantity.key.endswith(name))
 
 
-def test_what_is_always_there_says_nothing_and_half_of_the_time_a_bit_a_voxel():
+def test_entropy_is_one_bit_at_half_occupancy():
     ahead = beam(z_m=1.0)
     always, half = [frame(0, boxes(AHEAD)), frame(1, boxes(AHEAD))], [frame(0, boxes(AHEAD)), frame(1, NONE)]
     assert value(s_mig([ahead], always)).value == 0.0
@@ -49,7 +49,7 @@ def test_what_is_always_there_says_nothing_and_half_of_the_time_a_bit_a_voxel():
     assert value(s_mig(again, half)).value == number.value
 
 
-def test_a_rig_without_rays_in_the_region_has_the_highest_value_of_all():
+def test_rigs_without_rays_have_the_highest_s_mig():
     half = [frame(0, boxes(AHEAD)), frame(1, NONE)]
     above = value(s_mig([beam(z_m=5.0)], half))
     assert above.value == 0.0 > value(s_mig([beam(z_m=1.0)], half)).value
@@ -62,7 +62,7 @@ def test_rays_end_with_the_range_of_their_sensor():
     assert value(s_mig([beam(z_m=1.0, range_m=4.0)], half)).value == pytest.approx(-2 * math.log(2))
 
 
-def test_categories_have_numbers_of_their_own_and_those_that_never_come_have_none():
+def test_categories_have_separate_numbers():
     person = (8.0, 0.0, 1.0, 1.0, 1.0, 2.0, 0.0)
     both = Boxes.from_rows(torch.tensor([AHEAD, person]), categories=("car", "pedestrian"))
     every, car, pedestrian, cyclist = s_mig([beam(z_m=1.0)], [frame(0, both), frame(1, NONE)]).compute()
@@ -93,7 +93,7 @@ def slowly(objects, grid):
     return inside
 
 
-def test_occupancy_and_its_blocks_are_those_of_a_slow_twin():
+def test_occupancy_equals_a_slow_implementation():
     generator, grid = np.random.default_rng(3), VoxelGrid(REGION, 0.5)
     frames = [frame(index, random_boxes(generator, index % 6), place=index // 2) for index in range(40)]
     frames.append(frames[5])  # the same frame again
@@ -107,7 +107,7 @@ def test_occupancy_and_its_blocks_are_those_of_a_slow_twin():
     assert found.frame_counts.tolist() == [4, 5, *[4] * 8, *[0] * 6]
 
 
-def test_boxes_that_overlap_count_once_and_beside_each_other_share_no_voxel():
+def test_overlapping_boxes_count_once():
     grid = VoxelGrid(REGION, 0.5)
 
     def occupied(*rows):
@@ -129,7 +129,7 @@ def test_boxes_that_overlap_count_once_and_beside_each_other_share_no_voxel():
         assert occupied(standing) == 2 * 2 * math.ceil(tenths / 5)
 
 
-def test_errors_over_worlds_are_the_jackknife_by_hand_and_none_below_eight():
+def test_errors_equal_the_jackknife_over_scenes():
     generator = np.random.default_rng(1)
     sensors = [beam(z_m=1.0, columns=40), beam("low", z_m=0.3, columns=40)]
     frames = [frame(index, random_boxes(generator, 4)) for index in range(16)]
@@ -147,7 +147,7 @@ def test_errors_over_worlds_are_the_jackknife_by_hand_and_none_below_eight():
     assert math.isnan(value(occluded).error)
 
 
-def test_with_occlusion_rays_end_at_what_was_measured_and_without_points_nowhere():
+def test_occluded_rays_end_at_measured_points():
     before = torch.tensor([[5.0, 0.0, 1.25]])
     clouds = {"beam": before}
     frames = [frame(0, boxes(AHEAD), clouds=clouds), frame(1, NONE)]
@@ -159,7 +159,7 @@ def test_with_occlusion_rays_end_at_what_was_measured_and_without_points_nowhere
     assert s_mig([beam(z_m=1.25)], frames, ends_at_hits=True).estimate().resample(torch.ones(1, 2)) is None
 
 
-def test_with_occlusion_it_is_the_mean_over_frames_of_the_entropy_on_their_way():
+def test_occluded_s_mig_is_a_mean_over_frames():
     generator = np.random.default_rng(2)
     sensors = [beam("a", z_m=1.0), beam("b", z_m=2.0, x_m=-1.0)]
     frames = [
@@ -182,7 +182,7 @@ def test_with_occlusion_it_is_the_mean_over_frames_of_the_entropy_on_their_way()
     assert together == pytest.approx(sum(alone))
 
 
-def test_the_published_rig_crosses_as_many_voxels_as_were_counted_before():
+def test_published_rig_crosses_the_known_voxel_count():
     number = value(
         s_mig(place3d("center"), [frame(0, boxes(AHEAD))], voxel_m=1.0, region=SMig(place3d("line")).grid.region)
     )
@@ -206,7 +206,7 @@ def test_parameters_that_cannot_be_are_refused(options, message):
         SMig(**{"sensors": [beam()], "voxel_m": 0.5, "region": REGION, **options})
 
 
-def test_frames_that_cannot_say_it_are_refused_and_add_nothing():
+def test_unsuitable_frames_are_refused_without_effect():
     metric = s_mig([beam()], [frame(0, NONE)], ends_at_hits=True)
     without = frame(1, None)
     nobody = replace(frame(1, NONE), sensor_point_counts=None)

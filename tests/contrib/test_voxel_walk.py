@@ -47,7 +47,7 @@ def nasty_rays():
     return tuple(np.array(each, dtype=float) for each in zip(*product([*origins, *outside], directions), strict=True))
 
 
-def test_nasty_rays_cross_what_the_twin_in_fractions_says():
+def test_degenerate_rays_match_exact_arithmetic():
     origins, directions = nasty_rays()
     ends = np.where(np.arange(len(origins)) % 3 == 0, 0.75, np.inf)
     for ray in range(len(origins)):
@@ -57,7 +57,7 @@ def test_nasty_rays_cross_what_the_twin_in_fractions_says():
         assert np.array_equal(find_crossed_voxels(GRID, origins[one], directions[one], ends[one]), least), ray
 
 
-def test_any_rays_cross_what_the_twin_in_fractions_says():
+def test_random_rays_match_exact_arithmetic():
     generator = np.random.default_rng(5)
     origins = generator.uniform(-2.5, 2.5, (200, 3))
     directions = generator.normal(size=(200, 3)) * 10 ** generator.uniform(-3, 1, (200, 3))
@@ -73,7 +73,7 @@ def test_any_rays_cross_what_the_twin_in_fractions_says():
 MIDDLE = VoxelGrid(BoundingBox((-5.0, -5.0, -2.0), (5.0, 5.0, 2.0)), 0.5)
 
 
-def test_directions_that_are_all_but_parallel_run_in_the_upper_voxel_of_a_face():
+def test_nearly_parallel_rays_stay_in_the_upper_voxel():
     for tiny in (0.0, 1e-17, -1e-17, 1e-13, -1e-13):
         found = np.argwhere(find_crossed_voxels(MIDDLE, [0.0, 0.0, 0.25], [[1.0, tiny, tiny]]))
         assert found[:, 1:].tolist() == [[10, 4]] * 10
@@ -81,7 +81,7 @@ def test_directions_that_are_all_but_parallel_run_in_the_upper_voxel_of_a_face()
     assert find_crossed_voxels(MIDDLE, [-1e6, 0.25, 0.25], [[1.0, 1e-5, 0.0]]).sum() == 0
 
 
-def test_a_ray_that_grazes_the_upper_wall_stays_within_the_region():
+def test_grazing_rays_stay_within_the_region():
     grid = VoxelGrid(BoundingBox((0.0, 0.0, 0.0), (4.0, 4.0, 1.0)), 1.0)
     # Within a billionth of the wall at the last plane, and beyond it only after that.
     found = np.argwhere(find_crossed_voxels(grid, [0.0, 4.0 - 3.5e-9, 0.5], [[1.0, 1e-9, 0.0]]))
@@ -93,7 +93,7 @@ def some_rays(count=300):
     return generator.uniform(-4, 4, (count, 3)), generator.normal(size=(count, 3)), generator.uniform(0, 9, count)
 
 
-def test_order_and_division_and_length_of_directions_do_not_matter(monkeypatch):
+def test_order_and_length_of_rays_do_not_matter(monkeypatch):
     origins, directions, ends = some_rays()
     whole = find_crossed_voxels(MIDDLE, origins, directions, ends)
     order = np.random.default_rng(1).permutation(len(origins))
@@ -130,7 +130,7 @@ def test_rays_that_are_none_are_refused(given, message):
         find_crossed_voxels(MIDDLE, *given)
 
 
-def test_an_array_of_another_grid_is_not_added_to():
+def test_output_arrays_of_other_grids_are_refused():
     with pytest.raises(ValueError, match=r"crossed: a contiguous bool array of shape \(20, 20, 8\)"):
         find_crossed_voxels(MIDDLE, [0, 0, 0], [[1, 0, 0]], output=np.zeros((20, 20, 9), dtype=bool))
 
@@ -144,12 +144,12 @@ def test_an_array_of_another_grid_is_not_added_to():
         (np.nan, "voxel_m: a positive length"),
     ],
 )
-def test_a_side_that_does_not_divide_the_region_is_refused_and_one_that_does_named(voxel_m, message):
+def test_voxels_that_do_not_divide_are_refused(voxel_m, message):
     with pytest.raises(ValueError, match=message):
         VoxelGrid(MIDDLE.region, voxel_m)
 
 
-def test_every_centre_is_in_its_own_voxel_and_borders_are_half_open():
+def test_centers_lie_in_half_open_voxels():
     x, y, z = GRID.compute_centers_m()
     centres = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1).reshape(-1, 3)
     assert GRID.find_voxels(centres).tolist() == list(range(GRID.num_voxels))

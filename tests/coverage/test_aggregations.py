@@ -73,7 +73,7 @@ def test_quantiles_beyond_the_histogram_are_max_radius():
     assert quantile([(NOTHING, points_at(0.5))], 0.5) == math.inf
 
 
-def test_the_least_value_is_not_zero_unless_a_value_is():
+def test_smallest_quantile_is_positive_for_positive_values():
     least = quantile([(ORIGIN, points_at(0.5, 0.75))], 0.0)
     assert least == pytest.approx(0.5, rel=0.13)
     assert quantile([(ORIGIN, points_at(0.0, 0.75))], 0.0) == 0
@@ -83,7 +83,7 @@ def test_the_least_value_is_not_zero_unless_a_value_is():
 
 
 @pytest.mark.parametrize("level", [0.0, 0.25, 0.5, 0.9, 1.0])
-def test_a_quantile_over_steps_is_that_of_the_means(level):
+def test_frame_quantiles_are_quantiles_of_frame_means(level):
     random = np.random.default_rng(3)
     steps = [random.uniform(0.02, 0.9, random.integers(1, 9)) for _ in range(101)]
     means = [np.float32(step).astype(float).mean() for step in steps]
@@ -100,7 +100,7 @@ def test_a_bad_moment_is_no_bad_point():
     assert quantile(moment, 0.95, kind=FrameQuantiles) == pytest.approx(0.9, rel=0.13)
 
 
-def test_blind_steps_saturate_and_unprobed_ones_do_not_count():
+def test_blind_frames_saturate_unobserved_ones_do_not_count():
     steps = [(ORIGIN, points_at(0.1)), (ORIGIN, NOTHING), (NOTHING, points_at(0.1))]
     assert quantile(steps, 1.0, kind=FrameQuantiles) == math.inf
     assert quantile(steps, 1.0, kind=FrameQuantiles, max_radius_m=2.0) == 2.0
@@ -139,7 +139,7 @@ def radii_in(region, sensor, reference, weights, band=BANDS["all"]):
     return torch.cdist(reference[inside], sensor).amin(dim=1).numpy(), weights[inside].numpy()
 
 
-def test_the_number_of_a_region_is_what_the_aggregation_makes_of_all_its_points():
+def test_region_numbers_aggregate_all_points_of_the_region():
     steps = list(random_steps(40))
     coverage = in_regions(steps, has_area_weights=True).compute()
     for row, (region, band) in zip(coverage.summary(), product((NEAR, ALL), BANDS.values()), strict=True):
@@ -158,7 +158,7 @@ def test_the_number_of_a_region_is_what_the_aggregation_makes_of_all_its_points(
         assert found["radius_frame_q0.5_m"] == pytest.approx(np.quantile(means, 0.5), rel=0.13)
 
 
-def test_the_error_of_a_region_s_number_is_the_jackknife_over_its_blocks():
+def test_region_errors_are_jackknife_errors_over_blocks():
     steps = list(random_steps(16))
     coverage = in_regions(steps, has_area_weights=True).compute()
     numbers = coverage.summary()[-1].numbers
@@ -176,7 +176,7 @@ def test_the_error_of_a_region_s_number_is_the_jackknife_over_its_blocks():
 
 
 @pytest.mark.parametrize("has_area_weights", [True, False])
-def test_parts_and_files_give_the_numbers_of_the_whole(tmp_path, has_area_weights):
+def test_merged_parts_and_files_give_equal_numbers(tmp_path, has_area_weights):
     steps = list(random_steps(64))
     whole = in_regions(steps, has_area_weights=has_area_weights).compute()
     one, other = (
@@ -191,7 +191,7 @@ def test_parts_and_files_give_the_numbers_of_the_whole(tmp_path, has_area_weight
     assert whole.scalars()["radius_q0.9_m_error/near/all"] == whole.summary()[0].numbers["radius_q0.9_m"].error
 
 
-def test_what_was_not_seen_or_not_asked_for_is_unknown():
+def test_unobserved_or_unrequested_regions_are_unknown():
     empty = in_regions([(ORIGIN, NOTHING, torch.zeros(0))] * 9).compute()
     other = Region("other", (0.0, 2.0), (0.0, 2.0))
     for coverage, region in ((empty, NEAR), (in_regions(random_steps(9)).compute(), other)):
@@ -261,7 +261,7 @@ class Blind(Aggregation):
         return [Layer(quantity, sums["blind"] / sums["all"])]
 
 
-def test_an_aggregation_of_ones_own_has_a_map_numbers_errors_and_a_place_in_every_table():
+def test_custom_aggregations_appear_in_maps_numbers_and_tables():
     steps = list(random_steps(16))
     metric = CoverageMetric(FOUR, num_blocks=16, aggregations=[Blind()], regions=[NEAR])
     for index, (sensor, reference, _) in enumerate(steps):
@@ -301,7 +301,7 @@ class Minimum(Aggregation):
         return [Layer(quantity, (-sums["negative"]).where(observed_frames > 0, math.nan))]
 
 
-def test_what_is_known_of_means_only_is_told_of_means_only():
+def test_notes_on_means_concern_means_only():
     metric = CoverageMetric(
         FOUR, (), aggregations=[Blind()], regions=[NEAR], sensor_names=["a"], has_area_weights=True, max_radius_m=9.0
     )
@@ -316,7 +316,7 @@ def test_what_is_known_of_means_only_is_told_of_means_only():
     assert "Change of share" not in text
 
 
-def test_an_aggregation_of_ones_own_is_measured_merged_saved_and_loaded(tmp_path):
+def test_custom_aggregations_are_merged_saved_and_loaded(tmp_path):
     grid = BevGrid(x_m=(0.0, 2.0), y_m=(0.0, 1.0), cell_m=1.0, heights={"all": (-1.0, 1.0)})
     one, other = (CoverageMetric(grid, aggregations=[Minimum()], num_blocks=8) for _ in range(2))
     one.update(ORIGIN, points_at(0.5, 0.25))
@@ -338,7 +338,7 @@ def test_aggregations_have_names_of_their_own():
     )
 
 
-def test_each_of_the_package_has_a_name_that_makes_it():
+def test_names_create_the_built_in_aggregations():
     for kind in AGGREGATIONS:
         made = parse_aggregation(f"{kind.name}:{kind.example}")
         assert type(made) is kind

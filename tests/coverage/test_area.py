@@ -51,7 +51,7 @@ def by_hand(steps, low, high):
 
 
 @pytest.mark.parametrize("cell", [0.25, 1.0, 4.0])
-def test_it_is_the_ratio_of_sums_whatever_the_cells(cell):
+def test_area_average_is_independent_of_the_cells(cell):
     steps = steps_of(9)
     coverage = metric_over(steps, cell_m=cell).compute()
     for height, band in HEIGHTS.items():
@@ -60,7 +60,7 @@ def test_it_is_the_ratio_of_sums_whatever_the_cells(cell):
         assert estimate.error.isnan().all()
 
 
-def test_what_is_left_out_is_what_a_run_without_the_block_gives():
+def test_jackknife_values_equal_runs_without_the_block():
     steps = steps_of(40)
     coverage = metric_over(steps, num_blocks=16).compute()
     estimate = coverage.estimate(REGION, "low", "area")
@@ -80,7 +80,7 @@ def test_points_that_are_split_up_change_nothing():
 
 
 @pytest.mark.parametrize("blocks", [1, 8])
-def test_two_halves_merge_to_the_whole_and_a_file_gives_back_what_was_saved(tmp_path, blocks):
+def test_area_sums_merge_and_load_exactly(tmp_path, blocks):
     steps = steps_of(20)
     whole = metric_over(steps, num_blocks=blocks)
     first, second = (
@@ -132,7 +132,7 @@ def twin(steps, region, low, high):
     return sums / whole
 
 
-def test_a_point_belongs_to_a_region_by_its_own_place_whatever_the_cells():
+def test_points_belong_to_regions_by_position():
     steps = steps_of(20, points=150)
     coverage = of_odd(steps).compute()
     for region in ODD:
@@ -147,7 +147,7 @@ def test_a_point_belongs_to_a_region_by_its_own_place_whatever_the_cells():
     assert abs(cells[1] / cells[0] / coverage.estimate(ODD[0], "low").value[0] - 1) > 1e-3
 
 
-def test_neither_the_order_of_points_nor_of_steps_moves_it():
+def test_area_average_is_independent_of_any_order():
     steps = steps_of(16, points=60)
     random = torch.Generator().manual_seed(1)
     orders = [torch.randperm(60, generator=random) for _ in steps]
@@ -166,7 +166,7 @@ def test_neither_the_order_of_points_nor_of_steps_moves_it():
         parts.merge_state(of_odd(steps[:1], regions=ODD[:1]))
 
 
-def test_a_region_that_was_not_asked_for_is_made_from_whole_cells_or_refused(tmp_path):
+def test_other_regions_need_bounds_on_cell_edges(tmp_path):
     of_odd(steps_of(20)).compute().save(tmp_path / "coverage.npz")
     loaded, asked = Coverage.load(tmp_path / "coverage.npz"), Region("later", x_m=(0.32, 3.2), y_m=(0.64, 1.6))
     there = of_odd(steps_of(20), regions=[asked]).compute()
@@ -186,7 +186,7 @@ def test_a_region_that_was_not_asked_for_is_made_from_whole_cells_or_refused(tmp
         assert loaded.estimate(other, "low", "cells").value.isfinite().all()
 
 
-def test_a_cell_has_the_ratio_of_its_own_sums():
+def test_cells_have_the_ratio_of_their_sums():
     coverage = metric_over(steps_of(30), cell_m=4.0).compute()
     band = coverage.area_sums.sum_blocks()[0, 0]
     radius = coverage.layers["radius_area_m"].values[0]
@@ -196,7 +196,7 @@ def test_a_cell_has_the_ratio_of_its_own_sums():
     assert ((detection * band).sum() / band.sum()).item() == pytest.approx(value[2].item(), rel=1e-12)
 
 
-def test_no_square_metre_is_unknown_and_no_sensor_point_is_infinitely_far():
+def test_regions_without_surface_are_unknown():
     sensor, nowhere, none = torch.zeros(1, 3), torch.zeros(0, 3), torch.zeros(0)
     assert metric_over([(sensor, nowhere, none)]).compute().estimate(REGION, "low", "area").value.isnan().all()
     one = (torch.zeros(0, 3), torch.tensor([[1.0, 1.0, 0.5]]), torch.tensor([2.0]))

@@ -54,7 +54,7 @@ def test_on_level_ground_both_are_the_same():
     assert repr(by_ground.summary()) == repr(by_z.summary())
 
 
-def test_points_without_ground_are_in_no_band_and_counted():
+def test_points_without_ground_are_excluded_and_counted():
     holes = HEIGHT.clone()
     holes[:10] = math.nan
     result = measured(GROUND, holes)
@@ -83,7 +83,7 @@ def test_points_without_ground_are_in_no_band_and_counted():
         (GROUND, [HEIGHT, HEIGHT], "1 weights, 2 heights, 1 block indices and 1 errors for 1 reference clouds"),
     ],
 )
-def test_heights_that_do_not_go_with_the_grid_are_refused(grid, height, message):
+def test_mismatched_heights_are_refused(grid, height, message):
     with pytest.raises(ValueError, match=message) as refused:
         measured(grid, height)
     assert "\n" not in str(refused.value)
@@ -98,7 +98,7 @@ def test_a_step_without_points_needs_no_heights():
     assert metric.compute().counts["empty_reference_frames"] == 1
 
 
-def test_results_of_two_band_frames_are_neither_merged_nor_compared(tmp_path):
+def test_different_band_frames_cannot_be_merged_or_compared(tmp_path):
     ground, vehicle = CoverageMetric(GROUND), CoverageMetric(VEHICLE)
     ground.update(ON_RAMP, REFERENCE, heights_m=HEIGHT)
     with pytest.raises(ValueError, match="cannot merge metrics with different grid"):

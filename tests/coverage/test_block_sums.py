@@ -49,7 +49,7 @@ def test_lists_say_what_the_arrays_said(share):
     np.testing.assert_array_equal(spread[1], sums[:, :, band, known].swapaxes(0, 1))
 
 
-def test_what_is_moved_is_added_up_in_its_block():
+def test_remapped_cells_are_summed_within_their_block():
     base, sums = arrays(0.5)
     moved = listed_of(base, sums).remap_cells(lambda cell: cell // 2, SHAPE[1] * SHAPE[2] * 2, (*SHAPE[1:3], 2))
     halves = base.reshape(*SHAPE[:3], 2, 2).sum(axis=-1)

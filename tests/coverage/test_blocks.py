@@ -103,7 +103,7 @@ def assert_same_state(one: CoverageMetric, other: CoverageMetric) -> None:
 
 
 @pytest.mark.parametrize("count", [8, 9, 100])
-def test_the_jackknife_of_a_mean_is_the_textbook_standard_error(count):
+def test_jackknife_of_a_mean_equals_its_standard_error(count):
     values = torch.randn(count, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(count))
     left_out = (values.sum(dim=0) - values) / (count - 1)
     error = compute_jackknife_error(left_out, values.mean(dim=0), torch.ones(count))
@@ -118,7 +118,7 @@ def test_unequal_blocks_are_weighed_as_in_plain_loops(seed):
     assert float(error) == pytest.approx(slow_jackknife(left_out.tolist(), whole, sizes.tolist()), rel=1e-12)
 
 
-def test_blocks_that_all_say_the_same_do_not_say_how_exact_they_are():
+def test_equal_blocks_give_no_interval():
     coverage = metric_over(
         [{"clouds": clouds_of({0: [0.25]}), "more": {"block_index": at}} for at in range(40)]
     ).compute()
@@ -129,7 +129,7 @@ def test_blocks_that_all_say_the_same_do_not_say_how_exact_they_are():
 
 
 @pytest.mark.parametrize(("radius", "detection_error"), [(0.25, 1.0), (1.0, 1.0), (0.0, 1.0)])
-def test_no_error_of_a_cell_is_zero_however_much_its_blocks_agree(radius, detection_error):
+def test_cell_errors_are_never_zero(radius, detection_error):
     """Ten blocks that all say the same, and two more in which all is seen, or nothing: 12 values about a mean of 10."""
     coverage = metric_over(
         [{"clouds": clouds_of({0: [radius]}), "more": {"block_index": at}} for at in range(40)]
@@ -140,7 +140,7 @@ def test_no_error_of_a_cell_is_zero_however_much_its_blocks_agree(radius, detect
     assert float(coverage.errors["radius_m"].flatten()[0]) == pytest.approx(expected or math.nan, nan_ok=True)
 
 
-def test_one_step_a_block_gives_the_textbook_error_in_a_region():
+def test_one_frame_per_block_gives_the_textbook_error():
     radii = np.random.default_rng(0).random(16).astype(np.float32)
     steps = [
         {"clouds": clouds_of({2: [float(radius)]}), "more": {"block_index": at}} for at, radius in enumerate(radii)
@@ -165,7 +165,7 @@ def test_sums_and_errors_are_those_of_plain_loops(count):
     assert row.numbers["detection_0.5m"].error == pytest.approx(slow_region_error(sums, "detection"), rel=1e-9)
 
 
-def test_the_error_in_a_cell_is_that_of_a_ratio_of_sums_with_two_more_blocks():
+def test_cell_errors_use_two_pseudo_blocks():
     steps = random_steps(64, seed=3)
     coverage, sums = metric_over(steps).compute(), slow_blocks(steps, 16)
     for name, found in zip(("radius", "detection"), coverage.errors.values(), strict=True):
@@ -179,7 +179,7 @@ def test_the_error_in_a_cell_is_that_of_a_ratio_of_sums_with_two_more_blocks():
             assert float(found.flatten()[cell]) == pytest.approx(expected, rel=1e-9)
 
 
-def test_no_error_is_told_from_fewer_than_8_blocks_nor_in_a_cell_that_fewer_probed():
+def test_fewer_than_8_blocks_give_no_error():
     steps = [{"clouds": clouds_of({0: [at / 32], **({1: [0.1]} if at < 7 else {})}), "more": {"block_index": at}}
              for at in range(8)]  # fmt: skip
     (few,), (enough,) = (metric_over(steps[:count]).compute().summary([EVERYWHERE]) for count in (7, 8))
@@ -197,7 +197,7 @@ def test_without_blocks_there_are_no_errors():
     assert math.isnan(coverage.summary([EVERYWHERE])[0].numbers["radius_m"].error)
 
 
-def test_the_error_of_a_difference_is_that_of_the_paired_values():
+def test_difference_errors_equal_errors_of_paired_values():
     """Half of what both rigs share is noise a hundred times the difference: it cancels out."""
     random = np.random.default_rng(0)
     shared, own = 2 * random.random(16), 0.02 * random.random(16)
@@ -212,7 +212,7 @@ def test_the_error_of_a_difference_is_that_of_the_paired_values():
 
 
 @pytest.mark.parametrize("blocks", [0, 2, 6, 9, -8])
-def test_a_number_of_blocks_that_gives_no_error_to_believe_is_refused(blocks):
+def test_unreliable_numbers_of_blocks_are_refused(blocks):
     with pytest.raises(ValueError, match=f"num_blocks: 1, or an even number from 8 on, is needed; got {blocks}"):
         CoverageMetric(GRID, num_blocks=blocks)
 
@@ -244,7 +244,7 @@ def test_interleaved_parts_merge_into_the_whole(parts):
         assert_same_state(merged, whole)
 
 
-def test_a_run_goes_on_from_its_state_dict_as_if_it_had_never_stopped():
+def test_runs_continue_exactly_from_their_state_dict():
     steps = random_steps(70, dyadic=True)
     resumed = CoverageMetric(GRID, (THRESHOLD,), num_blocks=16)
     stopped = metric_over(steps[:23])
@@ -290,7 +290,7 @@ def test_doubling_the_blocks_keeps_every_sum(count):
 
 @pytest.mark.parametrize("blocks", [8, 16])
 @pytest.mark.parametrize("last", [7, 127, 128, 255, 256, 511, 512, 5000])
-def test_fine_blocks_are_worlds_as_long_as_there_is_room_and_parts_merge_to_them(blocks, last):
+def test_fine_blocks_are_scenes_and_merge_exactly(blocks, last):
     grid = BevGrid(x_m=(0.0, 1.0), y_m=(0.0, 1.0), cell_m=1.0, heights={"all": (-1.0, 1.0)})
     places = sorted({0, 1, last // 3, last // 2, last})
 
@@ -325,7 +325,7 @@ def test_blocks_change_no_number(aggregations):
         torch.testing.assert_close(blocked.layers[key].values, layer.values, rtol=1e-12, atol=0, equal_nan=True)
 
 
-def test_a_step_far_ahead_makes_room_and_leaves_a_gap():
+def test_distant_block_indices_leave_a_gap():
     steps = random_steps(3, dyadic=True)
     steps[2]["more"]["block_index"] = 1_000_000
     coverage = metric_over(steps).compute()
@@ -337,7 +337,7 @@ def test_a_step_far_ahead_makes_room_and_leaves_a_gap():
     ("index", "message"),
     [(-1, "a number from 0 to .*; got -1"), ([0, 1], "2 block indices and 1 errors for 1 reference clouds")],
 )
-def test_numbers_of_steps_that_make_no_sense_are_refused(index, message):
+def test_invalid_block_indices_are_refused(index, message):
     with pytest.raises(ValueError, match=message):
         CoverageMetric(GRID, num_blocks=16).update(*clouds_of({0: [0.5]}), block_index=index)
 
@@ -358,7 +358,7 @@ def test_weighted_means_are_those_of_plain_loops():
         assert float(coverage.layers["radius_pooled_m"].values.flatten()[cell]) == pytest.approx(pooled, rel=1e-12)
 
 
-def test_equal_weights_change_nothing_and_their_scale_in_a_step_neither():
+def test_equal_weights_and_their_scale_change_nothing():
     steps = random_steps(20, seed=6, weighted=True)
     options = {"aggregations": [Maximum(), Quantiles((0.1, 0.5))]}
     plain = [{**step, "more": {"block_index": step["more"]["block_index"]}} for step in steps]
@@ -382,7 +382,7 @@ def test_equal_weights_change_nothing_and_their_scale_in_a_step_neither():
             torch.testing.assert_close(layer.values, expected, rtol=1e-6, atol=1e-9, equal_nan=True)
 
 
-def test_weights_of_points_outside_the_grid_are_left_out_with_them():
+def test_weights_of_points_outside_the_grid_are_excluded():
     sensor, reference = clouds_of({0: [0.25, 0.75]})
     reference = torch.cat([torch.tensor([[-50.0, 50.0, 0.0]]), reference])
     metric = CoverageMetric(GRID, (THRESHOLD,))
@@ -419,7 +419,7 @@ def test_bad_weights_are_refused_and_nothing_is_counted(weights, message):
     assert int(metric.num_frames) == 0
 
 
-def test_points_of_another_density_with_weights_ask_the_same_question():
+def test_weights_compensate_the_density_of_points():
     """r = x from a sensor point at x = 0: the mean over [0, 1) is 1/2, the share within 0.3 m is 0.3."""
     uniform = torch.rand(200_000, generator=torch.Generator().manual_seed(0))
     line = BevGrid(x_m=(0.0, 1.0), y_m=(0.0, 1.0), cell_m=1.0, heights={"all": (-1.0, 1.0)})
@@ -460,7 +460,7 @@ def coverage_of(radii: np.ndarray, probed: np.ndarray) -> Coverage:
 
 
 @pytest.mark.parametrize("alike", [1, 4])
-def test_the_reported_errors_are_the_spread_over_many_runs(alike):
+def test_reported_errors_equal_the_spread_over_runs(alike):
     """Independent steps, and steps that are alike in fours, as many as a block has."""
     random = np.random.default_rng(0)
     numbers, errors, cells, of_cells = [], [], [], []
@@ -480,7 +480,7 @@ def test_the_reported_errors_are_the_spread_over_many_runs(alike):
     assert covers.double().mean() >= 0.93
 
 
-def test_two_errors_cover_what_a_cell_with_a_rare_event_has():
+def test_two_errors_cover_cells_with_rare_events():
     """In one block of ten a cell is blind: most runs of 16 blocks have seen it once or twice, and every fifth never."""
     blind = torch.from_numpy(np.random.default_rng(1).random((500, 16, 1, 1, 1)) < 0.1)
     once = torch.ones((16, 1, 1, 1), dtype=torch.int64)

@@ -32,7 +32,7 @@ def metric_over(steps, index=None, **options):
     return metric
 
 
-def test_what_is_left_out_is_what_a_run_without_the_block_gives():
+def test_jackknife_values_equal_runs_without_the_block():
     steps = steps_of(40)  # blocks of 4 steps, ten of them in use
     coverage = metric_over(steps, num_blocks=16).compute()
     for height in GRID.heights:
@@ -45,7 +45,7 @@ def test_what_is_left_out_is_what_a_run_without_the_block_gives():
             torch.testing.assert_close(estimate.jackknife_values[block], expected, rtol=1e-10, atol=1e-12)
 
 
-def test_a_difference_is_that_of_its_parts_block_by_block():
+def test_differences_are_taken_block_by_block():
     steps = steps_of(40)
     nearer = [(torch.cat([sensor, sensor + 0.2]), reference) for sensor, reference in steps]
     one, other = (metric_over(run, num_blocks=16).compute().estimate(PART, "low") for run in (steps, nearer))
@@ -55,13 +55,13 @@ def test_a_difference_is_that_of_its_parts_block_by_block():
     assert (one.subtract(one).error == 0).all()
 
 
-def test_without_blocks_there_is_a_value_but_no_error():
+def test_without_blocks_values_have_no_error():
     estimate = metric_over(steps_of(40)).compute().estimate(PART, "low")
     assert estimate.value.isfinite().all()
     assert estimate.error.isnan().all()
 
 
-def test_the_mean_over_known_cells_is_that_of_the_map():
+def test_cell_average_equals_the_mean_of_the_map():
     coverage = metric_over(steps_of(9)).compute()
     for band, height in enumerate(GRID.heights):
         cells = coverage.radius[band][PART.mask_cells(GRID)]
@@ -87,7 +87,7 @@ def test_no_such_band_is_said():
 
 
 @pytest.mark.parametrize("measure", ["cells", "area"])
-def test_numbers_of_worlds_that_are_drawn_again_are_those_of_a_run_over_them(measure):
+def test_resampled_numbers_equal_runs_over_resampled_scenes(measure):
     random = np.random.default_rng(1)
     steps = [(sensor, reference, torch.from_numpy(random.uniform(0.1, 2, 12))) for sensor, reference in steps_of(10)]
 
@@ -108,7 +108,7 @@ def test_numbers_of_worlds_that_are_drawn_again_are_those_of_a_run_over_them(mea
 
 
 @pytest.mark.parametrize("measure", ["area", "cells"])
-def test_numbers_without_maps_are_those_of_the_result_to_the_last_bit(measure):
+def test_numbers_without_maps_equal_those_with_maps(measure):
     metric = CoverageMetric(GRID, (0.4, 0.8), num_blocks=16, has_area_weights=True)
     for number, (sensor, reference) in enumerate(steps_of(40)):
         metric.update(sensor, reference, weights=reference[:, 0] + 0.1, block_index=number)

@@ -42,7 +42,7 @@ def test_cells_are_half_open_wherever_the_range_lies(bounds, axis):
         assert index_of(grid, at(**{axis: outside})) is None
 
 
-def test_bands_are_half_open_and_touch_without_a_gap():
+def test_bands_are_half_open_without_gaps():
     grid = BevGrid(x_m=(0.0, 1.0), y_m=(0.0, 1.0), cell_m=1.0)
     for z, band in [(-0.5, 0), (0.0, 0), (0.4999, 0), (0.5, 1), (1.9999, 1), (2.0, None), (-0.5001, None)]:
         found = index_of(grid, at(z=z))
@@ -75,7 +75,7 @@ def test_points_of_another_shape_are_refused(shape):
         BevGrid(x_m=(0.0, 1.0), y_m=(0.0, 1.0), cell_m=1.0).find_cells(torch.zeros(shape))
 
 
-def test_cells_are_numbered_band_by_band_then_row_by_row():
+def test_cell_indices_run_over_bands_then_rows():
     grid = BevGrid(x_m=(0.0, 4.0), y_m=(-1.0, 2.0), cell_m=1.0, heights={"a": (0.0, 1.0), "b": (1.0, 2.0)})
     assert grid.shape == (2, 3, 4)
     assert grid.num_cells == 24
@@ -102,7 +102,7 @@ def test_a_border_is_the_decimal_that_one_writes(cell, bounds):
     cell=st.sampled_from([0.1, 0.25, 0.3, 0.05, 1.0, 2.5]),
     share=st.floats(-0.5, 1.5),
 )
-def test_a_point_lies_between_the_borders_of_its_cell(low, count, cell, share):
+def test_points_lie_between_the_edges_of_their_cell(low, count, cell, share):
     bounds = (low * cell, (low + count) * cell)
     grid = BevGrid(x_m=(0.0, cell), y_m=bounds, cell_m=cell, heights=ONE_BAND)
     edges = grid.y_edges_m
@@ -118,7 +118,7 @@ def test_a_point_lies_between_the_borders_of_its_cell(low, count, cell, share):
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
-def test_points_of_any_type_are_compared_as_they_are(dtype):
+def test_points_of_any_dtype_are_compared_exactly(dtype):
     grid = BevGrid(x_m=(0, 1), y_m=(0, 1), cell_m=0.1, heights=ONE_BAND)
     x = torch.arange(10).to(dtype) / 10
     points = torch.stack([x, torch.zeros_like(x), torch.zeros_like(x)], dim=1)
@@ -141,7 +141,7 @@ def test_points_of_any_type_are_compared_as_they_are(dtype):
         ((0.0, 1e-310), 1e-313),
     ],
 )
-def test_cells_are_those_of_a_search_among_the_borders(x, cell, monkeypatch):
+def test_cells_equal_a_search_among_the_edges(x, cell, monkeypatch):
     """On every border, beside it, between, far out, and for what is no number; in one part and in several."""
     grid = BevGrid(x_m=x, y_m=(0.0, cell), cell_m=cell, heights=ONE_BAND)
     edges = grid.x_edges_m.numpy()
@@ -183,7 +183,7 @@ def test_the_defaults_are_the_papers():
     assert list(grid.heights) == ["ground", "obstacle"]
 
 
-def test_grids_are_equal_when_their_cells_mean_the_same():
+def test_grids_with_equal_cells_are_equal():
     heights = {"a": (0.0, 1.0), "b": (1.0, 2.0)}
     grid = BevGrid(x_m=(0.0, 2.0), y_m=(0.0, 1.0), cell_m=1.0, heights=heights)
     same = BevGrid(x_m=[0, 2], y_m=(0, 1), cell_m=1, heights={"a": [0, 1], "b": [1, 2]})
@@ -247,7 +247,7 @@ def test_bands_that_make_no_sense_are_refused(heights, message):
         BevGrid(x_m=(0, 1), y_m=(0, 1), cell_m=0.5, heights=heights)
 
 
-def test_a_grid_too_large_for_the_memory_is_refused_before_it_is_made():
+def test_too_large_grids_are_refused_before_allocation():
     with pytest.raises(ValueError, match=r"x_m: inf cells of 1e-310 m, over 100,000,000: use larger cells"):
         BevGrid(x_m=(0.0, 1.0), y_m=(0.0, 1.0), cell_m=1e-310)
     with pytest.raises(ValueError, match="the grid has 200,000,000 cells, over 100,000,000: use larger cells"):

@@ -24,7 +24,7 @@ def test_bin_of_is_the_definition(edges, value):
     values=st.lists(st.floats(0, 9.999), min_size=1, max_size=30),
     level=st.sampled_from([0.0, 0.25, 0.5, 0.75, 1.0]),
 )
-def test_a_quantile_lies_in_the_bin_of_the_true_one(values, level):
+def test_quantiles_lie_in_the_true_bin(values, level):
     edges = torch.arange(0, 11, dtype=torch.float64)
     histogram = torch.zeros(10, 2, dtype=torch.float64)
     for value in values:
@@ -44,7 +44,7 @@ def test_quantiles_are_linear_within_a_bin():
 
 @pytest.mark.parametrize("weights", [(0.1, 0.2, 0.3, 0.6), (1, 2, 3, 6), (0.7, 0.1, 0.8), (1 / 3, 1 / 3, 2 / 3)])
 @pytest.mark.parametrize("scale", [1e-9, 0.1, 0.3, 1.0, 7e9])
-def test_a_tie_stays_where_it_is_however_the_weights_are_rounded(weights, scale):
+def test_ties_do_not_depend_on_rounding_of_weights(weights, scale):
     """Half of the weight lies below 1, and the other half from 10 on: the median is 1, and never 10."""
     *below, above = weights
     edges = torch.tensor([*torch.linspace(0, 1, len(below) + 1), 10.0, 11.0], dtype=torch.float64)

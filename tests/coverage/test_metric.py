@@ -57,7 +57,7 @@ def random_steps(seed, steps=3, dyadic=True, empty=True):
 
 
 @pytest.mark.parametrize("backend", ["cdist", "kdtree"])
-def test_one_sensor_point_over_a_plane_of_reference_points(backend):
+def test_radius_of_one_sensor_point_above_a_plane(backend):
     """r is the distance to that point; a grid of four points a cell, two bands of which one is empty."""
     grid = BevGrid(x_m=(-4.0, 4.0), y_m=(-2.0, 2.0), cell_m=1.0)
     x, y = torch.meshgrid(torch.arange(-4, 4, 0.5) + 0.25, torch.arange(-2, 2, 0.5) + 0.25, indexing="ij")
@@ -83,20 +83,20 @@ def test_a_mean_of_means_not_a_pooled_mean():
     assert (result.observed_frames.item(), result.point_counts.item()) == (2, 1001)
 
 
-def test_a_step_without_a_point_in_the_cell_does_not_count_there():
+def test_frames_count_only_in_cells_with_points():
     grid = BevGrid(x_m=(0.0, 2.0), y_m=(0.0, 1.0), cell_m=1.0, heights={"all": (-1.0, 1.0)})
     result = coverage([(ORIGIN, points_at(0.5)), (ORIGIN, cloud([1, 0, 0])), (ORIGIN, points_at(0.25))], grid)
     assert result.radius.flatten().tolist() == [0.375, 1.0]
     assert result.observed_frames.flatten().tolist() == [2, 1]
 
 
-def test_the_nearest_sensor_point_may_lie_outside_the_grid():
+def test_nearest_sensor_points_may_lie_outside_the_grid():
     """Trap 3: the sensor cloud is never cropped."""
     outside = cloud([-0.25, 0.5, 0], [0.5, 0.5, 5.0])
     assert coverage([(outside, cloud([0.25, 0.5, 0]))]).radius.item() == 0.5
 
 
-def test_reference_points_outside_the_grid_change_nothing_but_their_count():
+def test_reference_points_outside_the_grid_are_only_counted():
     inside = points_at(0.25, 0.75)
     outside = cloud([1, 0, 0], [-0.01, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, -1.01])
     alone, together = coverage([(ORIGIN, inside)]), coverage([(ORIGIN, torch.cat([outside, inside]))])
@@ -141,7 +141,7 @@ def test_no_thresholds_give_no_detection():
 # Empty clouds, saturation, counts
 
 
-def test_a_step_in_which_the_rig_saw_nothing_is_blind_not_missing():
+def test_frames_without_sensor_points_are_blind():
     result = coverage(
         [(NOTHING, points_at(0.5)), (ORIGIN, points_at(0.5))], ONE_CELL, (0.75,), aggregations=[Maximum()]
     )
@@ -156,7 +156,7 @@ def test_an_empty_sensor_cloud_gives_max_radius():
     assert result.max_radius_m == 8.0
 
 
-def test_a_blind_step_detects_nothing_even_at_a_threshold_of_max_radius():
+def test_blind_frames_detect_nothing_at_any_threshold():
     result = coverage([(NOTHING, points_at(0.5)), (ORIGIN, points_at(0.4, 0.5))], ONE_CELL, (0.4,), max_radius_m=0.4)
     assert result.detection.item() == 0.25
     assert result.radius.item() == pytest.approx(0.4)
@@ -196,7 +196,7 @@ def test_max_radius_saturates_every_number(max_radius):
     assert map_of(result, "radius_q0.9_m").item() <= max_radius
 
 
-def test_a_search_bounded_by_the_threshold_detects_the_same_to_the_last_bit():
+def test_bounded_searches_detect_exactly_the_same():
     """Whoever wants detection only may bound the search by the largest threshold."""
     steps = random_steps(11, steps=6)
     whole, bounded = (coverage(steps, GRID, (0.25, 0.5), max_radius_m=limit) for limit in (math.inf, 0.5))
@@ -204,7 +204,7 @@ def test_a_search_bounded_by_the_threshold_detects_the_same_to_the_last_bit():
     assert (bounded.radius[bounded.observed_frames > 0] <= 0.5).all()
 
 
-def test_without_radii_only_points_near_the_reference_matter_to_the_last_bit():
+def test_without_radii_distant_points_change_no_bit():
     steps = random_steps(11, steps=6)
     near = [(sensor[torch.cdist(sensor, reference).amin(dim=1) <= 0.6], reference) for sensor, reference in steps]
     assert sum(len(sensor) for sensor, _ in near) < 0.5 * sum(len(sensor) for sensor, _ in steps)
@@ -247,7 +247,7 @@ def test_shorter_types_give_what_their_rounded_coordinates_give(slow_coverage, d
     ("dtype", "cell", "threshold"),
     [(torch.bfloat16, 0.5, 0.4), (torch.float16, 0.25, 0.4), (torch.float16, 1.0, 0.1), (torch.float32, 0.25, 1e-4)],
 )
-def test_types_that_are_too_coarse_for_cells_or_thresholds_are_refused(dtype, cell, threshold):
+def test_dtypes_too_coarse_for_cells_are_refused(dtype, cell, threshold):
     grid = BevGrid(x_m=(0.0, 80.0), y_m=(-20.0, 20.0), cell_m=cell)
     metric, cloud = CoverageMetric(grid, (threshold,)), torch.zeros(3, 3)
     for clouds in ((cloud.to(dtype), cloud.double()), (cloud.double(), cloud.to(dtype))):
@@ -258,7 +258,7 @@ def test_types_that_are_too_coarse_for_cells_or_thresholds_are_refused(dtype, ce
 
 
 @pytest.mark.filterwarnings("error")
-def test_numbers_that_mean_something_else_than_they_seem_are_warned_of_once():
+def test_misleading_settings_cause_one_warning():
     grid = BevGrid(x_m=(0.0, 10.0), y_m=(0.0, 10.0), cell_m=1.0)
     ground = torch.rand(1200, 3) * torch.tensor([10.0, 10.0, 0.2])
     in_lidar_frame, over_cells, right = (CoverageMetric(grid, max_radius_m=9.0) for _ in range(3))
@@ -286,7 +286,7 @@ def assert_same(one, other):
 
 @settings(max_examples=12, deadline=None)
 @given(seed=st.integers(0, 2**32))
-def test_neither_the_order_of_points_nor_of_steps_matters(seed):
+def test_order_of_points_and_frames_does_not_matter(seed):
     steps = random_steps(seed)
     generator = torch.Generator().manual_seed(seed)
     shuffled = [[c[torch.randperm(len(c), generator=generator)] for c in step] for step in reversed(steps)]
@@ -296,7 +296,7 @@ def test_neither_the_order_of_points_nor_of_steps_matters(seed):
 
 @settings(max_examples=12, deadline=None)
 @given(seed=st.integers(0, 2**32))
-def test_a_list_of_steps_is_the_steps_one_by_one(seed):
+def test_lists_of_frames_equal_single_updates(seed):
     steps = random_steps(seed, steps=4)
     metric = CoverageMetric(GRID, **OPTIONS)
     metric.update([sensor for sensor, _ in steps], tuple(reference for _, reference in steps))
@@ -315,7 +315,7 @@ def test_more_sensor_points_never_make_it_worse(seed):
     assert (map_of(before, "radius_maximum_m") >= before.radius - 1e-12)[known].all()
 
 
-def test_a_point_covers_from_a_threshold_as_large_as_its_error_on_whatever_else_is_asked():
+def test_points_detect_at_thresholds_above_their_error():
     points, reference = torch.rand(2, 40, 3, generator=torch.Generator().manual_seed(2)).unbind()
     error = torch.linspace(-0.6, 0.6, 40)[torch.randperm(40, generator=torch.Generator().manual_seed(3))]
     asked = {thresholds: CoverageMetric(ONE_CELL, thresholds, max_radius_m=9.0) for thresholds in SETS_OF_THRESHOLDS}
@@ -331,7 +331,7 @@ def test_a_point_covers_from_a_threshold_as_large_as_its_error_on_whatever_else_
     assert len({float(one) for one in found[0.1, 0.25, 0.5].detection}) == 3
 
 
-def test_errors_are_those_of_all_sensors_one_after_the_other():
+def test_errors_are_in_the_order_of_sensors():
     points, reference = torch.rand(2, 40, 3, generator=torch.Generator().manual_seed(2)).unbind()
     error, far = torch.linspace(-0.6, 0.6, 40), torch.full((5,), math.inf)
     by_name, plain = (CoverageMetric(ONE_CELL, (0.3,), max_radius_m=9.0, sensor_names=("a", "b")) for _ in range(2))
@@ -361,7 +361,7 @@ def test_errors_are_those_of_all_sensors_one_after_the_other():
         ({"a": torch.zeros(2)}, TypeError, r"errors_m .*tensor"),
     ],
 )
-def test_errors_that_are_none_of_its_points_are_refused(given, error, message):
+def test_errors_of_other_shapes_are_refused(given, error, message):
     metric = CoverageMetric(ONE_CELL)
     with pytest.raises(error, match=message):
         metric.update(torch.zeros(2, 3), torch.zeros(2, 3), errors_m=given)
@@ -423,14 +423,14 @@ def test_what_is_no_sequence_of_thresholds_is_refused(thresholds):
         (["1"], TypeError, "block_index: an integer"),
     ],
 )
-def test_a_number_of_a_step_that_is_none_is_refused(index, error, message):
+def test_invalid_block_index_types_are_refused(index, error, message):
     metric = CoverageMetric(ONE_CELL, num_blocks=8)
     with pytest.raises(error, match=message):
         metric.update(ORIGIN, ORIGIN, block_index=index)
     assert int(metric.num_frames) == 0
 
 
-def test_the_largest_number_of_a_step_has_its_block():
+def test_largest_block_index_has_a_block():
     metric = CoverageMetric(ONE_CELL, num_blocks=8)
     metric.update(ORIGIN, ORIGIN, block_index=np.int64(3))
     metric.update(ORIGIN, ORIGIN, block_index=10**15)

@@ -53,7 +53,7 @@ def test_a_number_is_that_of_the_summary(options):
 
 
 @pytest.mark.parametrize("name", NUMBERS)
-def test_the_tracker_finds_the_best_in_the_direction_of_the_number(name):
+def test_tracker_uses_the_direction_of_the_number(name):
     tracker = MetricTracker(numbers()[name])
     for seed, points in enumerate((5, 400, 40)):  # the second sees most
         tracker.increment()
@@ -64,7 +64,7 @@ def test_the_tracker_finds_the_best_in_the_direction_of_the_number(name):
     assert tracker.maximize == name.endswith(("far", "near"))
 
 
-def test_in_a_collection_every_number_has_its_direction_and_each_step_is_measured_once(monkeypatch):
+def test_collections_measure_each_frame_once(monkeypatch):
     searched = []
     monkeypatch.setattr(sums, "nearest", lambda *a, **o: (searched.append(1), nearest(*a, **o))[1])
     tracker = MetricTracker(MetricCollection(numbers()))
@@ -84,7 +84,7 @@ def test_in_a_collection_every_number_has_its_direction_and_each_step_is_measure
     assert best == {name: scalar(truths[1], name) for name in NUMBERS}
 
 
-def test_a_number_that_is_unknown_is_nan_and_the_best_of_nothing():
+def test_unknown_numbers_are_nan_and_never_best():
     tracker = MetricTracker(CoverageNumberMetric("radius_m", NEAR, "low", GRID))
     for reference in (torch.empty(0, 3), torch.tensor([[1.0, 0.0, 0.0]])):
         tracker.increment()

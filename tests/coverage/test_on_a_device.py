@@ -137,7 +137,7 @@ def test_a_gpu_adds_up_what_the_cpu_does():
         torch.testing.assert_close(found.layers[key].values.cpu(), layer.values, rtol=1e-6, atol=0, equal_nan=True)
 
 
-def test_what_was_seen_of_boxes_stays_on_the_device(monkeypatch):
+def test_box_visibility_stays_on_the_device(monkeypatch):
     monkeypatch.setattr(backend_choice, "_can_search", lambda *_: False)
     boxes = Boxes.from_rows(
         torch.tensor([[5.0, 5, 5, 8, 8, 8, 0.3], [15.0, 15, 15, 8, 8, 8, 0], [99.0, 0, 0, 1, 1, 1, 0]])

@@ -24,7 +24,7 @@ def measured(heights, **options):
 
 @pytest.mark.filterwarnings("ignore:reference. .* points lie outside the grid or in no height band:UserWarning")
 @pytest.mark.parametrize("has_area_weights", [False, True])
-def test_each_of_several_overlapping_bands_is_what_it_is_alone(has_area_weights):
+def test_overlapping_bands_do_not_affect_each_other(has_area_weights):
     together = measured(BANDS, has_area_weights=has_area_weights)
     for number, (name, band) in enumerate(BANDS.items()):
         alone = measured({name: band}, has_area_weights=has_area_weights)
@@ -43,7 +43,7 @@ def test_a_point_in_several_bands_is_counted_once():
     assert together.point_counts.sum() > together.counts["inside_points"] == widest.point_counts.sum()
 
 
-def test_bins_are_the_cells_of_each_band():
+def test_assigned_cells_are_the_cells_of_each_band():
     points = torch.randn(500, 3, generator=torch.Generator().manual_seed(1))
     bins = grid_of(BANDS).assign_cells(points)
     found = set(zip(bins.point_indices[bins.point_positions].tolist(), bins.cell_indices.tolist(), strict=True))
@@ -71,6 +71,6 @@ def test_points_by_column_are_those_of_the_bins(heights, dtype, monkeypatch):
     assert torch.equal(grid.count_points_by_column(points[:0]), torch.zeros(4, 8, dtype=torch.float64))
 
 
-def test_where_bands_overlap_a_point_has_no_single_cell():
+def test_find_cells_refuses_overlapping_bands():
     with pytest.raises(ValueError, match="the height bands overlap, so that a point may be in several cells: use"):
         grid_of(BANDS).find_cells(torch.zeros(1, 3))

@@ -31,7 +31,7 @@ def measured(*, weighed=False, steps=(0, 1), radius=1.0, more=0, num_blocks=8):
         ({"num_blocks": 1}, "different reference points"),
     ],
 )
-def test_only_what_was_measured_at_the_same_points_by_the_same_measure_is_compared(other, message):
+def test_only_paired_results_can_be_compared(other, message):
     check_paired({"a": measured(), "b": measured(radius=2.0), "c": measured(radius=0.5)})
     for pair in ((measured(), measured(**other)), (measured(**other), measured())):
         with pytest.raises(ValueError, match=rf"'a' and 'b' cannot be compared: .*{message}"):
@@ -42,7 +42,7 @@ def test_only_what_was_measured_at_the_same_points_by_the_same_measure_is_compar
 
 @pytest.mark.parametrize("shift", [0.0, 0.05, 0.1, 0.3])
 @pytest.mark.parametrize("seed", range(4))
-def test_significant_is_what_a_paired_t_test_calls_so(shift, seed):
+def test_significance_equals_a_paired_t_test(shift, seed):
     """One step a block and one cell: radii whose differences are `shift` and noise."""
     random = np.random.default_rng(seed)
     shared = 1 + random.random(16)

@@ -30,7 +30,7 @@ def drawn(axes):
     return axes.collections[0]
 
 
-def test_the_map_holds_the_layer_in_its_place_and_the_vehicle_is_at_the_origin():
+def test_maps_show_the_layer_and_the_vehicle():
     sensor = torch.tensor([[5.5, -0.5, 0.5]])
     metric = metric_over(sensor, sensor + torch.tensor([[0.0, 0.0, 0.0], [2.0, 1.0, 0.0]]), max_radius_m=9.0)
     _, axes = metric.plot(band="high", quantity_key="radius_m")
@@ -52,12 +52,12 @@ def test_the_map_holds_the_layer_in_its_place_and_the_vehicle_is_at_the_origin()
         ({"has_area_weights": True}, "detection within 0.4 m, by area, low, 1 frames (gray: unobserved)"),
     ],
 )
-def test_detection_of_the_first_band_unless_something_else_is_asked_for(options, title):
+def test_maps_show_the_first_detection_by_default(options, title):
     _, axes = metric_over(AHEAD, AHEAD, **options).plot()
     assert axes.get_title() == title
 
 
-def test_dark_is_blind_even_where_the_radius_is_infinite_and_grey_is_unknown():
+def test_blind_cells_are_dark_and_unobserved_gray():
     metric = metric_over(torch.empty(0, 3), AHEAD)
     darkest = colormaps["viridis"](0.0)
     for layer in ("radius_m", "detection_0.4m"):
@@ -67,7 +67,7 @@ def test_dark_is_blind_even_where_the_radius_is_infinite_and_grey_is_unknown():
         assert drawn(axes).get_facecolors()[1][3] == 0.0
 
 
-def test_layers_and_bands_that_there_are_not_are_refused():
+def test_unknown_layers_and_bands_are_refused():
     metric = metric_over(AHEAD, AHEAD)
     with pytest.raises(ValueError, match=r"layer: one of radius_m, detection_0.4m is needed; got 'detection'"):
         metric.plot(quantity_key="detection")

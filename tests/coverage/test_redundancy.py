@@ -47,7 +47,7 @@ def test_with_all_sensors_it_is_the_rig(has_area_weights):
 
 @pytest.mark.parametrize("empty", [(), ("left",)])
 @pytest.mark.parametrize("has_area_weights", [True, False])
-def test_without_a_sensor_it_is_the_rig_of_the_others(has_area_weights, empty):
+def test_failure_numbers_equal_the_rig_without_the_sensor(has_area_weights, empty):
     whole = measured(steps(empty=empty), has_area_weights=has_area_weights)
     alone = measured(steps(empty=empty), by_sensor=False, has_area_weights=has_area_weights)
     for sensor in SENSORS:
@@ -95,7 +95,7 @@ def test_how_many_sensors_see_a_point_is_counted():
         assert seen_by["sensors_0.8m"].error > 0
 
 
-def test_a_twin_makes_a_sensor_dispensable_and_the_only_one_is_indispensable():
+def test_duplicate_sensors_are_redundant_and_single_ones_critical():
     def twins():
         for clouds, reference, weights in steps():
             yield {"roof": clouds["roof"], "left": clouds["roof"], "rear": torch.empty(0, 3)}, reference, weights
@@ -122,7 +122,7 @@ def test_a_file_keeps_it(tmp_path, has_area_weights):
     assert loaded.redundancy.layers.keys() == whole.redundancy.layers.keys()
 
 
-def test_a_region_that_the_metric_was_not_told_of_has_no_redundancy_by_area():
+def test_unsummed_regions_have_no_redundancy_by_area():
     other = Region("other", (0.0, 2.0), (-1.0, 1.0))
     assert measured(steps(2), has_area_weights=True).summary([other])[0].redundancy is None
     assert measured(steps(2)).summary([other])[0].redundancy is not None
@@ -140,6 +140,6 @@ def test_other_clouds_are_refused(sensor, message):
         CoverageMetric(GRID, sensor_names=SENSORS).update(sensor, torch.zeros(1, 3))
 
 
-def test_clouds_by_name_need_a_metric_that_knows_the_names():
+def test_named_clouds_need_a_metric_with_sensor_names():
     with pytest.raises(TypeError, match="got clouds by name, for which the metric needs sensor_names="):
         CoverageMetric(GRID).update({"roof": torch.zeros(1, 3)}, torch.zeros(1, 3))

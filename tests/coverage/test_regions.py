@@ -19,7 +19,7 @@ def test_the_papers_regions():
     assert forward_regions(()) == ()
 
 
-def test_a_cell_belongs_to_a_region_if_its_centre_does():
+def test_cells_belong_to_the_region_of_their_center():
     # Centres along x: ..., 0.25, 0.75, 1.25, ...; along y: -1.75, ..., 1.75.
     mask = Region("r", x_m=(0.25, 1.25), y_m=(-0.3, 0.25)).mask_cells(GRID)
     assert mask.shape == (8, 16)
@@ -29,11 +29,11 @@ def test_a_cell_belongs_to_a_region_if_its_centre_does():
     assert inside == [(-0.25, 0.25), (-0.25, 0.75)]  # half-open: 1.25 and y = 0.25 are out, 0.25 is in
 
 
-def test_a_region_as_large_as_the_grid_is_the_grid():
+def test_regions_of_grid_size_contain_all_cells():
     assert Region("all", x_m=GRID.x_m, y_m=GRID.y_m).mask_cells(GRID).all()
 
 
-def test_a_region_smaller_than_a_cell_may_hold_no_centre():
+def test_small_regions_may_contain_no_cell_center():
     assert not Region("gap", x_m=(0.3, 0.7), y_m=(0.0, 1.0)).mask_cells(GRID).any()
 
 
@@ -76,7 +76,7 @@ def test_a_forward_region_of_no_range_is_refused():
         forward_regions((-1.0,))
 
 
-def test_regions_without_a_cell_are_found_before_a_run():
+def test_regions_without_cells_are_refused_early():
     check_regions([Region("all", x_m=GRID.x_m, y_m=GRID.y_m)], GRID)
     with pytest.raises(ValueError, match="region 'gap' holds no cell center; use smaller cells than"):
         check_regions([Region("gap", x_m=(0.3, 0.7), y_m=(0.0, 1.0))], GRID)
@@ -85,7 +85,7 @@ def test_regions_without_a_cell_are_found_before_a_run():
 @pytest.mark.parametrize(
     ("x", "y"), [((-4.0, 4.0), (-2.0, 2.0)), ((0.25, 1.25), (-0.3, 0.25)), ((-1.1, 0.6), (0.75, 2.0))]
 )
-def test_a_rectangle_given_by_its_corners_is_the_rectangle(x, y):
+def test_rectangles_as_polygons_equal_rectangles(x, y):
     # 0.25, -0.25 and so on are centres of cells: on an edge.
     corners = [(x[0], y[0]), (x[1], y[0]), (x[1], y[1]), (x[0], y[1])]
     for order in (corners, corners[::-1], [*corners, corners[0]]):
@@ -94,7 +94,7 @@ def test_a_rectangle_given_by_its_corners_is_the_rectangle(x, y):
         assert torch.equal(polygon.mask_cells(GRID), Region("r", x, y).mask_cells(GRID))
 
 
-def test_polygons_that_share_an_edge_share_no_cell_and_leave_none_out():
+def test_polygons_with_a_common_edge_partition_cells():
     # The edge goes through centres.
     left = Region.from_corners("left", [(-4.0, -2.0), (0.25, -2.0), (2.25, 2.0), (-4.0, 2.0)])
     right = Region.from_corners("right", [(0.25, -2.0), (4.0, -2.0), (4.0, 2.0), (2.25, 2.0)])
@@ -125,7 +125,7 @@ def test_a_name_is_given_once():
         check_regions([Region("r", (0.0, 1.0), (0.0, 1.0)), Region("r", (0.0, 2.0), (0.0, 1.0))], GRID)
 
 
-def test_points_belong_to_one_of_two_polygons_that_share_an_edge():
+def test_polygons_with_a_common_edge_partition_points():
     # Corners, points of the edge to the last bit, and some around it.
     left = Region.from_corners("left", [(-4.0, -2.0), (0.3, -2.0), (2.1, 2.0), (-4.0, 2.0)])
     right = Region.from_corners("right", [(0.3, -2.0), (4.0, -2.0), (4.0, 2.0), (2.1, 2.0)])

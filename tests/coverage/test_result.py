@@ -47,7 +47,7 @@ def a_coverage(seed=0, thresholds_m=(0.4, 0.8), grid=GRID, frames=None):
 
 
 @pytest.mark.parametrize("region", [Region("near", (0.0, 2.0), (-1.0, 1.0)), Region("rear", (-1.0, 0.25), (0.0, 5.0))])
-def test_a_regions_number_is_the_unweighted_mean_over_its_known_cells(region):
+def test_region_numbers_are_means_over_observed_cells(region):
     result = a_coverage()
     rows = result.summary([region])
     assert [(row.region, row.band) for row in rows] == [(region.name, "ground"), (region.name, "obstacle")]
@@ -68,14 +68,14 @@ def test_a_regions_number_is_the_unweighted_mean_over_its_known_cells(region):
             assert number.value == pytest.approx(np.mean([result.detection[(at, band, *cell)] for cell in known]))
 
 
-def test_a_region_of_which_nothing_is_known_is_unknown():
+def test_regions_without_observed_cells_are_unknown():
     result = a_coverage(frames=torch.zeros(GRID.shape, dtype=torch.int64))
     row = result.summary([Region("r", (0.0, 2.0), (-1.0, 1.0))])[0]
     assert (row.observed_cells, row.observed_share) == (0, 0.0)
     assert all(math.isnan(number.value) for number in row.numbers.values())
 
 
-def test_a_cell_that_is_blind_without_end_makes_its_region_so():
+def test_infinite_cells_make_their_region_infinite():
     result = a_coverage()
     result.sparse_layers["radius_m"].values[0] = math.inf
     assert result.summary([Region("all", GRID.x_m, GRID.y_m)])[0].numbers["radius_m"].value == math.inf
@@ -92,12 +92,12 @@ def test_a_cell_that_is_blind_without_end_makes_its_region_so():
         ((1.0, 21.0), (-5.0, 5.0), []),
     ],
 )
-def test_the_regions_of_the_paper_are_given_where_the_grid_holds_them(x, y, names):
+def test_default_regions_fit_into_the_grid(x, y, names):
     rows = a_coverage(grid=BevGrid(x_m=x, y_m=y, cell_m=1.0)).summary()
     assert [row.region for row in rows if row.band == "ground"] == names
 
 
-def test_a_region_the_grid_cannot_speak_of_is_refused():
+def test_regions_beyond_the_grid_are_refused():
     with pytest.raises(ValueError, match="region 'far' spans x = 0 to 30 m, beyond the grid's -1 to 20 m"):
         a_coverage().summary([Region("far", (0.0, 30.0), (-1.0, 1.0))])
     with pytest.raises(ValueError, match=r"region 'slit' holds no cell center; use smaller cells than 0\.5 m"):
@@ -121,7 +121,7 @@ def test_scalars_are_the_summary_laid_flat():
 
 
 @pytest.mark.parametrize(("blocks", "errors"), [(1, []), (8, ["radius_m_error", "detection_0.4m_error"])])
-def test_a_table_has_the_scalars_and_errors_where_there_are_blocks(blocks, errors):
+def test_dataframes_have_scalars_and_errors(blocks, errors):
     random = torch.Generator().manual_seed(7)
     metric = CoverageMetric(
         GRID, num_blocks=blocks, regions=[Region("a", GRID.x_m, GRID.y_m), Region("b", (0, 5), (-5, 5))]
@@ -138,7 +138,7 @@ def test_a_table_has_the_scalars_and_errors_where_there_are_blocks(blocks, error
     ]
 
 
-def test_without_a_block_of_one_step_a_pooled_mean_is_that_of_the_others():
+def test_pooled_means_without_a_block_use_other_frames():
     grid = BevGrid(x_m=(0.0, 1.0), y_m=(0.0, 1.0), cell_m=1.0, heights={"all": (-1.0, 1.0)})
     region, radii = Region("one", grid.x_m, grid.y_m), [3.0, 1.0, 4.0, 1.5, 9.0, 2.0, 6.0, 5.0]
     metric = CoverageMetric(grid, aggregations=[PooledMean()], regions=[region], num_blocks=8)
@@ -157,7 +157,7 @@ def test_what_was_not_aggregated_has_no_numbers():
     assert (found.quantities, len(found.value)) == ((), 0)
 
 
-def test_the_share_of_known_cells_is_in_the_repr():
+def test_repr_shows_the_observed_share():
     grid = BevGrid(x_m=(0.0, 1.0), y_m=(0.0, 1.0), cell_m=0.5, heights={"all": (0.0, 1.0)})
     result = a_coverage(grid=grid, frames=torch.tensor([[[1, 0], [0, 0]]]))
     assert repr(result) == "Coverage((1, 2, 2) cells, 3 frames, 25.0% of the cells observed)"
@@ -202,7 +202,7 @@ def test_a_file_gives_back_what_was_saved(tmp_path, options, as_text):
     assert_same(Coverage.load(str(path) if as_text else path), result)
 
 
-def test_a_loaded_result_has_its_errors_and_can_be_compared(tmp_path):
+def test_loaded_results_keep_errors_and_comparisons(tmp_path):
     """To the last bit: what is written is the sums in blocks, not what was made of them."""
     random = torch.Generator().manual_seed(3)
     grid = BevGrid(x_m=(0.0, 4.0), y_m=(-2.0, 2.0), cell_m=1.0, heights={"all": (-1.0, 1.0)})
@@ -239,7 +239,7 @@ def test_a_result_survives_pickling():
     assert_same(pickle.loads(pickle.dumps(a_coverage())), a_coverage())
 
 
-def test_a_file_that_is_not_there_is_said_to_be_missing(tmp_path):
+def test_missing_files_are_reported(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"missing\.npz: no such file; a saved coverage is needed"):
         Coverage.load(tmp_path / "missing.npz")
     with pytest.raises(IsADirectoryError, match="a folder; a saved coverage is one file"):
@@ -346,7 +346,7 @@ def test_blocks_that_do_not_fit_are_refused(saved_in_blocks, change, message):
         Coverage.load(saved_in_blocks)
 
 
-def test_blocks_in_which_nothing_is_listed_count_as_memory(saved_in_blocks, monkeypatch):
+def test_empty_blocks_count_as_memory(saved_in_blocks, monkeypatch):
     """A million blocks are some kB in a file, and errors are made of all known cells in all blocks."""
     many = np.zeros(1_000_000, np.int64)
     rewrite(
@@ -375,7 +375,7 @@ def test_another_format_is_refused_by_its_number(saved, number, then):
         Coverage.load(saved)
 
 
-def test_torch_loads_plain_objects_without_running_what_a_file_says():
+def test_torch_loads_results_with_weights_only():
     """As Lightning does with the hyperparameters of a checkpoint."""
     grid, region = BevGrid(x_m=(0.0, 1.0), y_m=(0.0, 1.0)), Region("a", x_m=(0.0, 1.0), y_m=(0.0, 1.0))
     options = {

@@ -31,7 +31,7 @@ def clouds(seed: int, points: int = 300) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 @pytest.mark.parametrize("cell", [0.1, 0.001])
-def test_the_state_is_a_few_numbers_for_each_cell_that_a_step_has_touched(cell):
+def test_state_size_depends_on_touched_cells_only(cell):
     grid = BevGrid(x_m=(0.0, 1.0), y_m=(0.0, 1.0), cell_m=cell, heights={"all": (-1.0, 1.0)})
     metric = CoverageMetric(grid, num_blocks=8)
     for at in range(16):
@@ -40,7 +40,7 @@ def test_the_state_is_a_few_numbers_for_each_cell_that_a_step_has_touched(cell):
     assert sum(value.numel() for value in metric.metric_state.values()) < 5 * len(metric.cell_sums) + 250
 
 
-def test_when_rows_are_added_up_changes_no_bit_and_a_state_has_no_order():
+def test_time_of_summation_changes_no_bit():
     """Reading the state adds up what waits: after every step, or once."""
     grid = BevGrid(x_m=(0.0, 1.0), y_m=(0.0, 1.0), cell_m=0.1, heights={"all": (-1.0, 1.0)})
     every = [CoverageMetric(grid, num_blocks=8, aggregations=[Maximum(), PooledMean()]) for _ in range(3)]
@@ -78,7 +78,7 @@ def test_no_step_holds_on_to_its_graph():
 
 @pytest.mark.parametrize("maxima", [0, 2])
 @pytest.mark.parametrize("sizes", [(40, 60), (60, 1), (0, 9), (9, 0), (1, 1)])
-def test_tables_merge_into_what_their_rows_add_up_to(sizes, maxima):
+def test_merged_tables_equal_sums_of_their_rows(sizes, maxima):
     generator = torch.Generator().manual_seed(3)
     keys = [torch.randint(0, 90, (size, 1), generator=generator) for size in sizes]
     values = [torch.randn(size, 4, generator=generator) for size in sizes]

@@ -27,7 +27,7 @@ def estimate(m2, each, steps=None):
     return Estimate.from_ratios(BOTH, torch.from_numpy(m2), torch.from_numpy(each), steps)
 
 
-def test_a_ratio_without_a_block_is_that_of_the_others_and_unused_blocks_do_not_count():
+def test_jackknife_values_of_ratios_ignore_unused_blocks():
     m2, each = sums(9)
     m2[4], each[4] = 0.0, 0.0
     found = estimate(m2, each, [1, 1, 1, 1, 0, 1, 1, 1, 1])
@@ -39,7 +39,7 @@ def test_a_ratio_without_a_block_is_that_of_the_others_and_unused_blocks_do_not_
 
 
 @pytest.mark.parametrize("blocks", [8, 19, 200])
-def test_differences_of_means_over_worlds_are_a_paired_t_test(blocks):
+def test_differences_of_scene_means_equal_paired_t_tests(blocks):
     random = np.random.default_rng(blocks)
     own, other = random.random((2, blocks, 2))
     one, two = (estimate(np.ones(blocks), each) for each in (own, other))
@@ -64,7 +64,7 @@ def test_differences_of_means_over_worlds_are_a_paired_t_test(blocks):
     assert {each.block_count for each in found} == {blocks}
 
 
-def test_blocks_of_which_few_decide_have_errors_and_no_intervals():
+def test_dominated_blocks_give_errors_without_intervals():
     m2, each = sums(12)
     m2[3:] *= 1e-3
     each[3:] *= 1e-3
@@ -79,7 +79,7 @@ def test_blocks_of_which_few_decide_have_errors_and_no_intervals():
     assert estimate(np.ones(8), each[:8]).has_intervals == [True, True]
 
 
-def test_too_few_blocks_show_no_error_and_say_so_of_nothing():
+def test_too_few_blocks_give_neither_errors_nor_tests():
     few = estimate(*sums(7))
     assert few.error.isnan().all()
     assert few.compute_errors(7).isfinite().all()
@@ -111,7 +111,7 @@ def test_without_blocks_there_is_a_value_only():
     assert alone[1:].quantities == (make_detection_quantity(0.4),)
 
 
-def test_after_some_blocks_it_is_what_these_alone_say():
+def test_truncated_estimates_use_the_first_blocks_only():
     m2, each = sums(20)
     some, alone = estimate(m2, each).truncate_blocks(9), estimate(m2[:9], each[:9])
     for one, other in (
@@ -130,7 +130,7 @@ def drawn(blocks, mean, spread, seed, size=2.0):
     return Estimate.from_ratios((RADIUS,), m2, m2[:, None] * ratios, torch.ones(blocks, dtype=torch.int64))
 
 
-def test_a_mixture_has_the_variance_of_its_strata_and_the_freedom_of_welch_and_satterthwaite():
+def test_mixtures_have_welch_satterthwaite_degrees_of_freedom():
     strata = [(0.6, drawn(10, 2.0, 0.5, 1)), (0.3, drawn(25, 4.0, 0.1, 2)), (0.1, drawn(9, 1.0, 2.0, 3))]
     mixed = Estimate.from_strata(strata)
     variances = [(weight * float(one.error)) ** 2 for weight, one in strata]
@@ -160,7 +160,7 @@ def test_differences_of_mixtures_are_paired_in_each_stratum():
 
 
 @pytest.mark.parametrize("blocks", [7, 1])
-def test_no_stratum_makes_up_for_blocks_that_another_lacks(blocks):
+def test_each_stratum_needs_enough_blocks(blocks):
     number = Estimate.from_strata([(0.99, drawn(1000, 2.0, 1.0, 1)), (0.01, drawn(blocks, 2.0, 1.0, 2))]).to_numbers()[
         "radius_m"
     ]
@@ -169,7 +169,7 @@ def test_no_stratum_makes_up_for_blocks_that_another_lacks(blocks):
     assert math.isnan(number.low)
 
 
-def test_a_stratum_of_which_nothing_is_known_or_that_never_varies_leaves_the_mixture_unknown():
+def test_unknown_or_constant_strata_make_mixtures_unknown():
     known = drawn(16, 2.0, 1.0, 1)
     nothing = Estimate.from_values((RADIUS,), torch.tensor([math.nan], dtype=torch.float64))
     assert math.isnan(Estimate.from_strata([(0.5, known), (0.5, nothing)]).to_numbers()["radius_m"].value)

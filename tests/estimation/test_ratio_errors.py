@@ -15,7 +15,7 @@ def blocks_of(cells: int, blocks: int = 16, seed: int = 0):
 
 
 @pytest.mark.parametrize(("unit", "blind"), [("share", lambda ratio: 0.0), ("m", lambda ratio: 5.0 * ratio)])
-def test_it_is_the_spread_of_the_residuals_with_two_blocks_more(unit, blind):
+def test_ratio_errors_use_two_pseudo_blocks(unit, blind):
     m2, sums = (each.numpy() for each in blocks_of(5))
     expected = []
     for cell in range(5):
@@ -28,14 +28,14 @@ def test_it_is_the_spread_of_the_residuals_with_two_blocks_more(unit, blind):
     np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 
-def test_with_many_blocks_it_is_the_jackknife_of_the_same_ratio():
+def test_ratio_errors_approach_the_jackknife():
     m2, sums = blocks_of(50, blocks=2000)
     left_out = (sums.sum(dim=0) - sums) / (m2.sum(dim=0) - m2)
     jackknife = compute_jackknife_error(left_out, sums.sum(dim=0) / m2.sum(dim=0), torch.ones(2000))
     torch.testing.assert_close(estimate_ratio_errors(m2, sums, "share"), jackknife, rtol=0.02, atol=0)
 
 
-def test_the_unit_of_the_square_metres_does_not_matter():
+def test_ratio_errors_are_independent_of_area_units():
     m2, sums = blocks_of(9)
     torch.testing.assert_close(
         estimate_ratio_errors(1e-6 * m2, 1e-6 * sums, "share"),

@@ -49,13 +49,13 @@ def twin(value, error, freedom, quantity, is_difference):
 @pytest.mark.parametrize("quantity", [RADIUS, SHARE, BLIND, FAR, NATS])
 @pytest.mark.parametrize("is_difference", [False, True])
 @pytest.mark.parametrize("freedom", [7, 10, 42, 255])
-def test_ends_are_students_t_on_a_scale_without_bounds(quantity, is_difference, freedom):
+def test_intervals_use_student_t_on_unbounded_scales(quantity, is_difference, freedom):
     for value, error in ((0.3, 0.001), (0.3, 0.05), (0.02, 0.015), (0.98, 0.015)):
         found = compute_interval95(value, error, freedom, quantity, is_difference=is_difference)
         assert found == pytest.approx(twin(value, error, freedom, quantity, is_difference), rel=1e-4)
 
 
-def test_a_difference_is_significant_just_where_its_interval_does_not_hold_0():
+def test_significant_differences_have_intervals_without_0():
     for quantity in (RADIUS, SHARE):
         for value in np.linspace(-0.3, 0.3, 61).tolist():
             low, high = compute_interval95(value, 0.05, 10, quantity, is_difference=True)
@@ -63,14 +63,14 @@ def test_a_difference_is_significant_just_where_its_interval_does_not_hold_0():
 
 
 @pytest.mark.parametrize("quantity", [RADIUS, SHARE])
-def test_what_is_not_known_has_no_interval_and_neither_has_what_all_blocks_agree_on(quantity):
+def test_unknown_or_constant_numbers_have_no_interval(quantity):
     assert all(map(math.isnan, compute_interval95(0.5, math.nan, 3, quantity)))
     assert all(map(math.isnan, compute_interval95(1.0, 0.0, 10, quantity)))
     assert compute_interval95(math.inf, math.nan, 10, quantity)[0] != math.inf
 
 
 @pytest.mark.parametrize("value", [0.0, 1.0, 1 + 2e-16, -1e-17])
-def test_a_share_at_the_rim_with_an_error_may_be_anything(value):
+def test_shares_of_0_or_1_may_be_anything(value):
     assert compute_interval95(value, 1e-3, 10, SHARE) == (0.0, 1.0)
     assert all(map(math.isnan, compute_interval95(0.0, 1e-3, 10, RADIUS)))
 

@@ -80,7 +80,7 @@ def other(tmp_path):
         process.kill()
 
 
-def test_the_second_process_is_refused_until_the_first_is_killed(other, tmp_path):
+def test_locks_hold_until_the_process_is_killed(other, tmp_path):
     with pytest.raises(ValueError, match="another run is writing there"), lock_folder(tmp_path / "out"):
         pass
     with pytest.raises(ValueError, match="another run is writing there"):
@@ -123,7 +123,7 @@ def test_published_files_replace_those_of_the_manifest(tmp_path):
     assert list_files(tmp_path) == {*all_files[0], "summary.json"}
 
 
-def test_a_kill_at_any_file_operation_leaves_old_new_or_incomplete(tmp_path):
+def test_kills_leave_old_new_or_incomplete_results(tmp_path):
     states = write_earlier(tmp_path / "earlier")
     out = shutil.copytree(tmp_path / "earlier", tmp_path / "out")
     count, code = operations_of(lambda: publish(out, NUMBERS, MAPS), copied=(out, tmp_path / "copies"))
@@ -148,7 +148,7 @@ def test_a_kill_at_any_file_operation_leaves_old_new_or_incomplete(tmp_path):
 
 
 @pytest.mark.parametrize("at", [9, 24, 33])
-def test_a_copy_before_an_operation_is_what_a_kill_leaves(tmp_path, at):
+def test_copies_before_operations_equal_states_after_kills(tmp_path, at):
     trees = []
     for name in ("copied", "killed"):
         out = tmp_path / name / "out"
@@ -164,7 +164,7 @@ def test_a_copy_before_an_operation_is_what_a_kill_leaves(tmp_path, at):
     assert trees[0] == trees[1]
 
 
-def test_every_file_of_an_unfinished_result_is_refused_and_others_are_read(tmp_path, monkeypatch):
+def test_files_of_unfinished_results_are_refused(tmp_path, monkeypatch):
     write_earlier(tmp_path)
     replace = os.replace
 
@@ -183,7 +183,7 @@ def test_every_file_of_an_unfinished_result_is_refused_and_others_are_read(tmp_p
 
 
 @pytest.mark.parametrize("name", ["b.txt", "summary.json", "maps/n.png"])
-def test_a_folder_in_the_place_of_a_file_is_refused_before_the_first_is_replaced(tmp_path, name):
+def test_folders_named_like_files_are_refused_first(tmp_path, name):
     publish(tmp_path / "out", {"a.txt": "earlier"}) if name != "summary.json" else None
     (tmp_path / "out" / name).mkdir(parents=True)
     before = list_files(tmp_path)
@@ -194,7 +194,7 @@ def test_a_folder_in_the_place_of_a_file_is_refused_before_the_first_is_replaced
 
 
 @pytest.mark.parametrize("text", ["NEW", "newer"])
-def test_a_file_that_differs_from_the_manifest_is_refused_and_an_edited_document_is_a_warning(tmp_path, text):
+def test_files_that_differ_from_the_manifest_are_refused(tmp_path, text):
     publish(tmp_path, {**NUMBERS, "c.yaml": "new"})
     (tmp_path / "a.txt").write_text(text)
     (tmp_path / "c.yaml").write_text(text)
@@ -223,7 +223,7 @@ FOREIGN = {
 
 
 @pytest.mark.parametrize("text", FOREIGN.values(), ids=FOREIGN)
-def test_another_file_of_that_name_lists_nothing_and_is_replaced(tmp_path, text):
+def test_foreign_manifests_list_nothing_and_are_replaced(tmp_path, text):
     (tmp_path / "a.txt").write_text("mine")
     (tmp_path / "summary.json").write_text("" if text is HUGE else text)
     if text is HUGE:
@@ -267,7 +267,7 @@ def special(path, kind, target):
 
 @pytest.mark.parametrize("name", ["summary.json", "a.txt", "maps", "maps/m.png", ".lock", ".torchcover_left"])
 @pytest.mark.parametrize("kind", ["link", "zero", "hard link", "FIFO"])
-def test_nothing_is_written_or_deleted_through_what_lies_in_the_folder(tmp_path, kind, name):
+def test_links_in_the_folder_are_never_followed(tmp_path, kind, name):
     out, target = tmp_path / "out", tmp_path / "target"
     out.mkdir()
     if name == "maps" and kind == "link":
@@ -287,7 +287,7 @@ def test_nothing_is_written_or_deleted_through_what_lies_in_the_folder(tmp_path,
     assert sum(1 for _ in target.rglob("*")) == 2 * target.is_dir()
 
 
-def test_listed_files_behind_links_are_refused_before_the_run(tmp_path):
+def test_linked_files_are_refused_before_the_run(tmp_path):
     publish(tmp_path / "out", NUMBERS, MAPS)
     (tmp_path / "out" / "maps").rename(tmp_path / "moved")
     (tmp_path / "out" / "maps").symlink_to(tmp_path / "moved")
@@ -297,7 +297,7 @@ def test_listed_files_behind_links_are_refused_before_the_run(tmp_path):
 
 
 @pytest.mark.parametrize("path", ["link", "link/new", "link/new/deep", "link/../out"])
-def test_nothing_is_written_to_a_path_through_a_link(tmp_path, monkeypatch, path):
+def test_paths_through_links_are_never_written(tmp_path, monkeypatch, path):
     (tmp_path / "target").mkdir()
     (tmp_path / "link").symlink_to(tmp_path / "target")
     monkeypatch.chdir(tmp_path)
@@ -327,7 +327,7 @@ def test_temporary_files_cannot_be_guessed_and_are_removed(tmp_path):
 
 
 @pytest.mark.parametrize("kind", ["link", "zero", "FIFO"])
-def test_a_manifest_that_is_no_file_does_not_stop_readers(tmp_path, kind):
+def test_special_files_as_manifests_do_not_block_readers(tmp_path, kind):
     (tmp_path / "a.txt").write_text("mine")
     (tmp_path / "other.json").write_text(json.dumps({WRITING: True, "files": {"a.txt": {"bytes": 1}}}))
     special(tmp_path / "summary.json", kind, tmp_path / "other.json")
@@ -351,7 +351,7 @@ def limited(act):
         return pipe.read().decode()
 
 
-def test_without_room_the_file_is_named_and_the_earlier_result_stays(tmp_path):
+def test_full_disks_keep_the_earlier_result(tmp_path):
     earlier, *_ = write_earlier(tmp_path)
     error = limited(lambda: publish(tmp_path, {"a.txt": "new", "maps/m.png": "x" * 3000}))
     assert error == f"[Errno 27] File too large: '{tmp_path}/maps/m.png'"
@@ -372,7 +372,7 @@ def test_an_error_of_a_library_names_the_file(tmp_path):
     assert list_files(tmp_path) == set()
 
 
-def test_files_are_on_the_disk_before_the_first_is_replaced(tmp_path, monkeypatch):
+def test_files_are_synced_before_any_is_replaced(tmp_path, monkeypatch):
     synced, seen, fsync, replace = set(), [], os.fsync, os.replace
     monkeypatch.setattr(os, "fsync", lambda number: (synced.add(os.fstat(number).st_ino), fsync(number)))
 

@@ -44,7 +44,7 @@ def reading(tmp_path, error):
         (ValueError("x" * 10_000), "x{500}$"),
     ],
 )
-def test_whatever_goes_wrong_is_one_error_that_names_the_file_in_one_line(tmp_path, error, message):
+def test_all_errors_become_one_line_with_the_file(tmp_path, error, message):
     path, read = reading(tmp_path, error)
     with pytest.raises(BadFileError, match=f"^{re.escape(str(path))}: {message}") as caught:
         read(str(path))
@@ -53,7 +53,7 @@ def test_whatever_goes_wrong_is_one_error_that_names_the_file_in_one_line(tmp_pa
 
 
 @pytest.mark.parametrize("error", [BadFileError("other.dat: bad"), ImportError("package"), KeyboardInterrupt()])
-def test_what_has_its_name_or_is_no_matter_of_the_file_passes(tmp_path, error):
+def test_errors_unrelated_to_the_file_pass(tmp_path, error):
     path, read = reading(tmp_path, error)
     with pytest.raises(type(error)) as caught:
         read(path)
@@ -73,7 +73,7 @@ def test_what_is_no_file_is_not_opened(tmp_path):
         read("/dev/null")
 
 
-def test_the_memory_of_a_file_has_a_bound_that_can_be_raised(monkeypatch):
+def test_memory_limit_of_a_file_can_be_raised(monkeypatch):
     check_memory(2 * 10**9)
     for needed in (2 * 10**9 + 1, 10**400):
         with pytest.raises(
@@ -106,7 +106,7 @@ def test_text_that_is_parsed_slowly_is_short(tmp_path):
         read_short_text(path)
 
 
-def test_a_table_of_many_columns_is_refused_at_once(tmp_path):
+def test_tables_with_many_columns_are_refused_quickly(tmp_path):
     (tmp_path / "a.csv").write_text("t," * 200_000 + "x\n1\n")
     start_s = time.process_time()
     with pytest.raises(BadFileError, match="there twice: t"):

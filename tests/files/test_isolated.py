@@ -30,7 +30,7 @@ def test_what_is_read_comes_as_it_was(path):
     read["numbers"][0] = 1.0  # it is ours
 
 
-def test_a_library_that_prints_does_not_answer_and_the_process_stays(path):
+def test_output_of_libraries_does_not_disturb_answers(path):
     (first, torch), (second, _) = (apart_readers.loud(path)["process"] for _ in range(2))
     assert first == second != os.getpid()
     assert not torch
@@ -45,7 +45,7 @@ def test_errors_are_raised_here(path, kind, error, words):
         apart_readers.wrong(path, kind)
 
 
-def test_a_crash_is_a_bad_file_and_the_next_one_is_read(path):
+def test_crashes_are_bad_files_and_reading_continues(path):
     door = guard_reader("a thing")(apart_readers.crashing)
     for _ in range(2):
         with pytest.raises(BadFileError, match=r"file\.x: the library that reads it crashed; the file is damaged"):
@@ -70,7 +70,7 @@ def test_memory_is_what_files_may_take(path, monkeypatch):
     assert path.with_suffix(".new").stat().st_size == 0
 
 
-def test_what_libraries_keep_of_one_file_does_not_add_to_the_next(path):
+def test_memory_kept_by_libraries_does_not_accumulate(path):
     (first, process), (second, other) = (apart_readers.keeping(path, 1.1)["kept"] for _ in range(2))
     assert (first, second) == (1, 1)
     assert process == other  # which has begun anew
@@ -97,7 +97,7 @@ def test_threads_and_forks_read_too(path):
     assert apart_readers.loud(path)["process"][0] == here
 
 
-def test_parts_of_a_mesh_are_looked_at_as_the_mesh_is(tmp_path):
+def test_parts_of_meshes_are_checked_as_meshes(tmp_path):
     corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4")
     (tmp_path / "good.bin").write_bytes(corners.tobytes())
     os.mkfifo(tmp_path / "pipe.bin")
@@ -127,5 +127,5 @@ def test_parts_of_a_mesh_are_looked_at_as_the_mesh_is(tmp_path):
 
 
 @pytest.mark.parametrize("module", ["cameras.isolated_images", "recordings.isolated_readers", "simulation.mesh_files"])
-def test_modules_that_read_in_the_isolated_process_do_not_load_torch(module):
+def test_isolated_readers_do_not_load_torch(module):
     run([sys.executable, "-c", f"import sys, torchcover.{module}; sys.exit('torch' in sys.modules)"], check=True)

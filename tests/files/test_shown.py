@@ -34,7 +34,7 @@ def test_numbers_stay_numbers():
     assert cells == ["-1.5", "3", "-0.25", "+1e-9", "-inf", "", "", "roof", "front left", "ü"]
 
 
-def test_a_name_that_begins_like_a_formula_comes_back(tmp_path):
+def test_names_like_formulas_survive_a_round_trip(tmp_path):
     names = ["=1+1", "-x", "'plain'", "'=quoted", "car"]
     path = tmp_path / "names.csv"
     path.write_text(format_csv([["name"], *([name] for name in names)]), encoding="utf-8")

@@ -57,7 +57,7 @@ def test_anchors_and_opencvs_matrices_are_read():
         ("? [a]\n: 1", "unhashable key"),
     ],
 )
-def test_what_is_a_trap_is_refused_at_once_with_its_line(text, message):
+def test_malicious_yaml_is_refused_with_its_line(text, message):
     start = time.perf_counter()
     with pytest.raises(ValueError, match=f"not a YAML file.*{message}"):
         parse_yaml(text)
@@ -67,6 +67,6 @@ def test_what_is_a_trap_is_refused_at_once_with_its_line(text, message):
 @pytest.mark.parametrize(
     "text", ["1e5", "1:40", "on", "0100", "~", "null", "0o17", "-.inf", "1.", "+1", "", "a: b", "é"]
 )
-def test_what_is_written_is_read_again_as_it_was(text):
+def test_written_yaml_is_read_back_equally(text):
     content = {"name": text, "values": [1, 1.0, 1e-7, 1e22, True, None], text or "empty": {"a": [text]}}
     assert parse_yaml(to_yaml(content)) == content

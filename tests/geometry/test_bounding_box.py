@@ -12,7 +12,7 @@ def test_a_box_around_points_touches_them():
     assert all(type(bound) is float for bound in (*box.lower_m, *box.upper_m))
 
 
-def test_the_outline_goes_counter_clockwise_around_the_box_seen_from_above():
+def test_outlines_are_counterclockwise_in_bird_eye_view():
     outline_m = BoundingBox((-1.0, -2.0, 0.5), (3.0, 4.0, 9.0)).outline_m
     np.testing.assert_array_equal(outline_m, [[-1, -2], [3, -2], [3, 4], [-1, 4]])
     x, y = outline_m.T
@@ -28,12 +28,12 @@ def test_a_box_without_inside_is_refused(lower, upper):
 
 
 @pytest.mark.parametrize(("lower", "upper"), [((0, 0), (1, 1)), ((0, 0, 0), (1, 1)), ((0,) * 4, (1,) * 4)])
-def test_a_box_in_other_than_three_dimensions_is_refused(lower, upper):
+def test_boxes_need_three_dimensions(lower, upper):
     with pytest.raises(ValueError, match="three numbers for each corner"):
         BoundingBox(lower, upper)
 
 
-def test_boxes_that_touch_share_no_space_and_those_that_are_turned_may():
+def test_touching_boxes_do_not_overlap():
     car = BoundingBox((-2.0, -1.0, 0.0), (2.0, 1.0, 1.5))
     there = build_poses(
         np.array([[4.0, 0.0], [3.99, 0.0], [0.0, -2.0], [2.9, 1.9], [2.9, 1.9]]), np.deg2rad([0, 0, 0, 0, 45])

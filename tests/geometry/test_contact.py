@@ -29,7 +29,7 @@ def pairs():
     return a_m, b_m, towards_m / generator.uniform(0.5, 5.0, (count, 1))
 
 
-def test_contact_is_where_the_way_enters_the_hull_of_all_differences(pairs):
+def test_contact_time_equals_the_minkowski_difference(pairs):
     expected_s = np.array([by_differences(*pair) for pair in zip(*pairs, strict=True)])
     found_s = compute_contact_time_s(*pairs)
     assert found_s == pytest.approx(expected_s, abs=1e-9)
@@ -73,7 +73,7 @@ def test_squares_that_touch_slide_or_hardly_move(offset_m, velocity_mps, expecte
     assert found_s == pytest.approx(expected_s, rel=1e-6)
 
 
-def test_contact_far_from_the_origin_is_the_same_to_the_last_bit():
+def test_contact_time_is_exact_at_large_coordinates():
     tilted_m, away_m, velocity_mps = (
         np.array([[5, 1], [-1, 5], [-5, -1], [1, -5]]) / 4,
         [8.0, 4.0],

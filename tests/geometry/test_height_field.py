@@ -22,7 +22,7 @@ def height_of(field, place_m):
     return first + y * (left - first) + x * (across - left)
 
 
-def test_heights_are_those_of_the_triangles_and_beyond_the_border_those_of_the_border():
+def test_heights_are_interpolated_and_clamped_at_the_border():
     field = HeightField(np.array([-3.0, 7.0]), RANDOM.normal(size=(4, 6)), 0.5)
     places_m = RANDOM.uniform([-4.0, 6.0], [0.5, 9.5], (500, 2))
     assert field.compute_heights_m(places_m) == pytest.approx(
@@ -40,7 +40,7 @@ def test_above_adds_what_lies_beneath():
     )
 
 
-def test_a_place_is_shared_by_the_corners_around_it():
+def test_positions_contribute_to_surrounding_corners():
     rows, columns = 5, 6
     cells = RANDOM.uniform(-0.5, 5.5, (60, 2))
     heights_m, weights = RANDOM.normal(size=60), RANDOM.uniform(0.1, 2.0, 60)
@@ -57,7 +57,7 @@ def test_a_place_is_shared_by_the_corners_around_it():
     assert np.array(accumulate_heights(cells, heights_m, rows, columns, weights)) == pytest.approx(expected, abs=1e-12)
 
 
-def test_of_a_slope_with_things_on_it_the_slope_is_found():
+def test_fit_finds_a_slope_despite_objects():
     places_m = RANDOM.uniform(0.0, 20.0, (4000, 2))
     slope_m = 1.0 + places_m @ [0.03, -0.02]
     heights_m = slope_m + RANDOM.normal(0.0, 0.01, 4000)

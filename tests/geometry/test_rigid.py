@@ -62,7 +62,7 @@ def test_transforms_act_on_column_vectors(angles_deg, translation, point):
     np.testing.assert_allclose(transform_points(matrix, np.array([point]))[0], (matrix @ [*point, 1.0])[:3], atol=1e-9)
 
 
-def test_transform_takes_any_type_and_leaves_its_input_alone():
+def test_transform_accepts_any_dtype_and_keeps_its_input():
     points = np.arange(6, dtype=np.float32).reshape(2, 3)
     before = points.copy()
     moved = transform_points(a_transform(), points)
@@ -91,21 +91,21 @@ def test_a_quaternion_of_the_wrong_kind_is_refused(bad):
         convert_quaternion_to_rotation(bad)
 
 
-def test_many_quaternions_are_turned_at_once_as_each_alone():
+def test_quaternions_convert_in_batches_as_individually():
     many = np.random.default_rng(0).normal(size=(2, 3, 4))
     each = [[convert_quaternion_to_rotation(one) for one in row] for row in many]
     np.testing.assert_allclose(convert_quaternion_to_rotation(many), each, rtol=0.0, atol=1e-15)
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32, np.int8])
-def test_a_quaternion_of_fewer_digits_is_turned_with_all_of_a_double(dtype):
+def test_rounded_quaternions_convert_in_double_precision(dtype):
     few = np.array([[3, 1, -2, 5], [0, 1, 1, 1]], dtype=dtype)
     np.testing.assert_array_equal(
         convert_quaternion_to_rotation(few), convert_quaternion_to_rotation(few.astype(np.float64))
     )
 
 
-def test_between_two_rotations_the_way_is_the_shorter_one_whatever_the_signs_of_their_quaternions():
+def test_quaternions_are_interpolated_along_the_shorter_arc():
     random = np.random.default_rng(0)
     first, second = (of / np.linalg.norm(of, axis=1, keepdims=True) for of in random.normal(size=(2, 50, 4)))
     share = random.random((50, 1))
@@ -128,7 +128,7 @@ def test_a_quaternion_of_norm_zero_is_refused():
         convert_quaternion_to_rotation([0.0, 0.0, 0.0, 0.0])
 
 
-def test_check_rigid_repairs_the_rounding_of_a_printed_matrix():
+def test_check_rigid_repairs_printed_matrices():
     printed = a_transform().round(4)
     before = printed.copy()
     checked = check_rigid(printed.tolist(), "lidar.vehicle_T_lidar")

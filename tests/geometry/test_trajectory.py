@@ -9,7 +9,7 @@ from torchcover.geometry import build_transform, convert_euler_to_rotation
 from torchcover.geometry.trajectory import Trajectory, interpolate_poses
 
 
-def test_between_poses_a_body_moves_straight_and_turns_the_shorter_way():
+def test_poses_are_interpolated_linearly_along_shorter_rotations():
     turn = Trajectory.from_arrays(
         [0.0, 2.0, 3.0], [[0, 0, 0], [4, 0, 0], [4, 2, 0]], [[170, 0, 0], [-170, 10, 0], [-170, 10, -6]]
     )
@@ -19,7 +19,7 @@ def test_between_poses_a_body_moves_straight_and_turns_the_shorter_way():
     np.testing.assert_allclose(turn.interpolate(2.0)[:3, 3], [4, 0, 0])
 
 
-def test_outside_its_times_a_body_rests_or_is_not_there():
+def test_bodies_rest_or_vanish_outside_their_times():
     resting = Trajectory.from_arrays([1.0, 2.0], [[0, 0, 0], [1, 0, 0]], [[0, 0, 0]] * 2)
     np.testing.assert_array_equal(resting.interpolate(-5.0), resting.interpolate(1.0))
     np.testing.assert_array_equal(resting.interpolate(9.0), resting.interpolate(2.0))
@@ -60,7 +60,7 @@ def test_poses_of_many_bodies_are_those_of_each():
 
 @pytest.mark.parametrize("pitch_deg", [(85.0, 95.0), (60.5, 80.0), (-90.0, -70.0), (89.0, 90.0)])
 @pytest.mark.parametrize("others_deg", [(0.0, 0.0), (170.0, -30.0)])
-def test_between_steep_poses_a_body_turns_about_one_axis(pitch_deg, others_deg):
+def test_steep_poses_are_interpolated_about_one_axis(pitch_deg, others_deg):
     yaw_deg, roll_deg = others_deg
     ends = np.stack(
         [build_transform(convert_euler_to_rotation(yaw_deg, pitch, roll_deg), np.zeros(3)) for pitch in pitch_deg]
@@ -73,7 +73,7 @@ def test_between_steep_poses_a_body_turns_about_one_axis(pitch_deg, others_deg):
         assert body.interpolate_many(np.array([0.1, share]))[1, :3, :3] == pytest.approx(between, abs=1e-9)
 
 
-def test_the_first_pose_out_of_order_is_named_and_any_later_time_will_do():
+def test_first_pose_out_of_order_is_named():
     """Of steps of any length: what counts is that they are later."""
     for step_s in (1e-9, 0.25, 1e6):
         times_s = step_s * np.arange(4)
@@ -90,7 +90,7 @@ def test_the_first_pose_out_of_order_is_named_and_any_later_time_will_do():
             Trajectory.from_arrays(numbers[:, 0], numbers[:, 1:4], numbers[:, 4:])
 
 
-def test_velocity_is_that_of_the_stretch_and_at_a_pose_the_mean_of_both():
+def test_velocity_at_poses_is_the_mean_of_segments():
     track = Trajectory.from_arrays(
         [1.0, 1.5, 3.5, 4.0], [[0, 0, 0], [1, 0, 0], [1, 6, -2], [1, 6, -2]], np.zeros((4, 3))
     )
@@ -129,7 +129,7 @@ def test_what_ever_changes_its_pose_moves():
     assert [*away, *turning, *coming] == [True] * 10
 
 
-def test_places_at_its_own_times_are_its_places_and_elsewhere_between():
+def test_positions_are_exact_at_the_times_of_poses():
     times_s, places = np.array([0.0, 1.0, 3.0]), np.array([[0.0, 0, 0], [2, 0, 0], [2, 8, 0]])
     for transient in (False, True):
         track = Trajectory(times_s, places, np.zeros((3, 3)), transient)

@@ -72,7 +72,7 @@ def test_a_batch_dict_of_openpcdet(convert):
     np.testing.assert_array_equal(metric.compute().radius, truth_of(zip(sensors, references, strict=True)).radius)
 
 
-def test_points_of_a_lidar_are_moved_into_the_vehicle_frame():
+def test_lidar_points_are_moved_to_the_vehicle_frame():
     points = in_one_array([torch.tensor([[3.0, 1.0, -1.7, 0.5]])])
     batch = convert_batch_dict(
         {"points": points, "reference_points": points, "batch_size": 1}, vehicle_T_lidar=VEHICLE_T_LIDAR
@@ -134,7 +134,7 @@ class PackAsMMDetection3D:
 
 
 @pytest.mark.parametrize("augmented", [False, True])
-def test_packed_with_the_reference_a_sample_keeps_the_default_meta_keys(augmented):
+def test_packed_samples_keep_the_default_meta_keys(augmented):
     config = {"type": "PackWithReference", "pack": {"type": "PackAsMMDetection3D", "keys": ["points"]}}
     pack = TRANSFORMS.build(config)
     results = {"points": cloud(20, 0), "reference_points": cloud(40, 100), "sample_idx": 0, "box_type_3d": "lidar"}
@@ -148,13 +148,13 @@ def test_packed_with_the_reference_a_sample_keeps_the_default_meta_keys(augmente
         pack({"points": cloud(20, 0)})
 
 
-def test_by_area_too_a_process_that_was_dealt_nothing_evaluates():
+def test_processes_without_samples_evaluate_by_area():
     metric = MMEngineCoverage({"grid": GRID, "has_area_weights": True})
     assert all(math.isnan(value) for name, value in metric.evaluate(0).items() if "radius_m" in name)
     assert metric.coverage.average == "area"
 
 
-def test_mmengine_needs_the_square_metres_that_the_metric_wants():
+def test_mmengine_requires_area_weights_of_the_metric():
     frame = Frame({"rig": cloud(9, 0, 3)}, cloud(9, 1, 3), 0, "0")
     without, metric = (
         MMEngineCoverage({"grid": GRID, "has_area_weights": True}, get_frames=lambda batch, _: batch) for _ in range(2)
@@ -192,7 +192,7 @@ def test_mmengine_evaluates_it_as_any_of_its_metrics():
 
 
 @pytest.mark.parametrize(("samples", "processes"), [(5, 1), (5, 2), (7, 4), (1, 3)])
-def test_mmengine_padding_is_left_out_by_the_size_of_the_dataset(monkeypatch, samples, processes):
+def test_mmengine_padding_is_excluded_by_dataset_size(monkeypatch, samples, processes):
     """What MMEngine's `DefaultSampler` gives each process: rounds that start with the first samples again."""
     rounds = math.ceil(samples / processes)
     dealt = (list(range(samples)) * processes)[: rounds * processes]
@@ -261,7 +261,7 @@ for name in ("CoverageCallback", "MMEngineCoverage"):
 """
 
 
-def test_without_a_framework_only_its_own_class_is_missing():
+def test_missing_frameworks_affect_only_their_class():
     done = subprocess.run([sys.executable, "-c", HIDE], capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 0, done.stderr
     callback, evaluator = done.stdout.splitlines()
@@ -271,7 +271,7 @@ def test_without_a_framework_only_its_own_class_is_missing():
     assert "pip install mmengine" in evaluator
 
 
-def test_a_frame_counts_once_whatever_kind_of_number_its_index_is():
+def test_frames_count_once_for_any_integer_type():
     once = FrameDeduplicator()
     frames = [Frame({"rig": torch.zeros(5, 3)}, torch.zeros(9, 3), index=index, name="a") for index in KINDS_OF_THREE]
     assert len(once.select_new(frames)) == 1

@@ -99,7 +99,7 @@ def test_every_frame_is_counted_by_one_process(samples, processes, shuffle, drop
 
 @pytest.mark.parametrize("batch_size", [1, 2, 5])
 @pytest.mark.parametrize(("samples", "processes"), [(1, 1), (1, 4), (3, 8), (4, 4), (5, 4), (7, 2), (8, 3), (10, 4)])
-def test_a_number_of_samples_that_is_told_at_the_end_gives_the_same(samples, processes, batch_size):
+def test_late_numbers_of_samples_give_equal_results(samples, processes, batch_size):
     dataset = Clouds(samples)
     for rank in range(processes):
         loader = DataLoader(
@@ -113,7 +113,7 @@ def test_a_number_of_samples_that_is_told_at_the_end_gives_the_same(samples, pro
         assert [frame.index for frame in counted] == [frame.index for frame in expected]
 
 
-def test_frames_that_have_neither_index_nor_name_are_all_new():
+def test_frames_without_index_and_name_are_new():
     """Batches of OpenPCDet without `frame_id`, of clouds that were sampled to one number of points."""
     points = torch.zeros(64, 5)
     batch = convert_batch_dict({"points": points, "reference_points": points, "batch_size": 1})
@@ -129,7 +129,7 @@ def test_a_batch_sampler_is_looked_through():
     assert find_shard([1, 2, 3]) is None
 
 
-def test_frames_of_two_datasets_with_the_same_index_are_different_ones():
+def test_equal_indices_of_two_datasets_are_different_frames():
     """Datasets side by side count from 0 each; their frames differ in name, or by seed in the numbers of points."""
     first = Frame({"rig": torch.zeros(5, 3)}, torch.zeros(9, 3), index=0, name="a")
     others = [

@@ -11,7 +11,7 @@ from torchcover import blind_spot_radius
 EXAMPLE = Path(__file__).parents[2] / "examples" / "optimize_points.py"
 
 
-def test_a_point_is_pulled_towards_those_it_is_nearest_to_and_others_feel_nothing():
+def test_gradients_pull_points_to_their_reference_points():
     reference = torch.tensor([[1.0, 0.0, 0.0], [0.0, 2.0, 0.0], [9.0, 0.0, 0.0]])
     points = torch.tensor([[0.0, 0.0, 0.0], [9.0, 0.0, 1.0], [0.0, -5.0, 0.0]], requires_grad=True)
     blind_spot_radius(points, reference).sum().backward()
@@ -19,7 +19,7 @@ def test_a_point_is_pulled_towards_those_it_is_nearest_to_and_others_feel_nothin
     assert torch.equal(-points.grad, torch.tensor([[1.0, 1.0, 0.0], [0.0, 0.0, -1.0], [0.0, 0.0, 0.0]]))
 
 
-def test_free_points_end_in_the_median_of_what_they_are_nearest_to():
+def test_optimized_points_converge_to_the_median():
     """On a line, the point of least mean distance to 0, 1 and 5 is 1, not the mean 2."""
     reference = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [5.0, 0.0, 0.0]])
     point = torch.tensor([[4.0, 0.3, 0.0]], requires_grad=True)
@@ -32,7 +32,7 @@ def test_free_points_end_in_the_median_of_what_they_are_nearest_to():
     assert (point.detach() - torch.tensor([[1.0, 0.0, 0.0]])).norm() < 0.05
 
 
-def test_the_example_lowers_the_mean_radius_and_draws_a_picture(tmp_path, monkeypatch, capsys):
+def test_example_lowers_the_mean_radius(tmp_path, monkeypatch, capsys):
     picture = tmp_path / "points.png"
     monkeypatch.setattr(
         sys, "argv", ["optimize_points.py", "--points", "60", "--num-steps", "15", "--out", str(picture)]

@@ -120,7 +120,7 @@ def test_a_validation_logs_the_coverage_of_its_frames(tmp_path):
     assert logged == pytest.approx({**scalars, "coverage/val/num_frames": 5.0}, rel=1e-6)
 
 
-def test_the_numbers_can_be_monitored_and_changed_outside_of_the_inference_mode(tmp_path):
+def test_numbers_can_be_monitored(tmp_path):
     callback = CoverageCallback(make_metric(), regions=REGIONS)
     monitor = ModelCheckpoint(tmp_path / "best", monitor="coverage/val/detection_0.4m/near/ground", mode="max")
     trainer = make_trainer(tmp_path, callback, monitor, enable_checkpointing=True)
@@ -132,7 +132,7 @@ def test_the_numbers_can_be_monitored_and_changed_outside_of_the_inference_mode(
     callback.metric.update(torch.zeros(1, 3), torch.zeros(1, 3))
 
 
-def test_every_epoch_starts_anew_and_those_between_cost_nothing(tmp_path):
+def test_epochs_reset_and_skipped_ones_cost_nothing(tmp_path):
     seen = []
 
     class Spy(CoverageMetric):
@@ -164,7 +164,7 @@ def measured_frames(trainer, metric):
     return seen
 
 
-def test_fixed_frames_are_measured_once_and_logged_at_every_epoch(tmp_path, blank_maps):
+def test_fixed_frames_are_measured_once(tmp_path, blank_maps):
     callback = CoverageCallback(make_metric(), regions=REGIONS, has_fixed_frames=True)
     logger = TensorBoardLogger(tmp_path, name="", version="run")
     trainer = make_trainer(tmp_path, callback, logger=logger, max_epochs=3)
@@ -188,7 +188,7 @@ def test_fixed_frames_are_measured_once_and_logged_at_every_epoch(tmp_path, blan
     assert len(events.Images("coverage/val/radius")) == 1
 
 
-def test_frames_that_were_said_to_be_fixed_and_are_not_are_added(tmp_path, blank_maps):
+def test_new_frames_are_added_to_fixed_frames(tmp_path, blank_maps):
     class Alternating(Validated):
         def val_dataloader(self):
             return loader([RandomFrames(5)[2 * min(self.current_epoch, 1) + k] for k in range(3)])
@@ -224,7 +224,7 @@ def test_frames_of_loaders_within_loaders_are_measured(tmp_path):
     assert_same(callback.coverage, expected([*RandomFrames(3), *RandomFrames(4), *RandomFrames(5)]))
 
 
-def test_no_frame_of_training_loaders_side_by_side_is_taken_for_padding(tmp_path):
+def test_combined_training_loaders_have_no_padding(tmp_path):
     """Seven frames for two processes are four for each, and the positions in a batch of both loaders go up to eight."""
     sides = {
         side: loader(
@@ -241,7 +241,7 @@ def test_no_frame_of_training_loaders_side_by_side_is_taken_for_padding(tmp_path
     assert len(seen) == 8
 
 
-def test_the_sums_are_where_the_model_is_even_if_no_frame_is_new(tmp_path):
+def test_sums_follow_the_device_of_the_model(tmp_path):
     class Moved(CoverageMetric):
         devices = ()
 
@@ -271,7 +271,7 @@ def test_the_weights_of_reference_points_count(tmp_path):
     assert not torch.equal(callback.coverage.radius, expected(frames).radius)
 
 
-def test_every_frame_has_the_square_metres_that_the_metric_wants(tmp_path):
+def test_frames_need_area_weights_of_the_metric(tmp_path):
     callback = CoverageCallback(make_metric(has_area_weights=True))
     without, other = RandomFrames(2)
     weighted = replace(other, reference_weights=torch.ones(40))
@@ -370,7 +370,7 @@ class TakesFigures(TakesImages):
         vars(self).update(attributes)
 
 
-def test_mlflow_gets_a_file_for_every_figure_and_step(tmp_path, blank_maps):
+def test_mlflow_gets_a_file_per_figure_and_step(tmp_path, blank_maps):
     taken = {}
 
     def log_figure(run_id, figure, artifact_file, *, save_kwargs=None):  # that of MlflowClient
@@ -399,7 +399,7 @@ def test_comet_gets_figures_by_name_and_step(tmp_path, blank_maps):
     assert taken == [(f"coverage/val/{name}", Figure, step) for step in (0, 1) for name in ("radius", "blank")]
 
 
-def test_a_logger_that_takes_no_figures_gets_numbers_and_one_warning(tmp_path):
+def test_loggers_without_figures_get_numbers_and_a_warning(tmp_path):
     logger = CSVLogger(tmp_path, name="", version="run")
     trainer = make_trainer(tmp_path, CoverageCallback(make_metric()), logger=logger, max_epochs=3)
     with pytest.warns(UserWarning, match="the numbers alone") as caught:
@@ -419,7 +419,7 @@ def test_without_maps_nothing_is_drawn(tmp_path):
     assert any("coverage/val/num_frames" in values for _, values in logger.scalars)
 
 
-def test_frames_without_reference_points_are_unknown_and_said_so_once(tmp_path):
+def test_frames_without_reference_points_cause_one_warning(tmp_path):
     callback = CoverageCallback(make_metric(), regions=REGIONS)
     trainer = make_trainer(tmp_path, callback, max_epochs=2)
     with pytest.warns(UserWarning, match="is unknown") as caught:
@@ -477,7 +477,7 @@ class SevenAnEpoch:
 
 
 @pytest.mark.parametrize("at", [1, 2, 3, 4, 6, 7])
-def test_a_run_resumed_within_an_epoch_ends_with_the_same_numbers(tmp_path, at):
+def test_resumed_epochs_give_equal_numbers(tmp_path, at):
     """Two epochs of four batches; the checkpoint is taken after one of them."""
     path = tmp_path / "within.ckpt"
 
@@ -501,7 +501,7 @@ def test_a_run_resumed_within_an_epoch_ends_with_the_same_numbers(tmp_path, at):
         assert_same(coverage, expected(list(RandomFrames(14))[7 * epoch : 7 * epoch + 7]))
 
 
-def test_frames_that_a_resumed_loader_gives_again_are_counted_once(tmp_path):
+def test_repeated_frames_of_resumed_loaders_count_once(tmp_path):
     callback = CoverageCallback(make_metric(), stage="train")
     make_trainer(tmp_path, callback, Save(tmp_path / "within.ckpt", 2)).fit(Model(), loader(8))
     with pytest.warns(UserWarning, match="your dataloader is not resumable"):
@@ -510,7 +510,7 @@ def test_frames_that_a_resumed_loader_gives_again_are_counted_once(tmp_path):
     assert_same(callback.coverage, expected(RandomFrames(4)))
 
 
-def test_a_checkpoint_between_epochs_holds_no_sums_and_one_within_an_epoch_does(tmp_path):
+def test_only_checkpoints_within_epochs_contain_sums(tmp_path):
     callback = CoverageCallback(make_metric(), stage="train")
     trainer = make_trainer(tmp_path, callback)
     trainer.fit(Model(), loader(4))
@@ -579,7 +579,7 @@ class LogsOwn(Validated):
 
 
 @pytest.mark.parametrize("precision", ["64-true", "bf16-true", "16-true", "bf16-mixed"])
-def test_a_batch_is_left_as_it_is_in_any_precision(tmp_path, precision):
+def test_batches_are_not_modified_in_any_precision(tmp_path, precision):
     wanted = CoverageMetric(BevGrid(**GRID), max_radius_m=9.0)
     for frame in RandomFrames(5):
         wanted.update(frame.sensor, frame.reference)
@@ -592,7 +592,7 @@ def test_a_batch_is_left_as_it_is_in_any_precision(tmp_path, precision):
     assert float(trainer.callback_metrics["own"]) == pytest.approx((2 * 0 + 2 * 1 + 1 * 2) / 5)
 
 
-def test_a_size_that_cannot_be_told_from_a_batch_is_asked_for(tmp_path):
+def test_unknown_batch_sizes_are_reported(tmp_path):
     class LogsNoSize(Validated):
         def validation_step(self, batch, batch_idx, dataloader_idx=0):
             self.log("own", float(batch_idx))
@@ -601,7 +601,7 @@ def test_a_size_that_cannot_be_told_from_a_batch_is_asked_for(tmp_path):
         make_trainer(tmp_path).fit(LogsNoSize(), loader(3), loader(5))
 
 
-def test_a_test_is_measured_under_a_name_of_its_own(tmp_path):
+def test_test_stage_has_a_separate_tag(tmp_path):
     class Tested(Model):
         def test_step(self, batch, batch_idx):
             pass

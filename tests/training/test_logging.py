@@ -54,7 +54,7 @@ def test_mlflow_gets_files_of_the_run(of_lightning):
     assert isinstance(figure, Figure)
 
 
-def test_weights_and_biases_gets_its_own_table_and_image(monkeypatch):
+def test_wandb_gets_a_table_and_an_image(monkeypatch):
     wandb = types.ModuleType("wandb")
     wandb.__spec__ = importlib.machinery.ModuleSpec("wandb", None)
     wandb.Table, wandb.Image = (lambda dataframe: ("table", len(dataframe))), (lambda pixels: ("image", pixels.shape))

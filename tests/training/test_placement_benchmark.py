@@ -10,7 +10,7 @@ import pytest
 from examples import placement_benchmark as example
 
 
-def test_a_placement_depends_on_seed_and_number_and_keeps_its_rays_and_limits():
+def test_placements_depend_on_seed_and_index_only():
     few, many, other = example.placements(4, 0), example.placements(9, 0), example.placements(4, 1)
     assert {name: many[name] for name in few} == few
     assert few != other
@@ -28,7 +28,7 @@ def test_a_placement_depends_on_seed_and_number_and_keeps_its_rays_and_limits():
             assert max(abs(sensor.mount.pitch_deg), abs(sensor.mount.roll_deg)) <= example.MOST_TILT_DEG
 
 
-def test_half_a_line_is_no_training_and_the_next_one_takes_its_place(tmp_path):
+def test_incomplete_lines_are_overwritten(tmp_path):
     path = tmp_path / "trainings.jsonl"
     assert example.finished(path) == {}
     example.append(path, {"placement": "a", "seed": 0, "ap": 0.5})
@@ -55,9 +55,7 @@ def test_what_is_finished_is_not_trained_again(tmp_path, monkeypatch):
     assert len(done) == 3
 
 
-def test_a_reduced_run_ends_with_a_page_goes_on_with_more_seeds_and_refuses_other_settings(
-    tmp_path, monkeypatch, capsys
-):
+def test_reduced_benchmark_resumes_and_refuses_other_settings(tmp_path, monkeypatch, capsys):
     out = tmp_path / "out"
     arguments = ["placement_benchmark.py", "--reduced", "--metrics", "point_density", "--out", str(out)]
     monkeypatch.setattr(sys, "argv", arguments)

@@ -58,7 +58,7 @@ def test_objects_beyond_the_region_are_not_encoded(example):
     assert example.encode(rows)[4].shape == (8, 1)
 
 
-def test_the_loss_is_nothing_for_a_perfect_answer_and_grows_with_the_error_of_the_boxes(example):
+def test_loss_grows_with_the_error_of_boxes(example):
     rows = cars(10, seed=2)
     heat, boxes = answer_to(example, rows, torch.full((10,), 0.99999))
     assert example.loss_of(heat[None], boxes[None], [rows]) < 1e-4
@@ -67,7 +67,7 @@ def test_the_loss_is_nothing_for_a_perfect_answer_and_grows_with_the_error_of_th
     assert example.loss_of(torch.full((1, 64, 64), -20.0), boxes[None], [rows[:0]]) < 1e-4
 
 
-def test_the_network_takes_points_in_any_order_and_frames_on_their_own(example):
+def test_network_is_invariant_to_point_order(example):
     torch.manual_seed(0)
     detector = example.Detector().eval()
     clouds = [
@@ -106,7 +106,7 @@ def test_average_precision_in_closed_form(example):
     assert math.isnan(average_precision(example, [([9.0], [0.9], [])]))
 
 
-def test_average_precision_of_a_bin_is_over_the_recall_of_its_objects(example):
+def test_average_precision_is_computed_per_range_bin(example):
     metric = RecallByVisibility(visibility_borders=(0.5,), score_thresholds=example.SCORES)
     there = torch.tensor([[x, 0.0, 1.0, 4.0, 2.0, 1.5, 0.0] for x in (9.0, 19.0, 29.0)])
     # Both well visible ones are found, of two detections; the other is not.
@@ -119,7 +119,7 @@ def test_average_precision_of_a_bin_is_over_the_recall_of_its_objects(example):
     assert example.average_precision(counts) == pytest.approx(67 / 101)
 
 
-def test_a_change_is_told_where_seeds_agree_and_only_there(example, capsys, monkeypatch):
+def test_changes_are_reported_where_seeds_agree(example, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "160")
     counts = SimpleNamespace(objects=torch.tensor([[1, 1], [1, 1]]))
     # Of three seeds, in all, below and above a share of 0.5.
@@ -153,7 +153,7 @@ def objects_of(found):
     return np.column_stack([np.arange(100) // 10, x, y, visibility, found(visibility)])
 
 
-def test_agreement_over_drives_has_an_interval_and_is_unknown_if_nothing_was_found(example):
+def test_correlation_over_drives_has_an_interval(example):
     noisy = objects_of(lambda visibility: visibility + np.random.default_rng(4).normal(0, 0.3, 100))
     value, low, high = example.over_drives(noisy, example.agreement, draws=200)
     assert value == pytest.approx(spearmanr(noisy[:, 3], noisy[:, 4]).statistic)
@@ -164,7 +164,7 @@ def test_agreement_over_drives_has_an_interval_and_is_unknown_if_nothing_was_fou
             assert all(math.isnan(number) for number in example.over_drives(objects, statistic, draws=10))
 
 
-def test_agreement_over_cells_is_that_of_means_and_recalls(example):
+def test_correlation_over_cells_compares_means_and_recalls(example):
     # Three cells of 6 cars: visible and found more and more.
     cell, k = np.repeat(np.arange(3), 6), np.tile(np.arange(6), 3)
     found = np.where(k < 2 * cell + 1, 0.9, 0.1)
@@ -206,9 +206,7 @@ def test_labels_are_compared_from_several_seeds(example, tmp_path, monkeypatch, 
     assert "AP, visible cars" in said
 
 
-def test_a_small_run_trains_both_rigs_logs_every_epoch_and_ends_with_table_and_figure(
-    example, tmp_path, monkeypatch, capsys, blank_maps
-):
+def test_small_run_trains_both_rigs_and_logs(example, tmp_path, monkeypatch, capsys, blank_maps):
     monkeypatch.setattr(example, "simulate", random_frames)
     options = {"--train": 8, "--validate": 16, "--epochs": 2, "--out": tmp_path}
     monkeypatch.setattr(sys, "argv", ["train_detector.py", *(str(word) for pair in options.items() for word in pair)])

@@ -47,7 +47,7 @@ def drive(tmp_path_factory):
     return kitti_raw(Straight(steps=10), tmp_path_factory.mktemp("kitti"))
 
 
-def test_the_last_fifth_has_the_reference_and_cars_of_any_data_set_count(example, drive):
+def test_last_fifth_of_a_recording_is_the_validation(example, drive):
     frames = RecordedFrames(drive, reference=AccumulatedReference(0.6))
     rig, trained, validated = example.read(frames)
     assert (rig, len(trained), len(validated)) == ("kitti", 8, 2)
@@ -59,9 +59,7 @@ def test_the_last_fifth_has_the_reference_and_cars_of_any_data_set_count(example
         assert torch.equal(frame.get_cloud(rig), frames[frame.index].get_cloud(rig))
 
 
-def test_a_small_run_on_a_drive_of_kitti_logs_and_ends_with_table_and_figure(
-    example, drive, tmp_path, monkeypatch, capsys, blank_maps
-):
+def test_small_kitti_run_ends_with_table_and_figure(example, drive, tmp_path, monkeypatch, capsys, blank_maps):
     options = ("--window", "0.6", "--epochs", "2", "--out", str(tmp_path))
     monkeypatch.setattr(sys, "argv", ["train_on_recording.py", str(drive), *options])
     monkeypatch.setenv("COLUMNS", "200")
