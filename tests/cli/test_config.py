@@ -9,7 +9,7 @@ from torchcover.cli.app import app
 from torchcover.data import RecordingSettings, open_recording
 from torchcover.evaluation.config import EvaluateConfig, format_defaults, load_config
 from torchcover.files import BadFileError, parse_yaml
-from torchcover.simulation.documents import KINDS, SETTINGS_KIND
+from torchcover.simulation.document_keys import KINDS, SETTINGS_KIND
 
 
 def test_printed_defaults_have_a_comment_for_every_setting(tmp_path):

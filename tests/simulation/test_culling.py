@@ -6,17 +6,14 @@ import pytest
 from torchcover.geometry import BoundingBox, build_transform, convert_euler_to_rotation
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation import PaperReference, Pose, Scenario
-from torchcover.simulation.raycaster import cast_from_vehicle
-from torchcover.simulation.rays import (
+from torchcover.simulation.culling import (
     compute_outlines,
-    compute_unit_directions,
     find_blocks_towards_boxes,
     find_boxes_in_cone,
     find_rays_towards_boxes,
-    rotate,
-    rotate_each,
-    split_into_tiles,
 )
+from torchcover.simulation.raycaster import cast_from_vehicle
+from torchcover.simulation.rays import compute_unit_directions, rotate, rotate_each, split_into_tiles
 from torchcover.simulation.scene import SceneGeometry
 from torchcover.simulation.shapes import Box, Plane
 from torchcover.simulation.world import Actor, Scene

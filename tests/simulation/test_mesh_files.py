@@ -10,8 +10,8 @@ import pytest
 
 from torchcover.files import BadFileError
 from torchcover.simulation import CameraSensor, Pose, Rig, Scenario, SimulatedFrames
-from torchcover.simulation.mesh_files import triangulate
 from torchcover.simulation.shapes import Box, MeshFile
+from torchcover.simulation.triangulation import triangulate
 
 # An L of 5 m² and a dart: for both, a fan from the first corner is wrong.
 L_SHAPE = [(1.5, -0.5), (-0.5, -0.5), (-0.5, 1.5), (-1.5, 1.5), (-1.5, -1.5), (1.5, -1.5)]

@@ -5,12 +5,8 @@ import pytest
 
 from torchcover.simulation import CameraSensor, Lidar, Pose, Radar, Scenario, SensorNoise
 from torchcover.simulation.camera_sensor import Stereo
-from torchcover.simulation.rays import (
-    SearchSpheres,
-    compute_ray_pixel_indices,
-    compute_unit_directions,
-    split_into_tiles,
-)
+from torchcover.simulation.culling import SearchSpheres
+from torchcover.simulation.rays import compute_ray_pixel_indices, compute_unit_directions, split_into_tiles
 from torchcover.simulation.scene import SceneGeometry
 from torchcover.simulation.sensor import ScanTimes
 from torchcover.simulation.sight import MountedSensor

@@ -10,8 +10,9 @@ from embreex.rtcore_scene import EmbreeScene
 
 from torchcover.geometry import build_transform, convert_euler_to_rotation, transform_points
 from torchcover.geometry.trajectory import Trajectory
+from torchcover.simulation.culling import SearchSpheres
 from torchcover.simulation.raycaster import RayCaster
-from torchcover.simulation.rays import SearchSpheres, compute_unit_directions, split_into_tiles
+from torchcover.simulation.rays import compute_unit_directions, split_into_tiles
 from torchcover.simulation.scene import SceneGeometry
 from torchcover.simulation.shapes import Box, Mesh, Plane
 from torchcover.simulation.sweep import compute_parabola_weights

@@ -24,8 +24,8 @@ from torchcover.geometry.arrays import Int64
 from torchcover.recordings.objects import Track
 from torchcover.recordings.recording import Recording
 from torchcover.recordings.vehicle_cloud import transform_to_vehicle
+from torchcover.simulation.culling import SearchSpheres
 from torchcover.simulation.lidar import Lidar
-from torchcover.simulation.rays import SearchSpheres
 from torchcover.simulation.simulator import Simulator
 
 Clouds = Sequence[NDArray[np.floating]]

@@ -213,7 +213,7 @@ def _read_config(path: Path) -> dict[str, Any]:
     try:
         EvaluateConfig.model_validate(content)
     except ValidationError as error:
-        from torchcover.simulation.documents import SETTINGS_KIND, find_other_kind
+        from torchcover.simulation.document_keys import SETTINGS_KIND, find_other_kind
 
         kind = find_other_kind(SETTINGS_KIND, content)
         mistakes = "; ".join(explain_validation_error(error))

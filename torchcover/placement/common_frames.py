@@ -18,7 +18,7 @@ from torchcover.placement.host_vehicle import HostVehicle
 from torchcover.placement.objective import Objective
 from torchcover.placement.queries import Queries
 from torchcover.simulation import Rig, Scenario, SimulatedFrames, Simulator, set_ego
-from torchcover.simulation.rays import SearchSpheres
+from torchcover.simulation.culling import SearchSpheres
 from torchcover.simulation.simulated_frames import build_rig_fields
 
 AnyScenario = Scenario | str | Path

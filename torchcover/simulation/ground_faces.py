@@ -1,7 +1,6 @@
 """Ground faces of meshes: the level faces on which one can drive or walk."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,72 +10,50 @@ from torchcover.simulation.patches import find_face_edges, find_outward_faces, l
 from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.shapes import Mesh
 
-
-@dataclass(frozen=True)
-class GroundFaceParams:
-    """Parameters of the search for ground faces.
-
-    Args:
-        max_slope_deg: Steepest face that counts as level, with a margin for rounding.
-        max_step_m: Largest height difference of connected surfaces: a step of stairs, or a high curb.
-        gap_m: Distance beyond the border of a surface at which its neighbors are searched.
-        probe_shares: Positions along each border edge at which neighbors are searched, as shares of the edge.
-        max_height_m: Largest distance of the ground above or below a position on the ground.
-    """
-
-    max_slope_deg: float = 45.0 + 1e-6
-    max_step_m: float = 0.3
-    gap_m: float = 0.02
-    probe_shares: tuple[float, ...] = (0.1, 0.5, 0.9)
-    max_height_m: float = 1.0
+# Steepest face that counts as level, with a margin for rounding.
+MAX_SLOPE_DEG = 45.0 + 1e-6
 
 
-def find_level_faces(
-    mesh: Mesh, outward_mask: Bools | None = None, params: GroundFaceParams = GroundFaceParams()
-) -> Bools:
+def find_level_faces(mesh: Mesh, outward_mask: Bools | None = None) -> Bools:
     """Find the faces on which one could stand: not too steep, and on the upper side of a closed body.
 
     Args:
         mesh: Mesh with F faces.
         outward_mask: (F,) result of `find_outward_faces`; None to compute it.
-        params: Largest slope.
 
     Returns:
         (F,) True for level faces.
     """
-    is_level, is_downward = _find_faces_towards(mesh, 1.0, params), find_downward_faces(mesh, params)
+    is_level, is_downward = _find_faces_towards(mesh, 1.0), find_downward_faces(mesh)
     if is_downward.any():
         # Faces of open surfaces are visible, and can carry, from both sides.
         is_level |= is_downward & ~(find_outward_faces(mesh) if outward_mask is None else outward_mask)
     return is_level
 
 
-def find_downward_faces(mesh: Mesh, params: GroundFaceParams = GroundFaceParams()) -> Bools:
+def find_downward_faces(mesh: Mesh) -> Bools:
     """Find the faces whose normal points downwards and that are not too steep to stand on.
 
     Args:
         mesh: Mesh with F faces.
-        params: Largest slope.
 
     Returns:
         (F,) True for these faces.
     """
-    return _find_faces_towards(mesh, -1.0, params)
+    return _find_faces_towards(mesh, -1.0)
 
 
-def _find_faces_towards(mesh: Mesh, z_sign: float, params: GroundFaceParams) -> Bools:
+def _find_faces_towards(mesh: Mesh, z_sign: float) -> Bools:
     """Find the (F,) faces whose normals are within the largest slope of up (1) or down (-1)."""
     is_towards = np.empty(len(mesh.faces), dtype=bool)
     for part, (first, second, third) in mesh.iterate_parts():
         normals = np.cross(second - first, third - first, axis=0)
-        min_z = np.cos(np.deg2rad(params.max_slope_deg)) * np.linalg.norm(normals, axis=0)
+        min_z = np.cos(np.deg2rad(MAX_SLOPE_DEG)) * np.linalg.norm(normals, axis=0)
         is_towards[part] = (z_sign * normals[2] >= min_z) & (min_z > 0)
     return is_towards
 
 
-def find_ground_faces(
-    meshes: Sequence[Mesh], positions_m: Float64, params: GroundFaceParams = GroundFaceParams()
-) -> list[Bools]:
+def find_ground_faces(meshes: Sequence[Mesh], positions_m: Float64) -> list[Bools]:
     """Find the level faces below positions, and all level faces that are connected with them.
 
     Two level surfaces are connected if they share an edge, or if one continues where the other ends with a step of at
@@ -85,15 +62,12 @@ def find_ground_faces(
     Args:
         meshes: Meshes in one frame with z up.
         positions_m: (N, 3) positions of the ego vehicle on the ground.
-        params: Distances.
 
     Returns:
         For each mesh (F,) True for ground faces.
     """
     outward_masks = [find_outward_faces(mesh) for mesh in meshes]
-    ground_masks = [
-        find_level_faces(mesh, is_outward, params) for mesh, is_outward in zip(meshes, outward_masks, strict=True)
-    ]
+    ground_masks = [find_level_faces(mesh, is_outward) for mesh, is_outward in zip(meshes, outward_masks, strict=True)]
     if not any(is_level.any() for is_level in ground_masks):
         return ground_masks
     level_corners_m, level_outward = [], []
@@ -111,13 +85,14 @@ def find_ground_faces(
         [Mesh(corners_m[faces].reshape(-1, 3), level_mesh.faces[: len(faces)]) for faces in surface_faces]
     )
     border_edges = np.flatnonzero(np.bincount(edges)[edges] == 1)
-    probes_m = _compute_probes_m(corners_m, border_edges, params)
-    neighbors = _find_surfaces_near(caster, probes_m, params.max_step_m)
-    border_surfaces = surfaces[edge_faces[border_edges]].repeat(len(params.probe_shares))
+    probes_m = _compute_probes_m(corners_m, border_edges)
+    max_step_m = 0.3  # a step of stairs, or a high curb
+    neighbors = _find_surfaces_near(caster, probes_m.reshape(-1, 3), max_step_m)
+    border_surfaces = surfaces[edge_faces[border_edges]].repeat(probes_m.shape[1])
     pairs = np.stack([border_surfaces, neighbors])[:, neighbors >= 0]
     groups = label_connected_faces(np.tile(np.arange(pairs.shape[1]), 2), pairs.ravel(), surfaces.max() + 1)
     is_sheet = np.bincount(surfaces, weights=np.concatenate(level_outward)) == 0
-    ground_surfaces = _find_surfaces_at(caster, positions_m, is_sheet, params)
+    ground_surfaces = _find_surfaces_at(caster, positions_m, is_sheet)
     is_ground = np.isin(groups, groups[ground_surfaces])[surfaces]
     first_face = 0
     for mask in ground_masks:
@@ -127,33 +102,36 @@ def find_ground_faces(
     return ground_masks
 
 
-def _find_surfaces_at(caster: RayCaster, positions_m: Float64, is_sheet: Bools, params: GroundFaceParams) -> Int64:
+def _find_surfaces_at(caster: RayCaster, positions_m: Float64, is_sheet: Bools) -> Int64:
     """Find the surfaces on which positions stand; if none is near, surfaces far below, or else sheets above."""
-    surfaces = _find_surfaces_near(caster, positions_m, params.max_height_m)
+    max_height_m = 1.0  # distance of the ground above or below a position on the ground
+    surfaces = _find_surfaces_near(caster, positions_m, max_height_m)
     if (surfaces >= 0).any():
         return surfaces[surfaces >= 0]
     for z_sign in (-1.0, 1.0):
         limit_m = np.full(len(positions_m), np.inf, dtype=np.float32)
         directions = build_vertical_directions(len(positions_m), z_sign)
-        surfaces = caster.cast_from_each(positions_m.astype(np.float32), directions, limit_m).body_indices
+        hits = caster.cast_from_each(positions_m.astype(np.float32), directions, limit_m)
+        surfaces = hits.body_indices.astype(np.int64)
         surfaces = surfaces[(surfaces >= 0) & ((z_sign < 0) | is_sheet[np.maximum(surfaces, 0)])]
         if len(surfaces):
-            return surfaces.astype(np.int64)
+            return surfaces
     return np.empty(0, dtype=np.int64)
 
 
-def _compute_probes_m(corners_m: Float64, border_edges: Int64, params: GroundFaceParams) -> Float64:
-    """Compute (edges x probes, 3) positions slightly beyond border edges, at the height of the edge."""
+def _compute_probes_m(corners_m: Float64, border_edges: Int64) -> Float64:
+    """Compute (edges, probes, 3) positions slightly beyond border edges, at the height of the edge."""
+    gap_m = 0.02
+    edge_shares = np.array([0.1, 0.5, 0.9])
     face, side = np.divmod(border_edges, 3)
     start_m, end_m, apex_m = (corners_m[face, (side + offset) % 3] for offset in range(3))
     along, outwards = (end_m - start_m)[:, :2], ((start_m + end_m) / 2 - apex_m)[:, :2]
     normal = np.stack([-along[:, 1], along[:, 0]], axis=1)
     normal *= np.sign((normal * outwards).sum(axis=1, keepdims=True))
     normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), np.finfo(np.float64).tiny)
-    shares = np.array(params.probe_shares)
-    probes_m = start_m[:, None] + shares[:, None] * (end_m - start_m)[:, None]
-    probes_m[..., :2] += params.gap_m * normal[:, None]
-    return np.asarray(probes_m.reshape(-1, 3))
+    probes_m = start_m[:, None] + edge_shares[:, None] * (end_m - start_m)[:, None]
+    probes_m[..., :2] += gap_m * normal[:, None]
+    return np.asarray(probes_m)
 
 
 def _find_surfaces_near(caster: RayCaster, positions_m: Float64, max_height_m: float) -> Int64:

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
 
@@ -20,6 +19,8 @@ TOLERANCE_M = 0.05
 ROUNDING_M = 5e-4
 # Margin of height bounds, on either side.
 SLACK_M = 1e-3
+# Ground that reaches less than this share into a cell is outside the cell.
+RELATIVE_ROUNDING = 1e-6
 
 
 class LocalGround:
@@ -98,23 +99,6 @@ class LocalGround:
         return GroundHeightPyramid.from_meshes(self._meshes, self.origin_m)
 
 
-@dataclass(frozen=True)
-class HeightPyramidParams:
-    """Resolution of a `GroundHeightPyramid`.
-
-    Args:
-        max_flat_m: Ground with at most this height difference is one cell.
-        min_cell_m: Smallest cell. Generated streets have their ground in squares of 10 m at multiples of 10 m.
-        max_cells: Largest number of cells, which grow for larger ground.
-        relative_rounding: Ground that reaches less than this share into a cell is outside the cell.
-    """
-
-    max_flat_m: float = 0.3
-    min_cell_m: float = 10.0
-    max_cells: int = 65_536
-    relative_rounding: float = 1e-6
-
-
 class GroundHeightPyramid(NamedTuple):
     """Lowest and highest ground per cell of a grid, and of coarser grids whose cells are twice as large per level.
 
@@ -129,15 +113,12 @@ class GroundHeightPyramid(NamedTuple):
     levels: Sequence[Float32]
 
     @classmethod
-    def from_meshes(
-        cls, meshes: Sequence[Mesh], origin_m: Float64, params: HeightPyramidParams = HeightPyramidParams()
-    ) -> "GroundHeightPyramid":
+    def from_meshes(cls, meshes: Sequence[Mesh], origin_m: Float64) -> "GroundHeightPyramid":
         """Build the pyramid of ground meshes.
 
         Args:
             meshes: Meshes in the local frame.
             origin_m: (3,) origin of the local frame in the world frame; cells are aligned to the world frame.
-            params: Resolution.
         """
         bounds_m = [
             (corners_m.min(axis=(0, 2)), corners_m.max(axis=(0, 2))) for _, corners_m in iterate_mesh_parts(meshes)
@@ -147,18 +128,17 @@ class GroundHeightPyramid(NamedTuple):
         lower_m = np.min([lower for lower, _ in bounds_m], axis=0)
         upper_m = np.max([upper for _, upper in bounds_m], axis=0)
         lowest_m, highest_m = float(lower_m[2]), float(upper_m[2])
-        if highest_m - lowest_m <= params.max_flat_m:
+        max_flat_m = 0.3  # ground with at most this height difference is one cell
+        if highest_m - lowest_m <= max_flat_m:
             single_cell = np.array([lowest_m - SLACK_M, highest_m + SLACK_M], dtype=np.float32)
             return cls(np.zeros(2), math.inf, [single_cell.reshape(2, 1, 1)])
         size_m = (upper_m - lower_m)[:2]
-        cell_m = max(
-            params.min_cell_m,
-            float(np.sqrt(size_m.prod() / params.max_cells)),
-            float(size_m.max()) / params.max_cells,
-        )
+        min_cell_m = 10.0  # generated streets have their ground in squares of 10 m at multiples of 10 m
+        max_cells = 65_536
+        cell_m = max(min_cell_m, float(np.sqrt(size_m.prod() / max_cells)), float(size_m.max()) / max_cells)
         corner_m = np.floor((lower_m[:2] + origin_m[:2]) / cell_m) * cell_m - origin_m[:2]
-        columns, rows = np.floor((upper_m[:2] - corner_m) / cell_m + params.relative_rounding).astype(np.int64) + 1
-        levels = [_rasterize_heights(meshes, corner_m, cell_m, int(columns), int(rows), params.relative_rounding)]
+        columns, rows = np.floor((upper_m[:2] - corner_m) / cell_m + RELATIVE_ROUNDING).astype(np.int64) + 1
+        levels = [_rasterize_heights(meshes, corner_m, cell_m, int(columns), int(rows))]
         while max(levels[-1].shape) > 2:
             levels.append(_merge_cells(levels[-1]))
         return cls(corner_m, cell_m, levels)
@@ -241,17 +221,15 @@ def build_vertical_directions(num_rays: int, z_sign: float) -> Float32:
     return directions
 
 
-def _rasterize_heights(
-    meshes: Sequence[Mesh], corner_m: Float64, cell_m: float, columns: int, rows: int, relative_rounding: float
-) -> Float32:
+def _rasterize_heights(meshes: Sequence[Mesh], corner_m: Float64, cell_m: float, columns: int, rows: int) -> Float32:
     """Rasterize the (2, columns, rows) lowest and highest ground per cell, with a margin on either side."""
     lowest_m = np.full(columns * rows, np.inf)
     highest_m = np.full(columns * rows, -np.inf)
     for _, corners_m in iterate_mesh_parts(meshes):
         lower_m, upper_m = corners_m.min(axis=0), corners_m.max(axis=0)
         # Every cell of the bounding box of a triangle counts, so that no cell is missed.
-        first_cell = np.floor((lower_m[:2] - corner_m[:, None]) / cell_m + relative_rounding).astype(np.int64)
-        last_cell = np.ceil((upper_m[:2] - corner_m[:, None]) / cell_m - relative_rounding).astype(np.int64) - 1
+        first_cell = np.floor((lower_m[:2] - corner_m[:, None]) / cell_m + RELATIVE_ROUNDING).astype(np.int64)
+        last_cell = np.ceil((upper_m[:2] - corner_m[:, None]) / cell_m - RELATIVE_ROUNDING).astype(np.int64) - 1
         last_cell = np.maximum(last_cell, first_cell)
         slopes, offsets_m = _fit_planes(corners_m - np.append(corner_m, 0.0)[None, :, None])
         # Largest difference between the height of a plane within a cell and at the center of the cell.

@@ -10,17 +10,17 @@ import numpy as np
 
 from torchcover.geometry import BoundingBox, invert
 from torchcover.geometry.arrays import Bools, Float32, Float64, Int32, Int64
-from torchcover.simulation.patches import Patches
-from torchcover.simulation.raycaster import HitAttributes, Hits, RayCaster
-from torchcover.simulation.rays import (
+from torchcover.simulation.culling import (
+    RELATIVE_SLACK,
+    SLACK_M,
     BoxOutlines,
-    CullingParams,
-    Tile,
     find_blocks_towards_boxes,
     find_boxes_in_cone,
     find_rays_towards_boxes,
-    rotate_each,
 )
+from torchcover.simulation.patches import Patches
+from torchcover.simulation.raycaster import HitAttributes, Hits, RayCaster
+from torchcover.simulation.rays import Tile, rotate_each
 from torchcover.simulation.shapes import Mesh
 
 
@@ -29,7 +29,6 @@ class BodyGeometry:
 
     Args:
         mesh: Mesh in the frame of the body.
-        params: Margins of the box.
 
     Attributes:
         bounding_box: Box around the mesh.
@@ -38,13 +37,13 @@ class BodyGeometry:
         reach_m: Upper bound of the distance of a vertex from the origin of the frame.
     """
 
-    def __init__(self, mesh: Mesh, params: CullingParams = CullingParams()) -> None:
+    def __init__(self, mesh: Mesh) -> None:
         self.mesh = mesh
         self.bounding_box = BoundingBox.from_points(mesh.vertices_m)
         center_m = (np.array(self.bounding_box.lower_m) + np.array(self.bounding_box.upper_m)) / 2
         self.radius_m = float(np.linalg.norm(mesh.vertices_m - center_m, axis=1).max())
         # Rays are cast at float32 coordinates, which may lie slightly outside the box.
-        slack_m = params.slack_m + params.relative_slack * float(np.abs(self.bounding_box.corners_m).max())
+        slack_m = SLACK_M + RELATIVE_SLACK * float(np.abs(self.bounding_box.corners_m).max())
         enlarged_m = self.bounding_box.corners_m + slack_m * np.sign(self.bounding_box.corners_m - center_m)
         self.outline_points_m: Float64 = np.vstack([enlarged_m, center_m])
         self.reach_m = float(np.linalg.norm(center_m)) + self.radius_m
@@ -145,20 +144,17 @@ class MovingBodies:
         caster_index = {caster: index for index, caster in enumerate(casters)}
         return casters, np.array([caster_index[caster] for caster in self.casters], dtype=np.int64)
 
-    def find_touched_bodies(
-        self, position_m: Float64, part_positions_m: Float64, params: CullingParams = CullingParams()
-    ) -> Bools:
+    def find_touched_bodies(self, position_m: Float64, part_positions_m: Float64) -> Bools:
         """Find the bodies on whose faces a position lies.
 
         Args:
             position_m: (3,) position in the vehicle frame.
             part_positions_m: (P, 3) the same position in the frame of each body.
-            params: Tolerances.
 
         Returns:
             (P,) True for these bodies.
         """
-        is_touched: Bools = np.linalg.norm(self.center_m - position_m, axis=1) <= self.radius_m + params.slack_m
+        is_touched: Bools = np.linalg.norm(self.center_m - position_m, axis=1) <= self.radius_m + SLACK_M
         for part in np.flatnonzero(is_touched).tolist():
             is_touched[part] = len(self.casters[part].find_touched_bodies(part_positions_m[part])) > 0
         return is_touched

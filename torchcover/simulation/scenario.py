@@ -14,7 +14,7 @@ from torchcover.geometry.trajectory import Trajectory
 from torchcover.recordings.formats.tracks import read_trajectory
 from torchcover.simulation.bodies import Body, Shape, VehicleShape, build_actor_mesh, get_shape_name
 from torchcover.simulation.documents import BuiltInDocument, Document, Pose, RelativePath
-from torchcover.simulation.ground_faces import GroundFaceParams, find_level_faces
+from torchcover.simulation.ground_faces import MAX_SLOPE_DEG, find_level_faces
 from torchcover.simulation.kinds import TRAFFIC
 from torchcover.simulation.lidar import Lidar
 from torchcover.simulation.radar import Radar
@@ -348,7 +348,7 @@ class Scenario(BuiltInDocument):
             if not find_level_faces(static_bodies[index][0]).any():
                 raise ValueError(
                     f"body {static_bodies[index][1].name!r} is ground, but none of its faces is an upper side that one "
-                    f"could stand on, at most {GroundFaceParams().max_slope_deg:g} degrees steep; is z up?"
+                    f"could stand on, at most {MAX_SLOPE_DEG:g} degrees steep; is z up?"
                 )
         ego, *actors = _shift_to_run_clock(
             [

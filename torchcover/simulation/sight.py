@@ -8,17 +8,11 @@ import numpy as np
 from torchcover.geometry import build_transform
 from torchcover.geometry.arrays import Bools, Float32, Float64, Int32, Int64
 from torchcover.simulation.bodies import Body
+from torchcover.simulation.culling import SearchSpheres
 from torchcover.simulation.instant import SceneSnapshot, SensorScan, run_in_threads
 from torchcover.simulation.memory import BYTES_PER_RAY, check_memory_fits
 from torchcover.simulation.raycaster import RayCaster
-from torchcover.simulation.rays import (
-    BLOCK_SIZE,
-    SearchSpheres,
-    Tile,
-    compute_ray_pixel_indices,
-    rotate,
-    split_into_tiles,
-)
+from torchcover.simulation.rays import BLOCK_SIZE, Tile, compute_ray_pixel_indices, rotate, split_into_tiles
 from torchcover.simulation.returns import CLEAR, Weather
 from torchcover.simulation.scene import SceneGeometry, compute_hit_ranges_m
 from torchcover.simulation.sensor import RayHits, ScanTimes, Sensor, SensorNoise

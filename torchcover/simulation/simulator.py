@@ -12,9 +12,9 @@ import torch
 
 from torchcover.geometry import BoundingBox
 from torchcover.geometry.arrays import Float32, Int64
+from torchcover.simulation.culling import SearchSpheres
 from torchcover.simulation.instant import SceneSnapshot, SensorScan
 from torchcover.simulation.memory import BYTES_PER_RAY, check_memory_fits
-from torchcover.simulation.rays import SearchSpheres
 from torchcover.simulation.reference_sensor import ReferenceContext, ReferenceScan, ReferenceSensor
 from torchcover.simulation.rig import Rig, set_ego
 from torchcover.simulation.scenario import Scenario
@@ -126,9 +126,8 @@ class Simulator:
     def get_block_index(self, index: int) -> int:
         """Get the block of a frame for standard errors: frames with the same block are correlated.
 
-        It is the index of the run if each run has a scene of its own, such as a city. In a scenario that repeats it is
-        the time step, which is the same in all repetitions. In a scenario of a single time step each frame is a block,
-        since only the random reference sensor differs.
+        It is the index of the run if each run has a separate scene, or the time step in a scenario that repeats. In a
+        scenario of a single time step each frame is a block, since only the random reference sensor differs.
 
         Args:
             index: Index of the frame.
@@ -143,9 +142,6 @@ class Simulator:
 
         Args:
             reference_sensor: Reference sensor.
-
-        Raises:
-            ValueError: More rays than the memory can hold.
         """
         simulator = copy.copy(self)
         simulator.reference_sensor = reference_sensor
@@ -157,9 +153,6 @@ class Simulator:
 
         Args:
             rigs: Rigs by name. The ego vehicle stays, whatever vehicle they name.
-
-        Raises:
-            ValueError: More rays than the memory can hold.
         """
         simulator = copy.copy(self)
         simulator.rigs = rigs
@@ -180,8 +173,7 @@ class Simulator:
             Rig name -> scan of each of its sensors.
 
         Raises:
-            FileNotFoundError: A mesh, vehicle or trajectory file is missing.
-            ValueError: See `simulate_frame`.
+            FileNotFoundError, ValueError: See `simulate_frame`.
 
         Example:
             >>> from torchcover.simulation import PaperReference
@@ -207,8 +199,7 @@ class Simulator:
         """
         mounted_rigs, snapshot = self.prepare_frame(index)
         geometry = mounted_rigs.scene_geometry
-        rng = np.random.default_rng([self.seed, index])
-        frame_name = f"{self.scenario.name} step {index}"
+        rng, frame_name = np.random.default_rng([self.seed, index]), f"{self.scenario.name} step {index}"
         context = ReferenceContext(geometry, snapshot, rng, frame_name, num_threads=torch.get_num_threads())
         reference = self.reference_sensor.scan(context)
         # Rays that cannot give points near a reference point are not cast.
@@ -273,13 +264,9 @@ class Simulator:
             if mask.any() and repr(name) not in ground_names:
                 ground_names.append(repr(name))
         if not ground_names:
-            return (
-                "Ground: none was found under the ego, so that no point has a height above it; mark bodies as ground."
-            )
-        return (
-            f"Ground: level faces under the ego and level faces that are connected with them, of "
-            f"{', '.join(ground_names)}; bodies with `ground: true` replace this choice."
-        )
+            return "Ground: none was found under the ego, so that no point has a height; mark bodies as ground."
+        faces = "level faces under the ego and level faces that are connected with them"
+        return f"Ground: {faces}, of {', '.join(ground_names)}; bodies with `ground: true` replace this choice."
 
     def compute_labels(self, index: int) -> list[ObjectLabel]:
         """Compute the labels of all objects in range of the reference sensor; names are unique within a run.
@@ -307,9 +294,7 @@ class Simulator:
         return geometry.ground.compute_heights_m(centers_m, world_T_vehicle) - half_heights_m
 
     def get_scene_geometry(self, index: int) -> tuple[SceneGeometry, int]:
-        """Get the geometry of the scene of a frame, and the time step in it.
-
-        Each process builds the geometry once per run through the scenario, on first use.
+        """Get the geometry of the scene of a frame, and the time step in it; built on first use in each process.
 
         Args:
             index: Index of the frame.
@@ -353,13 +338,12 @@ class Simulator:
             Mounted rigs, and the scene at the time of the frame.
 
         Raises:
-            FileNotFoundError: A mesh, vehicle or trajectory file is missing.
-            ValueError: See `simulate_frame`.
+            FileNotFoundError, ValueError: See `simulate_frame`.
         """
         mounted_rigs, time_step_index = self._get_mounted_rigs(index)
         geometry = mounted_rigs.scene_geometry
-        reach_m = self._compute_reach_m(geometry.ego_box)
-        snapshot = geometry.get_snapshot(time_step_index, max_distance_m=reach_m)
+        max_distance_m = self._compute_reach_m(geometry.ego_box)
+        snapshot = geometry.get_snapshot(time_step_index, max_distance_m=max_distance_m)
         mounted_rigs.check_mounts(snapshot)
         return mounted_rigs, snapshot
 
@@ -367,19 +351,14 @@ class Simulator:
         """Compute the largest distance of a visible point from the origin of the vehicle frame."""
         corner_m = np.abs(ego_box.corners_m).max(axis=0) + self.reference_sensor.shell_m
         reach_m = float(np.linalg.norm(corner_m)) + self.reference_sensor.max_range_m
-        # The range of a sensor begins at its mounting position.
-        for rig in self.rigs.values():
-            for sensor in rig.sensors:
-                mount_distance_m = float(np.linalg.norm(sensor.mount.to_matrix()[:3, 3]))
-                reach_m = max(reach_m, mount_distance_m + self.scenario.compute_max_range_m(sensor))
+        for sensor in [sensor for rig in self.rigs.values() for sensor in rig.sensors]:
+            # The range of a sensor begins at its mounting position.
+            mount_distance_m = float(np.linalg.norm(sensor.mount.to_matrix()[:3, 3]))
+            reach_m = max(reach_m, mount_distance_m + self.scenario.compute_max_range_m(sensor))
         return reach_m
 
     def _scan(
-        self,
-        mounted_rigs: MountedRigs,
-        snapshot: SceneSnapshot,
-        index: int,
-        search_spheres: SearchSpheres | None,
+        self, mounted_rigs: MountedRigs, snapshot: SceneSnapshot, index: int, search_spheres: SearchSpheres | None
     ) -> dict[str, list[SensorScan]]:
         """Simulate all sensors of all rigs; sensors at the same position of different rigs share random numbers."""
         scans: dict[str, list[SensorScan]] = {}
@@ -388,18 +367,14 @@ class Simulator:
             # The seed has the number of the sensor, so that noise does not depend on other sensors.
             for sensor_number, mounted in enumerate(sensors, 1):
                 rng = np.random.default_rng([self.seed, index, sensor_number])
-                noise = SensorNoise(rng, num_rays=len(mounted.ray_pixel_indices))
-                num_threads = torch.get_num_threads()
+                noise, num_threads = SensorNoise(rng, len(mounted.ray_pixel_indices)), torch.get_num_threads()
                 scan = mounted.scan(snapshot, noise, num_threads=num_threads, search_spheres=search_spheres)
                 scans[name].append(scan)
         return scans
 
 
 def _count_rays(
-    scene: SceneGeometry,
-    snapshot: SceneSnapshot,
-    scans: Mapping[str, Sequence[SensorScan]],
-    reference: ReferenceScan,
+    scene: SceneGeometry, snapshot: SceneSnapshot, scans: Mapping[str, Sequence[SensorScan]], reference: ReferenceScan
 ) -> dict[str, int]:
     """Count rays, self hits, and omitted casts of all rigs and of the reference sensor."""
     all_scans = [scan for rig_scans in scans.values() for scan in rig_scans]

@@ -17,31 +17,12 @@ from torchcover.simulation.patches import (
 from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.shapes import Mesh, compute_normals, get_corners_m, iterate_mesh_parts
 
-
-@dataclass(frozen=True)
-class CoincidenceParams:
-    """Parameters of the search for coincident faces.
-
-    Args:
-        max_distance_m: Faces within this distance coincide.
-        min_distance_m: Faces within this distance are the same to float32.
-        min_cosine: Smallest cosine of the angle between coincident faces.
-        points_per_side: Points along each side of a triangle at which other faces are searched.
-        points_per_long_side: The same for triangles with a side longer than `long_side_m`.
-        long_side_m: Length from which a side is long.
-    """
-
-    max_distance_m: float = 1e-3
-    min_distance_m: float = 1e-4
-    min_cosine: float = 0.9
-    points_per_side: int = 2
-    points_per_long_side: int = 10
-    long_side_m: float = 4.0
-
-    @property
-    def start_distance_m(self) -> float:
-        """Distance from a face at which rays start: no coincident face lies at their begin or end."""
-        return self.max_distance_m + self.min_distance_m
+# Faces within this distance coincide.
+COINCIDENCE_M = 1e-3
+# Faces within this distance are the same to float32.
+ROUNDING_M = 1e-4
+# Rays start this far from a face: no coincident face lies at their begin or end.
+START_DISTANCE_M = COINCIDENCE_M + ROUNDING_M
 
 
 def check_mesh(owner: str, mesh: Mesh) -> Mesh:
@@ -91,9 +72,7 @@ def check_mesh(owner: str, mesh: Mesh) -> Mesh:
     return mesh._replace(is_outward=find_outward_faces_from_edges(mesh, edges, directions, surfaces))
 
 
-def find_coincident_faces(
-    meshes: Sequence[Mesh], allow_within_mesh: Sequence[bool], params: CoincidenceParams = CoincidenceParams()
-) -> list[Bools]:
+def find_coincident_faces(meshes: Sequence[Mesh], allow_within_mesh: Sequence[bool]) -> list[Bools]:
     """Find faces that coincide with another face that is visible from the same side, within 1 mm.
 
     Points of the faces are tested, so that surfaces with a small common area may be missed.
@@ -102,7 +81,6 @@ def find_coincident_faces(
         meshes: Static meshes near the origin.
         allow_within_mesh: For each mesh True to also search for coincident faces within the mesh, such as parts of a
             vehicle that end in one plane.
-        params: Distances and numbers of points.
 
     Returns:
         For each mesh (F,) True for coincident faces.
@@ -110,14 +88,12 @@ def find_coincident_faces(
     is_outward = np.concatenate([find_outward_faces(mesh) for mesh in meshes])
     mesh_indices = np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes])
     is_coincident = np.zeros(len(mesh_indices), dtype=bool)
-    layers = _build_layers(meshes, params)
+    layers = _build_layers(meshes)
+    long_side_m = 4.0  # triangles with a longer side are tested at more points
     for part, corners_m in iterate_mesh_parts(meshes):
         has_area = compute_normals(corners_m).any(axis=0)
-        is_long = np.linalg.norm(corners_m - corners_m[[2, 0, 1]], axis=1).max(axis=0) > params.long_side_m
-        for is_selected, points_per_side in (
-            (has_area & ~is_long, params.points_per_side),
-            (has_area & is_long, params.points_per_long_side),
-        ):
+        is_long = np.linalg.norm(corners_m - corners_m[[2, 0, 1]], axis=1).max(axis=0) > long_side_m
+        for is_selected, points_per_side in ((has_area & ~is_long, 2), (has_area & is_long, 10)):
             faces, face_corners_m = part.start + np.flatnonzero(is_selected), corners_m[..., is_selected]
             if len(faces) == 0:
                 continue
@@ -125,14 +101,10 @@ def find_coincident_faces(
             search_within = np.array(allow_within_mesh, dtype=bool)[mesh_indices[faces]]
             for weights in _compute_point_weights(points_per_side):
                 points_m = np.tensordot(weights, face_corners_m, 1).T
-                rows, other_faces = _find_faces_at_points(
-                    points_m, normals, mesh_indices[faces], search_within, layers, params
-                )
+                rows, other_faces = _find_faces_at_points(points_m, normals, mesh_indices[faces], search_within, layers)
                 is_other = other_faces != faces[rows]
                 rows, other_faces = rows[is_other], other_faces[is_other]
-                is_pair = _find_coincident_pairs(
-                    rows, faces[rows], other_faces, normals[rows], meshes, is_outward, params
-                )
+                is_pair = _find_coincident_pairs(rows, faces[rows], other_faces, normals[rows], meshes, is_outward)
                 is_coincident[faces[rows[is_pair]]] = is_coincident[other_faces[is_pair]] = True
     return np.split(is_coincident, np.cumsum([len(mesh.faces) for mesh in meshes])[:-1])
 
@@ -149,7 +121,7 @@ class _Layer:
     face_indices: Int64
 
 
-def _build_layers(meshes: Sequence[Mesh], params: CoincidenceParams) -> list[_Layer]:
+def _build_layers(meshes: Sequence[Mesh]) -> list[_Layer]:
     """Distribute bodies to layers, so that bodies that may touch are in different layers.
 
     Which of several faces at the same position a ray hits first depends on rounding: layers are cast separately.
@@ -159,7 +131,7 @@ def _build_layers(meshes: Sequence[Mesh], params: CoincidenceParams) -> list[_La
     for index, mesh in enumerate(meshes):
         if len(mesh.faces):
             lower_m[index], upper_m[index] = mesh.vertices_m.min(axis=0), mesh.vertices_m.max(axis=0)
-    margin_m = 2 * params.max_distance_m
+    margin_m = 2 * COINCIDENCE_M
     layer_numbers = np.full(len(meshes), -1)
     for index in range(len(meshes)):
         touches = (lower_m[:index] <= upper_m[index] + margin_m) & (upper_m[:index] >= lower_m[index] - margin_m)
@@ -175,12 +147,7 @@ def _build_layers(meshes: Sequence[Mesh], params: CoincidenceParams) -> list[_La
 
 
 def _find_faces_at_points(
-    points_m: Float64,
-    normals: Float64,
-    mesh_indices: Int64,
-    search_within: Bools,
-    layers: Sequence[_Layer],
-    params: CoincidenceParams,
+    points_m: Float64, normals: Float64, mesh_indices: Int64, search_within: Bools, layers: Sequence[_Layer]
 ) -> tuple[Int64, Int64]:
     """Find faces close to points of faces.
 
@@ -190,7 +157,6 @@ def _find_faces_at_points(
         mesh_indices: (N,) meshes of these faces.
         search_within: (N,) True if faces of the same mesh are searched as well.
         layers: All faces.
-        params: Distances.
 
     Returns:
         (K,) rows of the points and (K,) numbers of faces there, the face itself included.
@@ -201,12 +167,12 @@ def _find_faces_at_points(
         # From above a ray finds faces of other bodies on or below the face. In the body of the face, a second ray from
         # just below is needed, since the first one may hit the face itself.
         for start_m, is_selected in (
-            (params.start_distance_m, ~is_own_layer | search_within),
-            (-params.min_distance_m, is_own_layer & search_within),
+            (START_DISTANCE_M, ~is_own_layer | search_within),
+            (-ROUNDING_M, is_own_layer & search_within),
         ):
             rows = np.flatnonzero(is_selected)
             starts_m = points_m[rows] + start_m * normals[rows]
-            limit_m = params.start_distance_m + max(start_m, -params.max_distance_m / 2)
+            limit_m = START_DISTANCE_M + max(start_m, -COINCIDENCE_M / 2)
             faces = layer.caster.find_first_faces(starts_m, -normals[rows], limit_m)
             is_hit = faces >= 0
             found_rows.append(rows[is_hit])
@@ -215,13 +181,7 @@ def _find_faces_at_points(
 
 
 def _find_coincident_pairs(
-    rows: Int64,
-    faces: Int64,
-    other_faces: Int64,
-    normals: Float64,
-    meshes: Sequence[Mesh],
-    is_outward: Bools,
-    params: CoincidenceParams,
+    rows: Int64, faces: Int64, other_faces: Int64, normals: Float64, meshes: Sequence[Mesh], is_outward: Bools
 ) -> Bools:
     """Find the pairs of close faces that are visible from the same side.
 
@@ -232,14 +192,14 @@ def _find_coincident_pairs(
         normals: (K, 3) normals of the first faces.
         meshes: Meshes.
         is_outward: (all faces,) result of `find_outward_faces`.
-        params: Angle.
     """
+    min_cosine = 0.9  # of the angle between coincident faces
     other_normals = compute_normals(get_corners_m(meshes, other_faces)).T
     cosine = (normals * other_normals).sum(axis=1)
-    is_parallel, is_opposite = cosine > params.min_cosine, cosine < -params.min_cosine
+    is_parallel, is_opposite = cosine > min_cosine, cosine < -min_cosine
     # The bottom of a body that stands on a sheet is invisible, and so are faces that coincide with it there.
-    is_bottom = is_outward[faces] & (normals[:, 2] < -params.min_cosine)
-    is_other_bottom = is_outward[other_faces] & (other_normals[:, 2] < -params.min_cosine)
+    is_bottom = is_outward[faces] & (normals[:, 2] < -min_cosine)
+    is_other_bottom = is_outward[other_faces] & (other_normals[:, 2] < -min_cosine)
     stands_on_sheet = is_bottom & ~is_outward[other_faces] & (is_parallel | is_opposite)
     is_hidden = np.isin(rows, rows[stands_on_sheet])
     # Faces back to back are visible from different sides, unless one of them is a sheet.
@@ -247,15 +207,12 @@ def _find_coincident_pairs(
     return np.asarray(~is_hidden & has_common_side)
 
 
-def warn_about_coincident_faces(
-    names: Sequence[str], coincident_masks: Sequence[Bools], params: CoincidenceParams = CoincidenceParams()
-) -> None:
+def warn_about_coincident_faces(names: Sequence[str], coincident_masks: Sequence[Bools]) -> None:
     """Warn about bodies whose surfaces coincide with others.
 
     Args:
         names: Names of the bodies.
         coincident_masks: For each body (F,) result of `find_coincident_faces`.
-        params: Distance of coincident faces.
 
     Warns:
         UserWarning: Some faces coincide; up to five bodies are named.
@@ -266,7 +223,7 @@ def warn_about_coincident_faces(
             bodies[name] = f"{name!r} ({_format_share(int(mask.sum()), len(mask))} of the faces)"
     if bodies:
         warnings.warn(
-            f"{', '.join(list(bodies.values())[:5])}: faces lie within {params.max_distance_m * 1000:g} mm of others "
+            f"{', '.join(list(bodies.values())[:5])}: faces lie within {COINCIDENCE_M * 1000:g} mm of others "
             "with the same orientation; where faces cover each other one counts",
             stacklevel=3,
         )

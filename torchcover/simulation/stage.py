@@ -266,66 +266,46 @@ def _describe_alternatives(scenario: Scenario, rig: Rig) -> str:
     return f"{vehicle_text}. {windows_text}" if windows_text else vehicle_text
 
 
-@dataclass(frozen=True)
-class GroundCheckParams:
-    """Parameters of the check that bodies stand on the ground.
-
-    Args:
-        max_frames: Largest number of frames that are checked.
-        max_distance_m: Actors within this distance of the ego vehicle are checked.
-        max_height_m: Largest distance of the ground above or below the bottom of a body.
-        max_missing_share: Share of checked poses of actors that may have no ground; none is allowed for the ego.
-    """
-
-    max_frames: int = 8
-    max_distance_m: float = 100.0
-    max_height_m: float = 1.0
-    max_missing_share: float = 0.5
-
-
-def warn_about_missing_ground(
-    scenario_name: str,
-    scene: SceneGeometry,
-    time_step_indices: Int64,
-    params: GroundCheckParams = GroundCheckParams(),
-) -> None:
+def warn_about_missing_ground(scenario_name: str, scene: SceneGeometry, time_step_indices: Int64) -> None:
     """Warn if the ego vehicle, or more than half of the moving actors, have no ground near the bottom of their body.
 
     Args:
         scenario_name: Name of the scenario in the message.
         scene: Geometry of the scene.
         time_step_indices: Time steps of the run; a few of them are checked.
-        params: Limits.
 
     Warns:
         UserWarning: Ground is missing.
     """
-    stride = -(-len(time_step_indices) // params.max_frames)
-    masks = [_find_grounded_bodies(scene, index, params) for index in time_step_indices[::stride].tolist()]
+    max_checks = 8
+    max_height_m = 1.0  # distance of the ground above or below the bottom of a body
+    stride = -(-len(time_step_indices) // max_checks)
+    masks = [_find_grounded_bodies(scene, index, max_height_m) for index in time_step_indices[::stride].tolist()]
     is_ego_grounded = np.array([mask[0] for mask in masks])
     is_actor_grounded = np.concatenate([mask[1:] for mask in masks])
+    # Actors may be in the air for a part of their way, the ego vehicle may not.
     for name, is_grounded, max_share in (
         ("the ego", is_ego_grounded, 0.0),
-        ("other moving actors", is_actor_grounded, params.max_missing_share),
+        ("other moving actors", is_actor_grounded, 0.5),
     ):
         missing_count = int((~is_grounded).sum())
         if missing_count > max_share * len(is_grounded):
             warnings.warn(
                 f"{scenario_name}: {missing_count} of {len(is_grounded)} times that were checked, {name} had no ground "
-                f"within {params.max_height_m:g} m below or above the wheels, so that little of it will be observed; "
+                f"within {max_height_m:g} m below or above the wheels, so that little of it will be observed; "
                 "is the ground a mesh in the same frame, and z that of the bottom? Traffic of type 'tracks' without "
                 "`ground` makes ground that follows the tracks",
                 stacklevel=4,
             )
 
 
-def _find_grounded_bodies(scene: SceneGeometry, time_step_index: int, params: GroundCheckParams) -> Bools:
-    """Find which bodies have ground near their bottom: the ego vehicle, then moving actors in range."""
-    snapshot = scene.get_snapshot(time_step_index, max_distance_m=params.max_distance_m)
+def _find_grounded_bodies(scene: SceneGeometry, time_step_index: int, max_height_m: float) -> Bools:
+    """Find which bodies have ground near their bottom: the ego vehicle, then moving actors within 100 m."""
+    snapshot = scene.get_snapshot(time_step_index, max_distance_m=100.0)
     bodies = snapshot.moving_bodies
     actor_positions_m = bodies.vehicle_T_part[bodies.body_indices != snapshot.ego_index, :3, 3]
     positions_m = np.concatenate([np.zeros((1, 3)), actor_positions_m])
     time_s = time_step_index * scene.scene.time_step_s
     up = scene.scene.ego.trajectory.interpolate(time_s)[2, :3]
-    heights_m = snapshot.compute_heights_m((positions_m + params.max_height_m * up).astype(np.float32))
-    return np.asarray(heights_m <= 2 * params.max_height_m + ROUNDING_M)
+    heights_m = snapshot.compute_heights_m((positions_m + max_height_m * up).astype(np.float32))
+    return np.asarray(heights_m <= 2 * max_height_m + ROUNDING_M)

@@ -19,7 +19,7 @@ from torchcover.simulation.reference_sensor import (
 )
 from torchcover.simulation.regions_of_interest import DEFAULT_BAND_FRAME, Areas, Bands, QueryPlan
 from torchcover.simulation.sight import Visibility, compute_visibility
-from torchcover.simulation.sound import CoincidenceParams
+from torchcover.simulation.sound import START_DISTANCE_M
 from torchcover.simulation.surface_strata import SurfacePoints, SurfaceStrata
 
 # Rays end at this height above the surface, so that they do not hit it; surfaces closer to it coincide with it.
@@ -227,8 +227,7 @@ def _remove_covered_points(points: SurfacePoints, context: ReferenceContext) -> 
     if len(tested) == 0:
         return points
     faces = points.coincident_faces[0, tested]
-    max_distance_m = CoincidenceParams().start_distance_m
-    first_faces = context.snapshot.find_first_faces(points.points_m[tested], points.normals[tested], max_distance_m)
+    first_faces = context.snapshot.find_first_faces(points.points_m[tested], points.normals[tested], START_DISTANCE_M)
     # Rounding decides between adjacent faces of one surface; these do not cover each other.
     coincident_faces = np.concatenate(context.scene_geometry.coincident_faces)
     is_adjacent_face = ~np.isin(first_faces, coincident_faces[coincident_faces >= 0])

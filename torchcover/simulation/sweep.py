@@ -13,9 +13,10 @@ import numpy as np
 
 from torchcover.geometry import invert, transform_points
 from torchcover.geometry.arrays import Float32, Float64, Int64
+from torchcover.simulation.culling import SLACK_M, BoxOutlines, compute_outlines
 from torchcover.simulation.moving import BodyHits, MovingBodies
 from torchcover.simulation.raycaster import Hits, RayCaster, cast_from_vehicle
-from torchcover.simulation.rays import BoxOutlines, CullingParams, Tile, compute_outlines, rotate, rotate_each
+from torchcover.simulation.rays import Tile, rotate, rotate_each
 
 # Poses at the begin, middle and end of a scan: a parabola, whose error grows with the cube of the rotation in a scan.
 NUM_SAMPLES = 3
@@ -104,7 +105,6 @@ class ScanMotion:
         moving_bodies: MovingBodies,
         sample_times_s: Float64,
         poses: Sequence[BodyPoses],
-        params: CullingParams = CullingParams(),
     ) -> Self | None:
         """Build the motion from sampled poses.
 
@@ -114,7 +114,6 @@ class ScanMotion:
             moving_bodies: P moving bodies.
             sample_times_s: (3,) sample times relative to the time of the frame.
             poses: Poses at these times.
-            params: Margin around boxes.
 
         Returns:
             The motion; None if nothing moves during the scan.
@@ -133,7 +132,7 @@ class ScanMotion:
             sample_corners_m.append(rotated_m + motion[:, None, :3, 3])
         corners_m = np.stack(sample_corners_m)
         # Between the samples a corner deviates from the straight line by at most half its second difference.
-        margin_m = params.slack_m + np.abs(np.diff(corners_m, n=2, axis=0)).max(axis=(0, 2, 3), initial=0.0) / 2
+        margin_m = SLACK_M + np.abs(np.diff(corners_m, n=2, axis=0)).max(axis=(0, 2, 3), initial=0.0) / 2
         outwards_m = np.sign(moving_bodies.box_corners_m - moving_bodies.center_m[:, None]) * margin_m[:, None, None]
         static_T_vehicle = np.stack([sample.static_T_vehicle for sample in poses])
         return cls(

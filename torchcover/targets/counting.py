@@ -11,9 +11,10 @@ import numpy as np
 import torch
 
 from torchcover.geometry.arrays import Float32, Float64, Int32, Int64
+from torchcover.simulation.culling import compute_outlines
 from torchcover.simulation.instant import run_in_threads
 from torchcover.simulation.moving import MovingBodies
-from torchcover.simulation.rays import compute_outlines, rotate
+from torchcover.simulation.rays import rotate
 from torchcover.simulation.sensor import RayHits
 from torchcover.simulation.sight import MountedSensor, RayEnds
 from torchcover.targets.placing import set_pose_heights
