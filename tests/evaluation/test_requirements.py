@@ -16,9 +16,8 @@ from torchcover.evaluation.requirements import TargetPositions, TargetRequiremen
 from torchcover.geometry import BoundingBox
 from torchcover.placement.selection_space import SelectionSpace
 from torchcover.placement.space import SearchSpace
-from torchcover.simulation import RegionsOfInterest, Rig, Scenario, list_builtin_names
+from torchcover.simulation import RegionsOfInterest, Rig, Scenario, document_keys, list_builtin_names
 from torchcover.simulation.bodies import Vehicle
-from torchcover.simulation.document_keys import KINDS
 from torchcover.simulation.documents import explain_document_error
 from torchcover.targets import SIDES, Raster, Target, measure_target_visibility
 
@@ -434,7 +433,7 @@ def test_the_keys_of_kinds_are_those_of_their_documents():
         of_kind = (document, SelectionSpace) if document is SearchSpace else (document,)
         known = {name for one in of_kind for name in one.model_fields} - {"name", "description"}
         assert document.kind == kind
-        assert set(" ".join(KINDS[kind]).split()) == known
+        assert set(" ".join(document_keys.KINDS[kind]).split()) == known
 
 
 @pytest.mark.parametrize(("kind", "name"), [("rigs", "urban"), ("scenarios", "kitti"), ("vehicles", "urban")])

@@ -5,7 +5,7 @@ import pytest
 
 
 @pytest.fixture
-def at(monkeypatch):
+def fix_position(monkeypatch):
     """Fix the reference position."""
 
     def put(position_m):

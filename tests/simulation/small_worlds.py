@@ -20,15 +20,19 @@ def scenario(*bodies, ego=EGO, **keys):
     return Scenario.model_validate({"name": "s", "ego": ego, "bodies": bodies, **keys})
 
 
-def sums(made, sensor, value=lambda points: np.ones(len(points)), steps=40, first=0):
+def sums(built_scenario, sensor, value=lambda points: np.ones(len(points)), num_frames=40, first_index=0):
     """Sum area weight times a value over the reference points of each frame; (steps,)."""
-    simulator = Simulator(made, {}, sensor)
-    seen = [simulator.simulate_frame(index) for index in range(first, first + steps)]
-    return np.array([(step.reference_weights.astype(np.float64) * value(step.reference)).sum() for step in seen])
+    simulator = Simulator(built_scenario, {}, sensor)
+    observations = [simulator.simulate_frame(index) for index in range(first_index, first_index + num_frames)]
+    sums_m2 = []
+    for observation in observations:
+        weights = observation.reference_weights.astype(np.float64)
+        sums_m2.append((weights * value(observation.reference)).sum())
+    return np.array(sums_m2)
 
 
-def agrees(samples, exact, within=0.02):
+def agrees(samples, exact, max_relative_error=0.02):
     """Assert that the mean is exact within 4 standard errors, and that these are small."""
     error = samples.std(ddof=1) / math.sqrt(len(samples))
-    assert error <= within * abs(exact)
+    assert error <= max_relative_error * abs(exact)
     assert abs(samples.mean() - exact) <= 4 * error + 1e-5 * abs(exact), (samples.mean(), exact, error)

@@ -90,11 +90,11 @@ IN_DEGREES = [name for name in ROLLS if name.startswith("place3d2024")]
 
 
 def mounted(rig, sensor):
-    (found,) = [each for each in Rig.load(rig).sensors if each.name == sensor]
-    return found.mount.to_matrix()
+    (matched,) = [candidate for candidate in Rig.load(rig).sensors if candidate.name == sensor]
+    return matched.mount.to_matrix()
 
 
-def looks(matrix, direction=(1.0, 0.0, 0.0)):
+def compute_direction_deg(matrix, direction=(1.0, 0.0, 0.0)):
     """Convert a direction of the sensor frame to azimuth and elevation in degrees in the vehicle frame."""
     x, y, z = matrix[:3, :3] @ direction
     return np.rad2deg(np.arctan2(y, x)), np.rad2deg(np.arcsin(z))
@@ -148,10 +148,10 @@ def test_carla_roll_lowers_the_right_axis(rig):
 @pytest.mark.parametrize("name", IN_DEGREES)
 def test_roll_readings_differ_only_in_the_unit(name):
     radians, degrees = Rig.load(name), Rig.load(f"{name}_degrees")
-    for sensor, other, roll in zip(radians.sensors, degrees.sensors, ROLLS[name], strict=True):
-        assert other.mount.roll_deg == roll
-        assert other.model_copy(update={"mount": sensor.mount}) == sensor
-        assert other.mount.model_copy(update={"roll_deg": sensor.mount.roll_deg}) == sensor.mount
+    for sensor, degrees_sensor, roll in zip(radians.sensors, degrees.sensors, ROLLS[name], strict=True):
+        assert degrees_sensor.mount.roll_deg == roll
+        assert degrees_sensor.model_copy(update={"mount": sensor.mount}) == sensor
+        assert degrees_sensor.mount.model_copy(update={"roll_deg": sensor.mount.roll_deg}) == sensor.mount
     assert "Doubt about the unit" in radians.description
     assert "Doubt about the unit" in degrees.description
 
@@ -171,7 +171,7 @@ def test_place3d_placements_use_the_lidar_of_place3d():
 
 def test_the_pitched_placement_looks_down():
     front = Rig.load("hu2022_pyramid_pitch").sensors[1].mount.to_matrix()
-    assert looks(front)[1] == pytest.approx(np.rad2deg(-0.09), abs=1e-3)
+    assert compute_direction_deg(front)[1] == pytest.approx(np.rad2deg(-0.09), abs=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -181,15 +181,15 @@ def test_the_pitched_placement_looks_down():
         ("waymo", "side_left", 88.8, 0.0),
         ("waymo", "side_right", -92.2, 0.0),
         ("waymo", "rear", 178.4, 0.0),
-        # The source turns the sensor's z axis outwards: 90 degrees less 1.369065 rad, and 1.7552732 rad less 90 degrees.
+        # The source turns the z axis outwards: 90 degrees less 1.369065 rad, and 1.7552732 rad less 90 degrees.
         ("edgar", "innovusion_front", 0.0, -11.558),
         ("edgar", "innovusion_rear", 180.0, -10.570),
     ],
 )
 def test_sensor_directions_match_the_source(rig, sensor, azimuth, elevation):
-    found = looks(mounted(rig, sensor))
-    assert (found[0] - azimuth + 180) % 360 - 180 == pytest.approx(0.0, abs=1e-3)
-    assert found[1] == pytest.approx(elevation, abs=1e-3)
+    direction_deg = compute_direction_deg(mounted(rig, sensor))
+    assert (direction_deg[0] - azimuth + 180) % 360 - 180 == pytest.approx(0.0, abs=1e-3)
+    assert direction_deg[1] == pytest.approx(elevation, abs=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -217,9 +217,9 @@ def test_sensor_directions_match_the_source(rig, sensor, azimuth, elevation):
 )
 def test_camera_directions_match_the_source_and_are_upright(rig, sensor, azimuth):
     matrix = mounted(rig, sensor)
-    found = looks(matrix)
-    assert found[0] == pytest.approx(azimuth, abs=0.1)
-    assert abs(found[1]) < 3.5
+    direction_deg = compute_direction_deg(matrix)
+    assert direction_deg[0] == pytest.approx(azimuth, abs=0.1)
+    assert abs(direction_deg[1]) < 3.5
     assert matrix[2, 2] > 0.99
 
 
@@ -254,7 +254,7 @@ def test_edgar_lidars_have_the_rotation_of_the_urdf():
 def test_argoverses_lower_lidar_hangs_upside_down():
     matrix = mounted("argoverse2", "down_lidar")
     np.testing.assert_allclose(matrix[:3, :3] @ [0, 0, 1], [0, 0, -1], atol=1e-12)
-    assert looks(matrix)[0] == pytest.approx(-11.6)
+    assert compute_direction_deg(matrix)[0] == pytest.approx(-11.6)
 
 
 def test_roof_rigs_differ_only_in_their_rows():

@@ -37,13 +37,13 @@ def camera(kind="pinhole", /, **changes):
 @pytest.mark.parametrize("lens", LENSES)
 def test_unprojected_depth_images_equal_the_hits(lens):
     sensor = camera(lens)
-    instant = SceneGeometry(Scenario.load("courtyard").build_scene()).get_snapshot(0)
+    snapshot = SceneGeometry(Scenario.load("courtyard").build_scene()).get_snapshot(0)
     vehicle_T_mount = sensor.mount.to_matrix()
-    image = instant.render_range_image(vehicle_T_mount, sensor.compute_directions(), max_range_m=60.0)
+    image = snapshot.render_range_image(vehicle_T_mount, sensor.compute_directions(), max_range_m=60.0)
     model = sensor.build_camera()
     cloud = model.to_vehicle(model.unproject(torch.from_numpy(image), depth_kind="distance")).numpy()
     tiles = split_into_tiles(sensor.compute_directions())
-    scan = instant.scan(vehicle_T_mount, tiles, max_range_m=60.0)
+    scan = snapshot.scan(vehicle_T_mount, tiles, max_range_m=60.0)
     # The image shows the hood of the ego vehicle, the scan excludes it.
     assert len(cloud) == len(scan.points) + scan.self_hits
     in_order = lambda points: points[np.lexsort(points.round(2).T)]  # noqa: E731
@@ -131,8 +131,8 @@ def test_point_counts_are_pixels_of_the_full_image():
         )
         for stride in (1, 2, 5)
     }
-    few = SurfaceReference((AHEAD,), num_rays=50)
-    (frame,) = SimulatedFrames(made, rigs=rigs, num_frames=1, reference_sensor=few, boxes=True)
+    reference_sensor = SurfaceReference((AHEAD,), num_rays=50)
+    (frame,) = SimulatedFrames(made, rigs=rigs, num_frames=1, reference_sensor=reference_sensor, boxes=True)
     full, *strided = (int(hits) for hits in frame.boxes.points_in_box.values())
     assert full > 5000
     assert strided == pytest.approx([full, full], rel=0.05)

@@ -28,23 +28,23 @@ def scene(request):
     return SceneGeometry(Scenario.load(request.param).build_scene(seed=3))
 
 
-def at_every_body(instant, vehicle_T_sensor, tiles, max_range_m):
+def cast_at_every_body(snapshot, vehicle_T_sensor, tiles, max_range_m):
     """Cast every ray at every body in turn: slow reference implementation."""
     origin_m, answers = vehicle_T_sensor[:3, 3], []
     for tile in tiles:
         directions = rotate(vehicle_T_sensor[:3, :3], tile.directions)
         limit_m = np.full(directions.shape[1], max_range_m, dtype=np.float32)
-        hits = cast_from_vehicle(instant.static_caster, instant.static_T_vehicle, origin_m, directions, limit_m)
-        moving = instant.moving_bodies
+        hits = cast_from_vehicle(snapshot.static_caster, snapshot.static_T_vehicle, origin_m, directions, limit_m)
+        moving = snapshot.moving_bodies
         for caster, part_T_vehicle, body in zip(
             moving.casters, moving.part_T_vehicle, moving.body_indices, strict=True
         ):
             nearer = cast_from_vehicle(caster, part_T_vehicle, origin_m, directions, hits.range_m)
             hits.range_m[:] = nearer.range_m
             hits.body_indices[nearer.body_indices >= 0] = body
-        seen = (hits.body_indices >= 0) & (hits.body_indices != instant.ego_index)
-        points = (directions * hits.range_m + origin_m.astype(np.float32)[:, None])[:, seen]
-        answers.append((points.T, np.count_nonzero(hits.body_indices == instant.ego_index)))
+        is_point = (hits.body_indices >= 0) & (hits.body_indices != snapshot.ego_index)
+        points = (directions * hits.range_m + origin_m.astype(np.float32)[:, None])[:, is_point]
+        answers.append((points.T, np.count_nonzero(hits.body_indices == snapshot.ego_index)))
     points, self_hits = zip(*answers, strict=True)
     return np.concatenate(points), sum(self_hits)
 
@@ -55,58 +55,66 @@ def assert_same_bits(scan, expected):
     assert scan.self_hits == self_hits
 
 
-@pytest.mark.parametrize("step", [0, 170, 399])
+@pytest.mark.parametrize("time_step_index", [0, 170, 399])
 @pytest.mark.parametrize("sensor", ["roof", "bumper", "paper"])
-def test_culling_does_not_change_a_scan(scene, step, sensor):
-    instant, generator = scene.get_snapshot(step, max_distance_m=150.0), np.random.default_rng(step)
+def test_culling_does_not_change_a_scan(scene, time_step_index, sensor):
+    snapshot, generator = (
+        scene.get_snapshot(time_step_index, max_distance_m=150.0),
+        np.random.default_rng(time_step_index),
+    )
     if sensor == "paper":
         reference = PaperReference(rows=60, columns=90)
         pose, tiles = reference.sample_pose(EGO, generator), split_into_tiles(reference.compute_directions())
     else:
         pose, tiles = ROOF if sensor == "roof" else Pose(x_m=2.6, z_m=0.4, pitch_deg=3).to_matrix(), SPHERE
-    seen = instant.scan(pose, tiles, max_range_m=150.0)
-    assert_same_bits(seen, at_every_body(instant, pose, tiles, 150.0))
-    assert seen.num_body_casts < 0.5 * seen.num_rays * len(instant.moving_bodies)
+    scan = snapshot.scan(pose, tiles, max_range_m=150.0)
+    assert_same_bits(scan, cast_at_every_body(snapshot, pose, tiles, 150.0))
+    assert scan.num_body_casts < 0.5 * scan.num_rays * len(snapshot.moving_bodies)
 
 
 def test_grouped_casting_starts_correctly_on_a_body():
     """Of two coincident bodies a ray hits the last one, as with separate casts."""
-    car, away = Box(type="box", size_m=(4, 2, 1.5)).build_mesh(), np.array([0.0, 3.0])
-    places = [(0, 0, 0), (8, 1, 0), (8, 1, 0), (9, -4, 0), (-7, 2, 0)]
-    ways = [
-        Trajectory.from_arrays(away, [at, np.add(at, (9, 0, 0))], [[15.0 * k, 0, 0]] * 2) for k, at in enumerate(places)
+    car, times_s = Box(type="box", size_m=(4, 2, 1.5)).build_mesh(), np.array([0.0, 3.0])
+    positions = [(0, 0, 0), (8, 1, 0), (8, 1, 0), (9, -4, 0), (-7, 2, 0)]
+    trajectories = [
+        Trajectory.from_arrays(times_s, [position, np.add(position, (9, 0, 0))], [[15.0 * k, 0, 0]] * 2)
+        for k, position in enumerate(positions)
     ]
-    ways[2] = ways[1]
-    actors = [Actor(f"car {k}", "car", car, way) for k, way in enumerate(ways)]
+    trajectories[2] = trajectories[1]
+    actors = [Actor(f"car {k}", "car", car, trajectory) for k, trajectory in enumerate(trajectories)]
     ground = Plane(type="plane", size_m=(60, 60)).build_mesh().transform(build_transform(np.eye(3), [0, 0, -2]))
-    instant = SceneGeometry(Scene((ground,), actors[0], tuple(actors[1:]), duration_s=3.0)).get_snapshot(0)
+    snapshot = SceneGeometry(Scene((ground,), actors[0], tuple(actors[1:]), duration_s=3.0)).get_snapshot(0)
     roof_m = np.array([9.0, -4.0, car.vertices_m[:, 2].max()])
-    touched = instant.moving_bodies.find_touched_bodies(roof_m, instant.moving_bodies.transform_to_parts_m(roof_m))
+    touched = snapshot.moving_bodies.find_touched_bodies(roof_m, snapshot.moving_bodies.transform_to_parts_m(roof_m))
     assert touched.tolist() == [False, False, False, True, False]
     for place_m in (roof_m, np.array([4.0, 0.0, 1.0])):
         pose = build_transform(np.eye(3), place_m)
-        assert_same_bits(instant.scan(pose, SPHERE, max_range_m=90.0), at_every_body(instant, pose, SPHERE, 90.0))
+        assert_same_bits(
+            snapshot.scan(pose, SPHERE, max_range_m=90.0), cast_at_every_body(snapshot, pose, SPHERE, 90.0)
+        )
     (tile,) = split_into_tiles(compute_unit_directions(np.zeros((1, 1)), np.array([[14.0]])))
-    _, hits, _ = instant.cast(
-        build_transform(np.eye(3), place_m), tile, np.full(1, 90, np.float32), instant.compute_outlines(place_m)
+    _, hits, _ = snapshot.cast(
+        build_transform(np.eye(3), place_m), tile, np.full(1, 90, np.float32), snapshot.compute_outlines(place_m)
     )
-    assert hits.body_indices == instant.moving_bodies.body_indices[2]
+    assert hits.body_indices == snapshot.moving_bodies.body_indices[2]
 
 
 def boxes_around(generator, count):
     """Sample boxes of all sizes and orientations, some around the origin: (count, 8, 3) corners, sizes, poses."""
     corners = BoundingBox((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)).corners_m
     sizes = generator.uniform(0.05, 1.0, size=(count, 3)) * 10 ** generator.uniform(-1, 1.3, size=(count, 1))
-    places = generator.normal(size=(count, 3)) * 10 ** generator.uniform(-1, 1.5, size=(count, 1))
-    poses = [build_transform(convert_euler_to_rotation(*generator.uniform(-180, 180, 3)), place) for place in places]
+    positions = generator.normal(size=(count, 3)) * 10 ** generator.uniform(-1, 1.5, size=(count, 1))
+    poses = [
+        build_transform(convert_euler_to_rotation(*generator.uniform(-180, 180, 3)), position) for position in positions
+    ]
     return np.array([(corners * s) @ p[:3, :3].T + p[:3, 3] for s, p in zip(sizes, poses, strict=True)]), sizes, poses
 
 
 def test_empty_tiles_have_no_candidate_blocks():
-    none = SPHERE[0].select(np.zeros(SPHERE[0].directions.shape[1], dtype=bool))
-    around = compute_outlines(EGO.corners_m[None], ROOF[:3, 3] / 2)
-    assert find_boxes_in_cone(around, none.axis, none.half_angle_rad, 0.0).tolist() == [0]
-    assert find_blocks_towards_boxes(around, none, np.eye(3), np.empty(0, dtype=np.float32)).shape == (1, 0)
+    empty_tile = SPHERE[0].select(np.zeros(SPHERE[0].directions.shape[1], dtype=bool))
+    outlines = compute_outlines(EGO.corners_m[None], ROOF[:3, 3] / 2)
+    assert find_boxes_in_cone(outlines, empty_tile.axis, empty_tile.half_angle_rad, 0.0).tolist() == [0]
+    assert find_blocks_towards_boxes(outlines, empty_tile, np.eye(3), np.empty(0, dtype=np.float32)).shape == (1, 0)
 
 
 def test_no_ray_that_hits_a_box_is_culled():
@@ -114,7 +122,7 @@ def test_no_ray_that_hits_a_box_is_culled():
     generator = np.random.default_rng(0)
     corners_m, sizes, poses = boxes_around(generator, 300)
     origin_m = np.array([0.3, -0.2, 0.1])
-    seen = compute_outlines(corners_m, origin_m)
+    outlines = compute_outlines(corners_m, origin_m)
     turned = convert_euler_to_rotation(30, 20, 10)
     close = 0
     for k, (size, pose) in enumerate(zip(sizes, poses, strict=True)):
@@ -127,15 +135,17 @@ def test_no_ray_that_hits_a_box_is_culled():
         directions = (way_m / range_m[:, None]).T
         (tile,) = split_into_tiles((turned.T @ directions).reshape(3, 10, 10))
         ends_m = range_m.astype(np.float32)
-        assert seen.min_distance_m[k] < range_m.min()
-        assert k in find_boxes_in_cone(seen, turned @ tile.axis, tile.half_angle_rad, float(ends_m.max()))
-        blocks = find_blocks_towards_boxes(seen.select(np.array([k])), tile, turned, ends_m)
+        assert outlines.min_distance_m[k] < range_m.min()
+        assert k in find_boxes_in_cone(outlines, turned @ tile.axis, tile.half_angle_rad, float(ends_m.max()))
+        blocks = find_blocks_towards_boxes(outlines.select(np.array([k])), tile, turned, ends_m)
         assert blocks.all()
         rays = tile.block_rays[blocks[0]]
-        box, kept = find_rays_towards_boxes(seen, np.full(len(rays), k), rays, directions.astype(np.float32), ends_m)
+        box, candidates = find_rays_towards_boxes(
+            outlines, np.full(len(rays), k), rays, directions.astype(np.float32), ends_m
+        )
         assert (box == k).all()
-        np.testing.assert_array_equal(np.unique(kept), np.arange(100))
-        close += bool((seen.normals[k] == 0).all())
+        np.testing.assert_array_equal(np.unique(candidates), np.arange(100))
+        close += bool((outlines.normals[k] == 0).all())
     assert 3 < close < 150
 
 
@@ -144,8 +154,8 @@ def test_rotating_a_ray_is_independent_of_other_rays():
     together = rotate(turn, rays)
     for first in range(0, 2000, 40):
         for count in (1, 2, 3, 5, 8):
-            some = slice(first, first + count)
-            np.testing.assert_array_equal(rotate(turn, rays[:, some]), together[:, some])
+            part = slice(first, first + count)
+            np.testing.assert_array_equal(rotate(turn, rays[:, part]), together[:, part])
     turns = np.array(
         [convert_euler_to_rotation(*angles) for angles in np.random.default_rng(1).uniform(-90, 90, (50, 3))]
     )

@@ -41,7 +41,7 @@ def write(folder, content, name="doc.yaml"):
 
 
 @pytest.mark.parametrize(
-    ("keys", "told"),
+    ("keys", "message"),
     [
         ({"yaw_deg": 1.5708}, "yaw_deg: 1.5708 looks like 90 degrees"),
         ({"x_m": 1.0, "pitch_deg": -0.785, "yaw_deg": 3}, "pitch_deg: -0.785 looks like -45 degrees"),
@@ -54,19 +54,19 @@ def write(folder, content, name="doc.yaml"):
         ({"vertical_fov_deg": (-0.4363, 0.03), "horizontal_fov_deg": 360}, None),
     ],
 )
-def test_degrees_that_look_like_radians_are_reported(keys, told):
+def test_degrees_that_look_like_radians_are_reported(keys, message):
     document = (
         Pose if Pose.model_fields.keys() >= keys.keys() else Lidar if "horizontal_fov_deg" in keys else CameraSensor
     )
-    more = {
+    further_keys = {
         Pose: {},
         Lidar: {"name": "a", "channels": 2, "columns": 8, "max_range_m": 50},
         CameraSensor: {"name": "a", "width": 4, "height": 3, "max_range_m": 50},
     }
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        document.model_validate({**more[document], **keys})
-    assert [told in str(one.message) for one in caught] == [True] * (told is not None)
+        document.model_validate({**further_keys[document], **keys})
+    assert [message in str(warning.message) for warning in caught] == [True] * (message is not None)
 
 
 def test_recording_mounts_in_radians_are_reported():
@@ -161,14 +161,14 @@ def test_repeated_keys_are_refused_in_every_document(tmp_path, kind):
 
 
 def test_a_sensor_without_mount_is_saved_at_origin(tmp_path):
-    given = {"channels": 4, "vertical_fov_deg": (-10, 10), "horizontal_fov_deg": 360, "columns": 8, "max_range_m": 50}
-    Rig(name="r", sensors=(Lidar(name="a", **given),)).save(tmp_path / "rig.yaml")
+    keys = {"channels": 4, "vertical_fov_deg": (-10, 10), "horizontal_fov_deg": 360, "columns": 8, "max_range_m": 50}
+    Rig(name="r", sensors=(Lidar(name="a", **keys),)).save(tmp_path / "rig.yaml")
     assert Rig.load(tmp_path / "rig.yaml").sensors[0].mount == Pose()
 
 
 def test_integers_lists_and_numpy_numbers_are_converted():
-    given = {"vertical_fov_deg": [-10, np.float32(10)], "horizontal_fov_deg": np.int64(360), "max_range_m": 50}
-    lidar = Lidar(name="a", channels=np.int64(4), columns=8, **given)
+    keys = {"vertical_fov_deg": [-10, np.float32(10)], "horizontal_fov_deg": np.int64(360), "max_range_m": 50}
+    lidar = Lidar(name="a", channels=np.int64(4), columns=8, **keys)
     assert lidar.vertical_fov_deg == (-10.0, 10.0)
     assert (lidar.channels, type(lidar.channels), type(lidar.max_range_m)) == (4, int, float)
 
@@ -232,7 +232,7 @@ def test_unknown_names_suggest_the_nearest_name(name):
 
 
 @pytest.mark.parametrize(
-    ("load", "name", "told"),
+    ("load", "name", "message"),
     [
         (Scenario.load, "cut_in.xosc", "one of the scenarios is a .yaml file; OpenSCENARIO is not read"),
         (Scenario.load, "road.xodr", r"name it in a scenario, traffic: \{type: sumo, net"),
@@ -246,9 +246,9 @@ def test_unknown_names_suggest_the_nearest_name(name):
         (read_objects, "cut_in.xosc", "OpenSCENARIO is not read.*; recorded tracks are"),
     ],
 )
-def test_files_of_other_formats_name_the_conversion(tmp_path, load, name, told):
+def test_files_of_other_formats_name_the_conversion(tmp_path, load, name, message):
     (tmp_path / name).write_text("<OpenSCENARIO/>")
-    with pytest.raises(ValueError, match=f"{name}: .*{told}"):
+    with pytest.raises(ValueError, match=f"{name}: .*{message}"):
         load(tmp_path / name)
 
 

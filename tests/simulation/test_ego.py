@@ -18,31 +18,31 @@ def rig(vehicle=None, name="r"):
     return Rig.model_validate({"name": name, "vehicle": vehicle, "sensors": [{**SENSOR, **PATTERN}]})
 
 
-def given(**ego):
+def create_scenario(**ego):
     return Scenario.model_validate({"name": "s", "ego": ego, "bodies": [GROUND]})
 
 
-def procedural(**ego):
+def create_traffic_scenario(**ego):
     return Scenario.model_validate({"name": "s", "traffic": {"type": "parking", "duration_s": 1.0}, "ego": ego or None})
 
 
 def length_m(scenario, *rigs, vehicle=None):
-    carried = {str(k): each for k, each in enumerate(rigs)}
+    rigs_by_name = {str(k): item for k, item in enumerate(rigs)}
     if vehicle is not None:
-        scenario = set_ego(scenario, carried, vehicle)
-    simulator = Simulator(scenario, carried, SMALL)
+        scenario = set_ego(scenario, rigs_by_name, vehicle)
+    simulator = Simulator(scenario, rigs_by_name, SMALL)
     box = simulator.scenario.compute_ego_box()
     assert scenario.traffic is not None or simulator.get_scene_geometry(0)[0].ego_box == box
     return box.size_m[0]
 
 
-@pytest.mark.parametrize("world", [given, procedural])
-def test_the_first_specified_vehicle_is_the_ego(world):
-    assert length_m(world(), rig()) == pytest.approx(4.90)
-    assert length_m(world(), rig("sedan")) == pytest.approx(4.77)
-    assert length_m(world(shape=BOX), rig("sedan")) == pytest.approx(6.0)
-    assert length_m(world(shape=BOX), rig("sedan"), vehicle="van") == pytest.approx(5.93)
-    assert length_m(world(), rig("sedan"), vehicle="van") == pytest.approx(5.93)
+@pytest.mark.parametrize("create", [create_scenario, create_traffic_scenario])
+def test_the_first_specified_vehicle_is_the_ego(create):
+    assert length_m(create(), rig()) == pytest.approx(4.90)
+    assert length_m(create(), rig("sedan")) == pytest.approx(4.77)
+    assert length_m(create(shape=BOX), rig("sedan")) == pytest.approx(6.0)
+    assert length_m(create(shape=BOX), rig("sedan"), vehicle="van") == pytest.approx(5.93)
+    assert length_m(create(), rig("sedan"), vehicle="van") == pytest.approx(5.93)
 
 
 @pytest.mark.parametrize("name", ["courtyard", "urban", "highway", "parking"])
@@ -55,11 +55,11 @@ def test_built_in_scenarios_use_the_vehicle_of_rigs(name):
 def test_rigs_of_different_vehicles_need_a_common_one():
     two = (rig("sedan"), rig("van"))
     with pytest.raises(ValueError, match=r"different vehicles \(0 sedan, 1 van\), .* one ego: choose it by --vehicle"):
-        length_m(given(), *two)
-    assert length_m(given(), *two, vehicle="suv") == pytest.approx(4.90)
-    assert length_m(given(shape=BOX), *two) == pytest.approx(6.0)
+        length_m(create_scenario(), *two)
+    assert length_m(create_scenario(), *two, vehicle="suv") == pytest.approx(4.90)
+    assert length_m(create_scenario(shape=BOX), *two) == pytest.approx(6.0)
     # Equal vehicles, and a rig without a vehicle, do not conflict.
-    assert length_m(given(), rig("sedan"), rig("sedan"), rig()) == pytest.approx(4.77)
+    assert length_m(create_scenario(), rig("sedan"), rig("sedan"), rig()) == pytest.approx(4.77)
 
 
 def test_vehicle_paths_are_relative_to_their_document(tmp_path, monkeypatch):
@@ -76,24 +76,24 @@ def test_vehicle_paths_are_relative_to_their_document(tmp_path, monkeypatch):
         "bodies: [{name: ground, shape: {type: plane, size_m: [9, 9]}}]\n"
     )
     monkeypatch.chdir(tmp_path / "elsewhere")
-    of_rig = set_ego(given(), {"r": Rig.load("../own/rig.yaml")})
+    of_rig = set_ego(create_scenario(), {"r": Rig.load("../own/rig.yaml")})
     assert (of_rig.ego_name, of_rig.compute_ego_box().size_m) == ("cart.yaml", (3.0, 1.5, 1.0))
     assert Scenario.load("../own/scene.yaml").compute_ego_box().size_m == (3.0, 1.5, 1.0)
     # The path of an option is relative to the working directory.
     with pytest.raises(FileNotFoundError, match=r"vehicle: cart\.yaml: no such file"):
-        set_ego(given(), {"r": rig()}, "cart.yaml")
-    assert set_ego(given(), {"r": rig()}, "../own/cart.yaml").ego_name == "cart.yaml"
+        set_ego(create_scenario(), {"r": rig()}, "cart.yaml")
+    assert set_ego(create_scenario(), {"r": rig()}, "../own/cart.yaml").ego_name == "cart.yaml"
 
 
 def test_unknown_vehicles_are_reported_with_their_rig():
     with pytest.raises(FileNotFoundError, match=r"rig 'top': vehicle: 'tank' is neither .* built-in vehicles; is "):
-        set_ego(given(), {"top": rig("tank")})
+        set_ego(create_scenario(), {"top": rig("tank")})
 
 
 def test_frames_depend_on_the_vehicle_and_name_it():
-    scenario = given()
+    scenario = create_scenario()
     frames = [SimulatedFrames(scenario, rig(), num_frames=1, reference_sensor=SMALL, vehicle=v) for v in (None, "van")]
-    assert [each.description["vehicle"] for each in frames] == ["suv", "van"]
+    assert [item.description["vehicle"] for item in frames] == ["suv", "van"]
     assert frames[0].content["scenario"] != frames[1].content["scenario"]
     np.testing.assert_allclose(np.ptp(frames[1].ego_outline_m, axis=0), [5.93, 2.02])
     # The vehicle that a rig names does not matter if another one is chosen, not even for checkpoints.

@@ -11,21 +11,21 @@ CAR = Box(type="box", size_m=(4.0, 2.0, 1.5)).build_mesh()
 UTM_M = np.array([5.6e5, 5.9e6, 80.0])
 
 
-def driving(speed_mps, yaw_deg, start_m, seconds=10.0):
+def build_trajectory(speed_mps, yaw_deg, start_m, seconds=10.0):
     heading = np.array([np.cos(np.deg2rad(yaw_deg)), np.sin(np.deg2rad(yaw_deg)), 0.0])
     start = np.asarray(start_m, dtype=float)
     return Trajectory.from_arrays([0.0, seconds], [start, start + seconds * speed_mps * heading], [[yaw_deg, 0, 0]] * 2)
 
 
-def world(ego, actors, parked=()):
+def build_scene(ego, actors, parked=()):
     return Scene((CAR,), Actor("ego", "car", CAR, ego), tuple(actors), 0.5, 10.0, tuple(parked))
 
 
 def test_labels_are_poses_in_the_vehicle_frame():
     """The ego drives north, 10 m/s; the truck drives east, 5 m/s, 20 m ahead of it after a second."""
-    ego = driving(10.0, 90.0, UTM_M)
-    truck = Actor("truck 1", "truck", CAR, driving(5.0, 0.0, UTM_M + np.array([-5.0, 30.0, 0.0])))
-    (label,) = compute_labels(world(ego, [truck]), time_step_index=2, max_distance_m=100.0)
+    ego = build_trajectory(10.0, 90.0, UTM_M)
+    truck = Actor("truck 1", "truck", CAR, build_trajectory(5.0, 0.0, UTM_M + np.array([-5.0, 30.0, 0.0])))
+    (label,) = compute_labels(build_scene(ego, [truck]), time_step_index=2, max_distance_m=100.0)
     assert (label.name, label.category, label.size_m) == ("truck 1", "truck", (4.0, 2.0, 1.5))
     np.testing.assert_allclose(label.center_m, [20.0, 0.0, 0.75], atol=1e-6)
     assert label.yaw_rad == pytest.approx(-np.pi / 2)
@@ -35,17 +35,17 @@ def test_labels_are_poses_in_the_vehicle_frame():
 
 def test_range_is_horizontal_and_absent_objects_are_unlabeled():
     ego = Trajectory.create_static([0.0, 0.0, 0.0])
-    near = Actor("near", "car", CAR, Trajectory.create_static([30.0, 40.0, 9.0]))
-    far = Actor("far", "car", CAR, Trajectory.create_static([30.0, 40.1, 0.0]))
+    near_actor = Actor("near", "car", CAR, Trajectory.create_static([30.0, 40.0, 9.0]))
+    far_actor = Actor("far", "car", CAR, Trajectory.create_static([30.0, 40.1, 0.0]))
     brief = Trajectory(np.array([0.0, 1.0]), np.array([[9.0, 0, 0], [9.0, 1, 0]]), np.zeros((2, 3)), is_transient=True)
-    made = world(ego, [near, far, Actor("brief", "car", CAR, brief)])
-    assert [label.name for label in compute_labels(made, 0, 50.0)] == ["near", "brief"]
-    assert [label.name for label in compute_labels(made, 4, 50.0)] == ["near"]
+    scene = build_scene(ego, [near_actor, far_actor, Actor("brief", "car", CAR, brief)])
+    assert [label.name for label in compute_labels(scene, 0, 50.0)] == ["near", "brief"]
+    assert [label.name for label in compute_labels(scene, 4, 50.0)] == ["near"]
 
 
 def test_parked_objects_have_labels_too():
     parked = Actor("parked van 0", "car", CAR, Trajectory.create_static([7.0, 3.0, 0.0], [180.0, 0.0, 0.0]))
-    (label,) = compute_labels(world(Trajectory.create_static([0, 0, 0]), [], [parked]), 3, 50.0)
+    (label,) = compute_labels(build_scene(Trajectory.create_static([0, 0, 0]), [], [parked]), 3, 50.0)
     assert label.name == "parked van 0"
     np.testing.assert_array_equal(label.velocity_mps, 0.0)
 

@@ -32,8 +32,8 @@ def sheet(heights, half=60.0, every=5.0, down=False):
     side = np.arange(-half, half + every / 2, every)
     x, y = np.meshgrid(side, side, indexing="ij")
     number = np.arange(x.size).reshape(x.shape)
-    here, right, above, across = number[:-1, :-1], number[1:, :-1], number[:-1, 1:], number[1:, 1:]
-    faces = np.concatenate([np.stack(f, -1).reshape(-1, 3) for f in ((here, right, across), (here, across, above))])
+    corner, right, above, across = number[:-1, :-1], number[1:, :-1], number[:-1, 1:], number[1:, 1:]
+    faces = np.concatenate([np.stack(f, -1).reshape(-1, 3) for f in ((corner, right, across), (corner, across, above))])
     vertices = np.stack([x.ravel(), y.ravel(), heights(x, y).ravel()], axis=1)
     return Mesh(vertices, faces[:, ::-1] if down else faces)
 
@@ -55,8 +55,8 @@ def wedge(x, y, z):
     return Mesh(np.array(bottom + top, dtype=float), np.array(faces))
 
 
-def ground_of(static, places=((0.0, 0.0, 0.0),)):
-    masks = find_ground_faces(static, np.array(places))
+def ground_of(static, positions=((0.0, 0.0, 0.0),)):
+    masks = find_ground_faces(static, np.array(positions))
     return LocalGround([Mesh(m.vertices_m, m.faces[k]) for m, k in zip(static, masks, strict=True)], np.zeros(3))
 
 
@@ -70,8 +70,8 @@ PLANE = sheet(lambda x, y: 0 * x)
 def test_sidewalks_are_ground_and_roofs_are_not():
     house, pavement, car = solid((9, 9, 6), 20), solid((9, 3, 0.15), -20), solid((4, 2, 1.4), 0, 10)
     ground = ground_of([PLANE, house, pavement, car])
-    found = heights(ground, [20, 0, 7], [-20, 0, 1.15], [0, 10, 1.4], [5, 5, 2], [5, 5, -1], [5, 5, -0.02])
-    np.testing.assert_allclose(found, [7, 1, 1.4, 2, np.nan, -0.02], atol=1e-5)
+    heights_m = heights(ground, [20, 0, 7], [-20, 0, 1.15], [0, 10, 1.4], [5, 5, 2], [5, 5, -1], [5, 5, -0.02])
+    np.testing.assert_allclose(heights_m, [7, 1, 1.4, 2, np.nan, -0.02], atol=1e-5)
     assert math.isnan(heights(ground, [500, 0, 2])[0])
 
 
@@ -80,9 +80,11 @@ def test_ramps_connect_a_bridge_with_the_road():
     deck = solid((20, 6, 0.8), 40, 0, 4.2)
     down = wedge((10, 30), (-3, 3), (0, 5)).transform(build_transform(convert_euler_to_rotation(180, 0, 0), [80, 0, 0]))
     ground = ground_of([PLANE, up, deck, down])
-    found = heights(ground, [20, 0, 2.5], [20, 0, 3.5], [40, 0, 6], [40, 0, 2], [40, 0, 4.6], [40, 10, 6], [55, 0, 6])
+    heights_m = heights(
+        ground, [20, 0, 2.5], [20, 0, 3.5], [40, 0, 6], [40, 0, 2], [40, 0, 4.6], [40, 10, 6], [55, 0, 6]
+    )
     # On the ramp, above it, above the bridge, below it, in it (the road is the ground), next to it, on the way down.
-    np.testing.assert_allclose(found, [0, 1, 1, 2, 4.6, 6, 6 - 3.75], atol=1e-5)
+    np.testing.assert_allclose(heights_m, [0, 1, 1, 2, 4.6, 6, 6 - 3.75], atol=1e-5)
     # A bridge without a ramp is a roof.
     np.testing.assert_allclose(heights(ground_of([PLANE, deck]), [40, 0, 6]), [6], atol=1e-5)
 
@@ -97,8 +99,8 @@ def test_stairs_connect_levels_of_a_parking_garage():
     )
     ground = ground_of([PLANE, *stairs, deck, pillar])
     top = 0.18 * 17
-    found = heights(ground, [24, 12, 1.5], [24, 12, top + 1.5], [6.5, 12, 2.0], [8, 0, 1.0])
-    np.testing.assert_allclose(found, [1.5, 1.5, 2.0 - 0.18 * 6, 1.0], atol=1e-5)
+    heights_m = heights(ground, [24, 12, 1.5], [24, 12, top + 1.5], [6.5, 12, 2.0], [8, 0, 1.0])
+    np.testing.assert_allclose(heights_m, [1.5, 1.5, 2.0 - 0.18 * 6, 1.0], atol=1e-5)
 
 
 @pytest.mark.parametrize("down", [False, True])
@@ -117,10 +119,12 @@ def test_terrain_is_ground_for_any_face_orientation(down):
 def test_heights_are_along_the_world_vertical():
     ground = ground_of([PLANE, solid((9, 3, 0.15), -20)])
     rng = np.random.default_rng(2)
-    world = np.column_stack([rng.uniform(-50, 50, (200, 2)), rng.uniform(-0.03, 9, 200)])
+    world_points_m = np.column_stack([rng.uniform(-50, 50, (200, 2)), rng.uniform(-0.03, 9, 200)])
     pose = build_transform(convert_euler_to_rotation(70, 3, -2), [4, -7, 1.0])
-    inside = (world - pose[:3, 3]) @ pose[:3, :3]
-    np.testing.assert_allclose(ground.compute_heights_m(inside, pose), ground.compute_heights_m(world), atol=1e-4)
+    inside = (world_points_m - pose[:3, 3]) @ pose[:3, :3]
+    np.testing.assert_allclose(
+        ground.compute_heights_m(inside, pose), ground.compute_heights_m(world_points_m), atol=1e-4
+    )
 
 
 def test_steep_or_distant_faces_are_not_ground():
@@ -154,21 +158,24 @@ def test_height_bounds_contain_all_points_of_triangles():
     low, high = ground.height_pyramid.compute_height_bounds_m(triangles)
     for _ in range(20):
         share = rng.dirichlet([0.5] * 3)
-        found = ground.compute_heights_m(np.einsum("c,cin->ni", share, triangles))
-        known = np.isfinite(found)
-        assert (found[known] >= low[known]).all()
-        assert (found[known] <= high[known]).all()
+        heights_m = ground.compute_heights_m(np.einsum("c,cin->ni", share, triangles))
+        has_ground = np.isfinite(heights_m)
+        assert (heights_m[has_ground] >= low[has_ground]).all()
+        assert (heights_m[has_ground] <= high[has_ground]).all()
 
 
-def scan(world, sensor, seed, step=0):
-    scene = SceneGeometry(world)
-    return sensor.scan(ReferenceContext(scene, scene.get_snapshot(step), np.random.default_rng(seed), "a test"))
+def scan(scene, sensor, seed, time_step_index=0):
+    """Scan a scene once with a reference sensor."""
+    geometry = SceneGeometry(scene)
+    return sensor.scan(
+        ReferenceContext(geometry, geometry.get_snapshot(time_step_index), np.random.default_rng(seed), "a test")
+    )
 
 
 def resting(static, **pose):
-    place = [pose.pop(key, 0.0) for key in ("x", "y", "z")]
+    position = [pose.pop(key, 0.0) for key in ("x", "y", "z")]
     matrix = build_transform(
-        convert_euler_to_rotation(*(pose.get(key, 0.0) for key in ("yaw", "pitch", "roll"))), place
+        convert_euler_to_rotation(*(pose.get(key, 0.0) for key in ("yaw", "pitch", "roll"))), position
     )
     return Scene(tuple(static), Actor("ego", "ego", EGO_MESH, Trajectory.from_poses([0.0], matrix[None])))
 
@@ -178,15 +185,15 @@ OBSTACLE = SurfaceReference(AREA, num_rays=600, num_poses=2, bands_m=((0.5, 2.0)
 
 
 @pytest.mark.parametrize("slope", [0.0, 0.06, -0.06])
-def test_walls_are_cut_by_height_above_slope(at, slope):
-    at([2.6, 0.0, 1.0])
+def test_walls_are_cut_by_height_above_slope(fix_position, slope):
+    fix_position([2.6, 0.0, 1.0])
     wall = Mesh(np.array([[25, -8, -5], [25, 8, -5], [25, 8, 9], [25, -8, 9.0]]), np.array([[0, 1, 2], [0, 2, 3]]))
-    world = resting([sheet(lambda x, y: slope * x + 0.04 * y), wall], pitch=-math.degrees(math.atan(slope)))
-    found = [scan(world, OBSTACLE, seed) for seed in range(40)]
-    for one in found:
-        assert ((one.heights_m >= 0.5) & (one.heights_m < 2)).all()
-        np.testing.assert_allclose(one.points[:, 0] - 25 * math.hypot(1, slope), 0, atol=1.0)
-    agrees(np.array([one.weights.astype(np.float64).sum() for one in found]), 16 * 1.5)
+    scene = resting([sheet(lambda x, y: slope * x + 0.04 * y), wall], pitch=-math.degrees(math.atan(slope)))
+    scans = [scan(scene, OBSTACLE, seed) for seed in range(40)]
+    for scan_ in scans:
+        assert ((scan_.heights_m >= 0.5) & (scan_.heights_m < 2)).all()
+        np.testing.assert_allclose(scan_.points[:, 0] - 25 * math.hypot(1, slope), 0, atol=1.0)
+    agrees(np.array([scan_.weights.astype(np.float64).sum() for scan_ in scans]), 16 * 1.5)
 
 
 def test_sampling_by_height_is_unbiased():
@@ -195,25 +202,29 @@ def test_sampling_by_height_is_unbiased():
     areas = (((5.0, 45.0), (-10.0, 10.0)), ((15.0, 25.0), (-5.0, 5.0)))
     bands = ((0.5, 2.0), (-0.5, 0.5), (0.2, 1.0))
 
-    def both(rays, places, count):
-        sensor = SurfaceReference(areas, rays, places, bands, band_frame="ground")
+    def compute_sums(rays, num_poses, count):
+        sensor = SurfaceReference(areas, rays, num_poses, bands, band_frame="ground")
         sums = []
         for seed in range(count):
-            one = sensor.scan(ReferenceContext(scene, scene.get_snapshot(0), np.random.default_rng(seed), "a test"))
-            low = (one.heights_m < 0.5) & (one.points[:, 0] > 6)
-            sums.append([one.weights[low].sum(), one.weights[one.heights_m >= 0.5].sum()])
+            reference_scan = sensor.scan(
+                ReferenceContext(scene, scene.get_snapshot(0), np.random.default_rng(seed), "a test")
+            )
+            low = (reference_scan.heights_m < 0.5) & (reference_scan.points[:, 0] > 6)
+            sums.append(
+                [reference_scan.weights[low].sum(), reference_scan.weights[reference_scan.heights_m >= 0.5].sum()]
+            )
         return np.array(sums, dtype=np.float64)
 
-    many = both(10_000, 8, 25)
-    for rays, places, count in ((400, 2, 200), (30, 1, 500)):
-        few = both(rays, places, count)
-        error = np.hypot(*(kind.std(axis=0, ddof=1) / math.sqrt(len(kind)) for kind in (few, many)))
-        assert (np.abs(few.mean(axis=0) - many.mean(axis=0)) < 4 * error).all()
-        assert (error < 0.1 * many.mean(axis=0)).all()
+    exact = compute_sums(10_000, 8, 25)
+    for rays, num_poses, count in ((400, 2, 200), (30, 1, 500)):
+        sums_ = compute_sums(rays, num_poses, count)
+        error = np.hypot(*(kind.std(axis=0, ddof=1) / math.sqrt(len(kind)) for kind in (sums_, exact)))
+        assert (np.abs(sums_.mean(axis=0) - exact.mean(axis=0)) < 4 * error).all()
+        assert (error < 0.1 * exact.mean(axis=0)).all()
 
 
-def test_both_band_frames_agree_on_level_ground(at):
-    at([2.6, 0.0, 1.0])
+def test_both_band_frames_agree_on_level_ground(fix_position):
+    fix_position([2.6, 0.0, 1.0])
     wall = box([0.2, 10, 3], x_m=20)
     made = scenario({**FLOOR, "ground": True}, wall)
     for frame in ("ground", "vehicle"):
@@ -221,34 +232,37 @@ def test_both_band_frames_agree_on_level_ground(at):
         agrees(sums(made, sensor), 15.0)
 
 
-def test_sunken_bodies_count_from_the_ground_up(at):
+def test_sunken_bodies_count_from_the_ground_up(fix_position):
     """The upper 5 cm of the front of a ledge of 4 x 4 m count as its top, as for curbs."""
-    at([2.6, 0.0, 2.0])
+    fix_position([2.6, 0.0, 2.0])
     ledge = {"name": "ledge", "ground": True, "shape": {"type": "box", "size_m": [4, 4, 2]}, "poses": [{"x_m": 12}]}
     for sunk_m in (0.0, 1.0, 1.6):
         made = scenario({**FLOOR, "ground": True}, {**ledge, "poses": [{"x_m": 12, "z_m": -sunk_m}]})
         high_m = 2.0 - sunk_m
         front = SurfaceReference((((9.5, 14.5), (-2.5, 2.5)),), 300, 1, ((0.5, 2.0),))
-        agrees(sums(made, front, steps=20), 4 * max(high_m - 0.05 - 0.5, 0))
+        agrees(sums(made, front, num_frames=20), 4 * max(high_m - 0.05 - 0.5, 0))
         if high_m < 2:  # the top is visible from here
             area = SurfaceReference((((10.0, 14.0), (-2.0, 2.0)),), 300, 1, ((-0.5, 0.5),))
-            agrees(sums(made, area, steps=20), 16 + 4 * min(high_m, 0.5 + 0.05))
+            agrees(sums(made, area, num_frames=20), 16 + 4 * min(high_m, 0.5 + 0.05))
 
 
-def test_moving_bodies_are_cut_by_height_above_ground(at):
-    at([2.6, 0.0, 1.0])
+def test_moving_bodies_are_cut_by_height_above_ground(fix_position):
+    fix_position([2.6, 0.0, 1.0])
     hill = sheet(lambda x, y: 0.08 * x)
     times = np.array([0.0, 1.0])
     lane = np.array([[20.0, -4, 1.6], [21, -4, 1.68]])
     truck = Actor("t", "truck", solid((6, 2, 3)), Trajectory(times, lane, np.zeros((2, 3))))
     drive = Trajectory(times, np.array([[0.0, 0, 0], [1, 0, 0.08]]), np.zeros((2, 3)))
-    world = Scene((hill,), Actor("ego", "ego", EGO_MESH, drive), (truck,), 1.0, 1.0)
-    only = [scan(world, OBSTACLE, seed) for seed in range(60)]
-    for one in only:
-        assert ((one.heights_m >= 0.5) & (one.heights_m < 2)).all()
+    scene = Scene((hill,), Actor("ego", "ego", EGO_MESH, drive), (truck,), 1.0, 1.0)
+    only = [scan(scene, OBSTACLE, seed) for seed in range(60)]
+    for reference_scan in only:
+        assert ((reference_scan.heights_m >= 0.5) & (reference_scan.heights_m < 2)).all()
     # Side and upright rear that face the ego: 1.5 m of each, up to a bevel by the slope.
-    weights = np.array([one.weights[one.points[:, 1] > -3.001].sum() for one in only], dtype=np.float64)
-    agrees(weights, 6 * 1.5, within=0.05)
+    weights = np.array(
+        [reference_scan.weights[reference_scan.points[:, 1] > -3.001].sum() for reference_scan in only],
+        dtype=np.float64,
+    )
+    agrees(weights, 6 * 1.5, max_relative_error=0.05)
 
 
 def attitudes():
@@ -259,28 +273,28 @@ def test_heights_are_independent_of_ego_attitude():
     """The same world positions have the same heights for any attitude of the ego vehicle."""
     static = [sheet(lambda x, y: 0.03 * x), solid((3, 3, 2.5), 20, 2), solid((8, 3, 0.15), -20, 0, -0.6)]
     rng = np.random.default_rng(4)
-    places = np.column_stack([rng.uniform(-50, 50, (2000, 2)), rng.uniform(-1, 4, 2000)])
-    found = []
+    positions = np.column_stack([rng.uniform(-50, 50, (2000, 2)), rng.uniform(-1, 4, 2000)])
+    all_heights_m = []
     for pose in attitudes():
-        world = resting(static, z=0.1, **pose)
-        instant = SceneGeometry(world).get_snapshot(0)
-        inside = (places - instant.world_T_vehicle[:3, 3]) @ instant.world_T_vehicle[:3, :3]
-        found.append(instant.compute_heights_m(inside.astype(np.float32)))
-    for other in found[1:]:
-        np.testing.assert_allclose(other, found[0], atol=2e-4)
+        scene = resting(static, z=0.1, **pose)
+        snapshot = SceneGeometry(scene).get_snapshot(0)
+        inside = (positions - snapshot.world_T_vehicle[:3, 3]) @ snapshot.world_T_vehicle[:3, :3]
+        all_heights_m.append(snapshot.compute_heights_m(inside.astype(np.float32)))
+    for heights_m in all_heights_m[1:]:
+        np.testing.assert_allclose(heights_m, all_heights_m[0], atol=2e-4)
 
 
 def test_positions_below_ground_are_refused():
     flat = {True: sheet(lambda x, y: 0 * x, down=True), False: PLANE}
     for mesh in flat.values():
-        instant = SceneGeometry(resting([mesh])).get_snapshot(0)
-        assert not instant.is_occupied(np.array([3.0, 0.0, 0.3]))
-        assert instant.is_occupied(np.array([3.0, 0.0, -0.3]))
+        snapshot = SceneGeometry(resting([mesh])).get_snapshot(0)
+        assert not snapshot.is_occupied(np.array([3.0, 0.0, 0.3]))
+        assert snapshot.is_occupied(np.array([3.0, 0.0, -0.3]))
     roof = sheet(lambda x, y: 0 * x + 3, half=5)
     inside = solid((4, 4, 2), 8)
-    instant = SceneGeometry(resting([PLANE, roof, inside])).get_snapshot(0)
-    assert not instant.is_occupied(np.array([3.0, 0.0, 0.5]))  # under an open roof whose faces point up
-    assert instant.is_occupied(np.array([8.0, 0.0, 1.0]))
+    snapshot = SceneGeometry(resting([PLANE, roof, inside])).get_snapshot(0)
+    assert not snapshot.is_occupied(np.array([3.0, 0.0, 0.5]))  # under an open roof whose faces point up
+    assert snapshot.is_occupied(np.array([8.0, 0.0, 1.0]))
 
 
 def test_frames_keep_heights_through_transforms_and_storage(tmp_path):
@@ -299,9 +313,9 @@ def test_frames_keep_heights_through_transforms_and_storage(tmp_path):
     assert collate_frames([unknown]).get_heights_m("vehicle") is None
     torch.testing.assert_close(scale(frame, 2.0).reference_heights_m, 2 * frame.reference_heights_m)
     write_recording(frames, tmp_path / "there")
-    again = RecordedFrames(tmp_path / "there")[0]
-    assert torch.equal(again.reference_heights_m, frame.reference_heights_m)
-    torch.testing.assert_close(again.boxes.bottom_heights_m, frame.boxes.bottom_heights_m)
+    loaded_frame = RecordedFrames(tmp_path / "there")[0]
+    assert torch.equal(loaded_frame.reference_heights_m, frame.reference_heights_m)
+    torch.testing.assert_close(loaded_frame.boxes.bottom_heights_m, frame.boxes.bottom_heights_m)
 
 
 def test_boxes_have_bottom_heights_above_ground():
@@ -317,9 +331,9 @@ def test_unmarked_ground_is_found_and_noted():
     deck = {"name": "deck", "shape": {"type": "box", "size_m": [9, 9, 4]}, "poses": [{"x_m": -30}]}
     guessed = Simulator(scenario(FLOOR, wall, deck), {}, OBSTACLE)
     assert "of 'floor'; bodies with" in guessed.ground_note
-    said = Simulator(scenario(FLOOR, wall, {**deck, "ground": True}), {}, OBSTACLE)
-    assert said.ground_note == ""
-    assert [bool(mask.any()) for mask in said.get_scene_geometry(0)[0].ground_masks] == [False, False, True]
+    marked = Simulator(scenario(FLOOR, wall, {**deck, "ground": True}), {}, OBSTACLE)
+    assert marked.ground_note == ""
+    assert [bool(mask.any()) for mask in marked.get_scene_geometry(0)[0].ground_masks] == [False, False, True]
     nothing = Simulator(scenario(wall, ego={**EGO, "pose": {"z_m": 30}}), {}, OBSTACLE)
     assert "none was found" in nothing.ground_note
     assert np.isnan(nothing.simulate_frame(0).reference_heights_m).all()
@@ -347,9 +361,9 @@ def test_bodies_without_level_faces_cannot_be_ground():
 
 
 def test_ground_of_the_courtyard_matches_the_search():
-    world = Scenario.load("courtyard").build_scene()
-    said, found = (
-        SceneGeometry(dataclasses.replace(world, ground_mesh_indices=known)).ground_masks
-        for known in (world.ground_mesh_indices, None)
+    scene = Scenario.load("courtyard").build_scene()
+    marked, found_masks = (
+        SceneGeometry(dataclasses.replace(scene, ground_mesh_indices=ground_indices)).ground_masks
+        for ground_indices in (scene.ground_mesh_indices, None)
     )
-    assert [mask.tolist() for mask in said] == [mask.tolist() for mask in found]
+    assert [mask.tolist() for mask in marked] == [mask.tolist() for mask in found_masks]

@@ -102,9 +102,9 @@ def test_polygons_keep_their_area_in_any_plane():
     vertices = np.insert(np.concatenate(shapes), 2, 0.0, axis=1) @ rotation.T + [1e3, 0.0, 5.0]
     triangles = triangulate(vertices, [np.arange(*ends[k : k + 2]) for k in range(len(shapes))])
     a, b, c = vertices[triangles].swapaxes(0, 1)
-    each = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
     of_shape = np.searchsorted(ends, triangles[:, 0], side="right") - 1
-    np.testing.assert_allclose(np.bincount(of_shape, each), [shoelace(shape) for shape in shapes], rtol=1e-9)
+    np.testing.assert_allclose(np.bincount(of_shape, area), [shoelace(shape) for shape in shapes], rtol=1e-9)
 
 
 def as_glb(meshes):
@@ -165,22 +165,22 @@ def test_blocked_cameras_are_told_about_transparent_windows(tmp_path):
     (tmp_path / "car.glb").write_bytes(as_glb(sides))
     camera = CameraSensor(name="cam", mount=Pose(z_m=1.0), width=64, height=48, fov_deg=90.0, max_range_m=50.0)
     rig, courtyard = Rig(name="inside", sensors=(camera,)), Scenario.load("courtyard")
-    for key, told in (
+    for key, message in (
         ("", "glass.* look transparent .* give its shape `transparent: .glass.`"),
         (", transparent: [glass]", ""),
     ):
         shape = f"{{type: mesh, path: car.glb{key}}}"
         (tmp_path / "car.yaml").write_text(f"name: car\nparts: [{{name: body, shape: {shape}}}]\n")
         frames = SimulatedFrames(courtyard, rig, num_frames=1, vehicle=tmp_path / "car.yaml")
-        with warnings.catch_warnings(), pytest.raises(ValueError, match=told) if told else nullcontext():
+        with warnings.catch_warnings(), pytest.raises(ValueError, match=message) if message else nullcontext():
             warnings.simplefilter("ignore")  # windows become holes
             assert len(frames[0].sensor) > 100
 
 
-@pytest.mark.parametrize(("name", "told"), [("a.fbx", "export it as GLB"), ("a.urdf", "`torchcover robot` reads")])
-def test_unsupported_formats_name_the_conversion(tmp_path, name, told):
+@pytest.mark.parametrize(("name", "message"), [("a.fbx", "export it as GLB"), ("a.urdf", "`torchcover robot` reads")])
+def test_unsupported_formats_name_the_conversion(tmp_path, name, message):
     (tmp_path / name).write_bytes(b"Kaydara FBX Binary")
-    with pytest.raises(BadFileError, match=f"is no mesh that can be read; {told}"):
+    with pytest.raises(BadFileError, match=f"is no mesh that can be read; {message}"):
         MeshFile(type="mesh", path=tmp_path / name).build_mesh()
 
 
@@ -201,18 +201,18 @@ def test_latin_1_text_equals_utf_8_text(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "error", "told"),
+    ("name", "content", "error", "message"),
     [
         ("a.step", "ISO-10303-21;", ImportError, r"\.step needs cascadio: pip install cascadio"),
         ("a.gltf", "KHR_draco_mesh_compression", ImportError, r"\.gltf needs DracoPy: pip install DracoPy"),
         ("a.gltf", "EXT_meshopt_compression", BadFileError, "compressed by EXT_meshopt_compression; export it without"),
     ],
 )
-def test_missing_packages_are_not_reported_as_damage(tmp_path, name, content, error, told):
+def test_missing_packages_are_not_reported_as_damage(tmp_path, name, content, error, message):
     """trimesh would read compressed glTF as points at the origin."""
     text = f'{{"asset": {{}}, "extensionsRequired": ["{content}"]}}' if name == "a.gltf" else content
     (tmp_path / name).write_text(text)
-    with pytest.raises(error, match=rf"{name}: .*{told}"):
+    with pytest.raises(error, match=rf"{name}: .*{message}"):
         MeshFile(type="mesh", path=tmp_path / name).build_mesh()
 
 

@@ -48,10 +48,13 @@ def test_only_foreign_vehicles_suggest_the_vehicle_option():
     kitti = Rig.load("kitti")
     low = kitti.sensors[0].model_copy(update={"mount": Pose(z_m=0.8)})
     low = kitti.model_copy(update={"sensors": (low,)})
-    for vehicle, said in ((None, "move its mount$"), ("suv", r"own vehicle \(--vehicle volkswagen_passat_estate\)$")):
-        world = set_ego(Scenario.load("courtyard"), {"kitti": low}, vehicle)
-        with pytest.raises(ValueError, match=said):
-            Simulator(world, {"kitti": low}, PaperReference(rows=4, columns=4)).simulate_frame(0)
+    for vehicle, message in (
+        (None, "move its mount$"),
+        ("suv", r"own vehicle \(--vehicle volkswagen_passat_estate\)$"),
+    ):
+        scenario = set_ego(Scenario.load("courtyard"), {"kitti": low}, vehicle)
+        with pytest.raises(ValueError, match=message):
+            Simulator(scenario, {"kitti": low}, PaperReference(rows=4, columns=4)).simulate_frame(0)
 
 
 def test_sensors_inside_other_bodies_are_refused(tmp_path):
@@ -89,7 +92,7 @@ def test_sensors_may_lie_on_the_ego_surface(tmp_path, speed_mps):
 @pytest.mark.parametrize("moving", [False, True])
 def test_the_ego_is_neither_ground_nor_enclosing(tmp_path, moving):
     scene = SceneGeometry(simulator(tmp_path, {"z_m": 1.6}, speed_mps=2.0 * moving).scenario.build_scene())
-    instant = scene.get_snapshot(0)
-    assert not instant.is_occupied(np.array([0.0, 0.0, 0.5]))
-    assert not instant.is_on_surface(np.array([0.5, 0.5, 1.0]))
-    assert instant.is_on_surface(np.array([30.0, 0.5, 0.0]))
+    snapshot = scene.get_snapshot(0)
+    assert not snapshot.is_occupied(np.array([0.0, 0.0, 0.5]))
+    assert not snapshot.is_on_surface(np.array([0.5, 0.5, 1.0]))
+    assert snapshot.is_on_surface(np.array([30.0, 0.5, 0.0]))

@@ -24,10 +24,12 @@ def same_points(a, b):
 
 
 def test_counts_report_omitted_work_in_traffic():
-    near, far = (simulator("urban", max_range_m=metres).simulate_frame(5).counts for metres in (30.0, 200.0))
-    assert near["moving_bodies"] == far["moving_bodies"]
-    assert near["moving_bodies_out_of_range"] > far["moving_bodies_out_of_range"]
-    for counts in (near, far):
+    near_counts, far_counts = (
+        simulator("urban", max_range_m=metres).simulate_frame(5).counts for metres in (30.0, 200.0)
+    )
+    assert near_counts["moving_bodies"] == far_counts["moving_bodies"]
+    assert near_counts["moving_bodies_out_of_range"] > far_counts["moving_bodies_out_of_range"]
+    for counts in (near_counts, far_counts):
         in_range = counts["moving_bodies"] - counts["moving_bodies_out_of_range"]
         assert in_range >= 1
         assert counts["ray_body_pairs"] == in_range * (counts["sensor_rays"] + counts["reference_rays"])
@@ -56,9 +58,9 @@ def test_reused_scans_equal_new_scans(keys):
 def test_changing_a_frame_does_not_affect_the_next():
     used = simulator("courtyard")
     first = used.simulate_frame(0).clouds["r"]
-    kept = first.copy()
+    copy_ = first.copy()
     first[:] = 0.0
-    np.testing.assert_array_equal(used.simulate_frame(1).clouds["r"], kept)
+    np.testing.assert_array_equal(used.simulate_frame(1).clouds["r"], copy_)
 
 
 def test_bodies_out_of_range_change_nothing(monkeypatch):
@@ -72,7 +74,7 @@ def test_bodies_out_of_range_change_nothing(monkeypatch):
     moves = [
         actor.trajectory for actor in scene.scene.actors if actor.trajectory.is_moving or actor.trajectory.is_transient
     ]
-    absent = sum(not np.isfinite(one.interpolate_positions_m(time_s)).all() for one in moves)
+    absent = sum(not np.isfinite(trajectory.interpolate_positions_m(time_s)).all() for trajectory in moves)
     assert unlimited.counts["moving_bodies_out_of_range"] == absent < limited.counts["moving_bodies_out_of_range"]
     assert same_points(limited, unlimited)
 
@@ -86,5 +88,5 @@ def test_ranges_start_at_the_sensor(tmp_path):
     scenario = Scenario.model_validate({"name": "s", "ego": {"shape": box}, "bodies": [ground], "actors": [mover]})
     reference = PaperReference(rows=8, columns=8, max_range_m=30.0)
     lidar = rig(30.0, mount={"x_m": 3.0, "z_m": 1.0}, vertical_fov_deg=[-1, 1], columns=720)
-    seen = Simulator(scenario, {"r": lidar}, reference).simulate_frame(0)
-    assert seen.clouds["r"][:, 0].max() == pytest.approx(32.0, abs=1e-3)
+    observation = Simulator(scenario, {"r": lidar}, reference).simulate_frame(0)
+    assert observation.clouds["r"][:, 0].max() == pytest.approx(32.0, abs=1e-3)

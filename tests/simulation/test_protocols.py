@@ -72,9 +72,9 @@ class DownReference:
         pose, redrawn = context.sample_free_pose(self.sample_pose)
         x, y = context.rng.uniform(-0.1, 0.1, size=(2, 1, self.num_rays))
         tiles = split_into_tiles(np.stack([x, y, -np.sqrt(1 - x**2 - y**2)]))
-        seen = context.snapshot.scan(pose, tiles, max_range_m=self.max_range_m)
-        weights = np.full(len(seen.points), 2.0, dtype=np.float32)
-        return ReferenceScan(seen.points, weights, seen.num_rays, seen.self_hits, seen.num_body_casts, redrawn)
+        scan = context.snapshot.scan(pose, tiles, max_range_m=self.max_range_m)
+        weights = np.full(len(scan.points), 2.0, dtype=np.float32)
+        return ReferenceScan(scan.points, weights, scan.num_rays, scan.self_hits, scan.num_body_casts, redrawn)
 
     def sample_pose(self, ego_box, rng):
         return build_transform(np.eye(3), sample_position_in_shell(ego_box, self.shell_m, rng))
@@ -119,10 +119,10 @@ def test_sensor_directions_are_unit_vectors_or_nan(sensor):
     assert directions.dtype == np.float64
     assert directions.ndim == 3
     assert len(directions) == 3
-    there = ~np.isnan(directions)
-    assert there.any()
-    assert (there.all(axis=0) == there.any(axis=0)).all()
-    lengths = np.linalg.norm(directions, axis=0)[there[0]]
+    has_ray = ~np.isnan(directions)
+    assert has_ray.any()
+    assert (has_ray.all(axis=0) == has_ray.any(axis=0)).all()
+    lengths = np.linalg.norm(directions, axis=0)[has_ray[0]]
     np.testing.assert_allclose(lengths, 1.0, atol=1e-12)
     np.testing.assert_array_equal(sensor.compute_directions(), directions)
 
@@ -152,9 +152,9 @@ def test_only_hits_within_range_limits_give_points(sensor):
     exact = sensor.model_copy(update={"range_noise_m": 0.0, "dropout": 0.0})
     assert exact.is_exact
     assert not sensor.is_exact
-    near, far = hits_of(exact, 0.99), hits_of(exact, 1.0)
-    assert len(hit_by(exact.measure(near, SensorNoise(None)), len(near.ray_indices))) == 0
-    hit = hit_by(exact.measure(far, SensorNoise(None)), len(far.ray_indices))
+    near_hits, far_hits = hits_of(exact, 0.99), hits_of(exact, 1.0)
+    assert len(hit_by(exact.measure(near_hits, SensorNoise(None)), len(near_hits.ray_indices))) == 0
+    hit = hit_by(exact.measure(far_hits, SensorNoise(None)), len(far_hits.ray_indices))
     assert len(hit) > 0
     assert (np.diff(hit) > 0).all()
     none = hits_of(exact, 5.0, np.empty(0, dtype=np.int64))
@@ -164,26 +164,29 @@ def test_only_hits_within_range_limits_give_points(sensor):
 def test_beams_are_measured_independently(sensor):
     """Removing hits of some beams does not change the points of other beams, for any number of positions."""
     beams, random = sensor.compute_beam_indices(), np.random.default_rng(5)
-    whole = hits_of(sensor, random.uniform(0.5, 9.0, len(hits_of(sensor, 1.0).ray_indices)))
-    of_ray = whole.ray_indices if beams is None else beams.ravel()[whole.pixel_indices]
-    measured = sensor.measure(whole, SensorNoise(np.random.default_rng(0), num_rays=len(whole.ray_indices)))
-    kept = np.flatnonzero(of_ray % 3 != 1)
+    all_hits = hits_of(sensor, random.uniform(0.5, 9.0, len(hits_of(sensor, 1.0).ray_indices)))
+    of_ray = all_hits.ray_indices if beams is None else beams.ravel()[all_hits.pixel_indices]
+    measured = sensor.measure(all_hits, SensorNoise(np.random.default_rng(0), num_rays=len(all_hits.ray_indices)))
+    remaining = np.flatnonzero(of_ray % 3 != 1)
     part = RayHits(
-        whole.ray_indices[kept], whole.range_m[kept], whole.ray_pixel_indices, np.zeros(len(kept), dtype=np.int64)
+        all_hits.ray_indices[remaining],
+        all_hits.range_m[remaining],
+        all_hits.ray_pixel_indices,
+        np.zeros(len(remaining), dtype=np.int64),
     )
-    of_part = sensor.measure(part, SensorNoise(np.random.default_rng(0), num_rays=len(whole.ray_indices)))
-    left = np.isin(measured.hit_indices, kept)
-    np.testing.assert_array_equal(kept[of_part.hit_indices], measured.hit_indices[left])
+    of_part = sensor.measure(part, SensorNoise(np.random.default_rng(0), num_rays=len(all_hits.ray_indices)))
+    left = np.isin(measured.hit_indices, remaining)
+    np.testing.assert_array_equal(remaining[of_part.hit_indices], measured.hit_indices[left])
     np.testing.assert_array_equal(of_part.range_error_m, measured.range_error_m[left])
     twice = RayHits(
-        np.tile(whole.ray_indices, 2),
-        np.tile(whole.range_m, 2),
-        whole.ray_pixel_indices,
-        np.repeat([0, 1], len(whole.ray_indices)),
+        np.tile(all_hits.ray_indices, 2),
+        np.tile(all_hits.range_m, 2),
+        all_hits.ray_pixel_indices,
+        np.repeat([0, 1], len(all_hits.ray_indices)),
     )
-    both = sensor.measure(twice, SensorNoise(np.random.default_rng(0), num_rays=len(whole.ray_indices)))
+    combined = sensor.measure(twice, SensorNoise(np.random.default_rng(0), num_rays=len(all_hits.ray_indices)))
     np.testing.assert_array_equal(
-        both.hit_indices, np.concatenate([measured.hit_indices, measured.hit_indices + len(whole.ray_indices)])
+        combined.hit_indices, np.concatenate([measured.hit_indices, measured.hit_indices + len(all_hits.ray_indices)])
     )
 
 
@@ -192,9 +195,9 @@ def test_random_numbers_do_not_depend_on_the_hits(sensor):
     rays = len(hits_of(sensor, 1.0).ray_indices)
     used, fresh = (SensorNoise(np.random.default_rng(2), num_rays=rays) for _ in range(2))
     sensor.measure(hits_of(sensor, 1.0, np.empty(0, dtype=np.int64)), used)
-    one, other = (sensor.measure(hits_of(sensor, 5.0), draws) for draws in (used, fresh))
-    np.testing.assert_array_equal(one.hit_indices, other.hit_indices)
-    np.testing.assert_array_equal(one.range_error_m, other.range_error_m)
+    first, second = (sensor.measure(hits_of(sensor, 5.0), draws) for draws in (used, fresh))
+    np.testing.assert_array_equal(first.hit_indices, second.hit_indices)
+    np.testing.assert_array_equal(first.range_error_m, second.range_error_m)
 
 
 def test_sensors_survive_pickling_and_saving(sensor):
@@ -225,7 +228,7 @@ def test_a_sensor_is_simulated(sensor):
 def test_the_scenario_decides_the_range_of_sensors(sensor, monkeypatch):
     rig = Rig(name="r", sensors=(sensor.model_copy(update={"range_noise_m": 0.0, "dropout": 0.0}),))
 
-    def seen():
+    def simulate():
         frames = SimulatedFrames("courtyard", rig, num_frames=1, reference_sensor=PaperReference(8, 8))
         return frames[0].reference, (frames[0].sensor.double() - torch.tensor([2.6, 0.0, 1.0])).norm(dim=1)
 
@@ -235,10 +238,10 @@ def test_the_scenario_decides_the_range_of_sensors(sensor, monkeypatch):
             measure_target_visibility(rig, Scenario.load("courtyard"), Target.load("adult"), raster).points
         )
 
-    (whole, away_m), of_targets = seen(), targets()
+    (whole, away_m), of_targets = simulate(), targets()
     reach_m = float(away_m.min() + away_m.max()) / 2 - 0.01
     monkeypatch.setattr(Scenario, "compute_max_range_m", lambda *_: reach_m)
-    reference, near_m = seen()
+    reference, near_m = simulate()
     assert torch.equal(reference, whole)
     assert (near_m <= reach_m).all()
     assert (away_m > reach_m).any()
@@ -268,9 +271,9 @@ def test_reference_positions_lie_in_the_shell(sensor):
 
 
 def test_reference_sensors_have_a_default_ray_number(reference_sensor):
-    own = type(reference_sensor).from_query_plan(ASKED, None)
-    assert own == type(reference_sensor).from_query_plan(ASKED, None)
-    assert own != reference_sensor
+    default_sensor = type(reference_sensor).from_query_plan(ASKED, None)
+    assert default_sensor == type(reference_sensor).from_query_plan(ASKED, None)
+    assert default_sensor != reference_sensor
 
 
 @pytest.mark.parametrize("rays", [0, -4])
@@ -294,31 +297,31 @@ def test_reference_sensors_use_only_the_frame_rng(reference_sensor):
     np.random.seed(1)  # noqa: NPY002  (the random numbers that it must not draw)
     state = np.random.get_state()[1].copy()  # noqa: NPY002
     simulator = Simulator(Scenario.load("courtyard"), {}, reference_sensor, seed=3)
-    one, again, other = simulator.simulate_frame(4), simulator.simulate_frame(4), simulator.simulate_frame(5)
-    np.testing.assert_array_equal(one.reference, again.reference)
-    assert not np.array_equal(one.reference, other.reference)
+    first, repeated, second = simulator.simulate_frame(4), simulator.simulate_frame(4), simulator.simulate_frame(5)
+    np.testing.assert_array_equal(first.reference, repeated.reference)
+    assert not np.array_equal(first.reference, second.reference)
     np.testing.assert_array_equal(np.random.get_state()[1], state)  # noqa: NPY002
 
 
 def test_reference_points_are_in_range_and_weighted(reference_sensor):
-    seen = Simulator(Scenario.load("courtyard"), {}, reference_sensor).simulate_frame(0)
-    assert seen.reference.dtype == np.float32
-    assert seen.reference.shape == (len(seen.reference), 3)
+    observation = Simulator(Scenario.load("courtyard"), {}, reference_sensor).simulate_frame(0)
+    assert observation.reference.dtype == np.float32
+    assert observation.reference.shape == (len(observation.reference), 3)
     farthest_m = np.linalg.norm(EGO.corners_m, axis=1).max() + 2 * reference_sensor.shell_m
-    assert np.linalg.norm(seen.reference, axis=1).max() <= reference_sensor.max_range_m + farthest_m
-    assert reference_sensor.has_area_weights == (seen.reference_weights is not None)
-    if seen.reference_weights is not None:
-        assert seen.reference_weights.dtype == np.float32
-        assert len(seen.reference_weights) == len(seen.reference)
-        assert (seen.reference_weights > 0).all()
-        assert np.isfinite(seen.reference_weights).all()
+    assert np.linalg.norm(observation.reference, axis=1).max() <= reference_sensor.max_range_m + farthest_m
+    assert reference_sensor.has_area_weights == (observation.reference_weights is not None)
+    if observation.reference_weights is not None:
+        assert observation.reference_weights.dtype == np.float32
+        assert len(observation.reference_weights) == len(observation.reference)
+        assert (observation.reference_weights > 0).all()
+        assert np.isfinite(observation.reference_weights).all()
 
 
 def test_a_reference_sensor_is_simulated(reference_sensor):
     frames = SimulatedFrames("courtyard", "front_roof_32", num_frames=2, seed=4, reference_sensor=reference_sensor)
-    frame, again = frames[1], pickle.loads(pickle.dumps(frames))[1]
+    frame, loaded_frame = frames[1], pickle.loads(pickle.dumps(frames))[1]
     assert frame.counts["reference_rays"] == pytest.approx(900, rel=0.15)
     assert 0 < len(frame.reference) <= frame.counts["reference_rays"]
-    assert torch.equal(frame.reference, again.reference)
+    assert torch.equal(frame.reference, loaded_frame.reference)
     assert frame.reference_weights is None or len(frame.reference_weights) == len(frame.reference)
     assert not torch.equal(frames[0].reference, frame.reference)

@@ -58,15 +58,17 @@ def test_points_are_central_hits_of_cells():
     sensor, random = radar(min_range_m=3.0, range_cell_m=2.0), np.random.default_rng(3)
     rays = sensor.num_rays
     beams = sensor.compute_beam_indices().ravel()
-    ray, place = np.tile(np.arange(rays), 2), np.repeat([0, 1], rays)
-    there = random.random(2 * rays) < 0.4
-    hits = RayHits(ray[there], random.uniform(2, 12, there.sum()).astype(np.float32), np.arange(rays), place[there])
+    ray, position = np.tile(np.arange(rays), 2), np.repeat([0, 1], rays)
+    is_hit = random.random(2 * rays) < 0.4
+    hits = RayHits(
+        ray[is_hit], random.uniform(2, 12, is_hit.sum()).astype(np.float32), np.arange(rays), position[is_hit]
+    )
     cells = {}
-    for number, (one, range_m, where) in enumerate(
+    for number, (position_hits, range_m, where) in enumerate(
         zip(hits.ray_indices, hits.range_m, hits.position_indices, strict=True)
     ):
         if range_m >= 3.0:
-            cells.setdefault((where, beams[one], int(range_m / 2.0)), []).append((range_m, number))
+            cells.setdefault((where, beams[position_hits], int(range_m / 2.0)), []).append((range_m, number))
     expected = sorted(sorted(cell)[(len(cell) - 1) // 2][1] for cell in cells.values())
     assert sensor.measure(hits, SensorNoise(None)).hit_indices.tolist() == expected
     assert max(map(len, cells.values())) > 5
@@ -78,10 +80,12 @@ def test_more_rays_per_cell_find_the_same_surfaces():
     finest = by_cell(radar(ray_spacing_m=0.05), box)
     missing, moved_m = [], []
     for spacing_m in (2.0, 0.5, 0.1):
-        found = by_cell(radar(ray_spacing_m=spacing_m), box)
-        both = sorted(found.keys() & finest.keys())
-        missing.append(len(finest) - len(both))
-        moved_m.append(np.mean([abs(np.linalg.norm(found[cell]) - np.linalg.norm(finest[cell])) for cell in both]))
+        points = by_cell(radar(ray_spacing_m=spacing_m), box)
+        common_cells = sorted(points.keys() & finest.keys())
+        missing.append(len(finest) - len(common_cells))
+        moved_m.append(
+            np.mean([abs(np.linalg.norm(points[cell]) - np.linalg.norm(finest[cell])) for cell in common_cells])
+        )
     assert missing[0] > missing[1] > missing[2]
     assert missing[2] < 0.05 * len(finest)
     assert moved_m[0] > moved_m[1] > moved_m[2]
@@ -150,9 +154,9 @@ def test_invalid_radars_are_refused_with_the_key(keys, message):
 def test_nuscenes_radars_cover_all_azimuths():
     sensors = Rig.load("nuscenes_radars").sensors
     assert len(sensors) == 10
-    for near, far in zip(sensors[::2], sensors[1::2], strict=True):
-        assert far.name == f"{near.name}_far"
-        assert (near.mount, near.max_range_m) == (far.mount, far.min_range_m)
+    for near_radar, far_radar in zip(sensors[::2], sensors[1::2], strict=True):
+        assert far_radar.name == f"{near_radar.name}_far"
+        assert (near_radar.mount, near_radar.max_range_m) == (far_radar.mount, far_radar.min_range_m)
     yaw_deg = np.sort([sensor.mount.yaw_deg % 360 for sensor in sensors[::2]])
     gaps = np.diff([*yaw_deg, yaw_deg[0] + 360])
     assert np.sort(gaps)[-1] < 95

@@ -43,8 +43,8 @@ def random_directions(count, seed=0):
 
 def random_mesh(faces, seed=0):
     generator = np.random.default_rng(seed)
-    places = np.repeat(generator.uniform(-10, 10, size=(faces, 3)), 3, axis=0)
-    return Mesh(places + generator.uniform(-2, 2, size=(3 * faces, 3)), np.arange(3 * faces).reshape(-1, 3))
+    positions_m = np.repeat(generator.uniform(-10, 10, size=(faces, 3)), 3, axis=0)
+    return Mesh(positions_m + generator.uniform(-2, 2, size=(3 * faces, 3)), np.arange(3 * faces).reshape(-1, 3))
 
 
 def box_at(x, y=0.0, size=1.0):
@@ -78,9 +78,9 @@ def test_agrees_with_a_slow_intersection_in_float64():
     # A ray exactly through a border of a face may hit or miss in float32.
     assert (np.isfinite(hits.range_m) == np.isfinite(expected)).mean() > 0.995
     assert ((hits.body_indices >= 0) == np.isfinite(hits.range_m)).all()
-    both = np.isfinite(hits.range_m) & np.isfinite(expected)
-    assert (np.abs(hits.range_m[both] - expected[both]) < 1e-4).mean() > 0.995
-    assert 0.2 < both.mean() < 1.0
+    is_hit = np.isfinite(hits.range_m) & np.isfinite(expected)
+    assert (np.abs(hits.range_m[is_hit] - expected[is_hit]) < 1e-4).mean() > 0.995
+    assert 0.2 < is_hit.mean() < 1.0
 
 
 def test_hit_attributes_have_the_incidence_angle():
@@ -154,37 +154,40 @@ def test_rays_leave_all_faces_at_their_origin(shape):
     )
     room = box_at(0.0, size=40.0)
     caster = RayCaster([room, mesh])
-    (normals, away), (walls, walls_away) = planes_of(mesh), planes_of(room)
+    (normals, distances_m), (walls, wall_distances_m) = planes_of(mesh), planes_of(room)
     for _ in range(60):
-        corner, other, _ = generator.permutation(mesh.vertices_m[generator.choice(mesh.faces)])
-        place = corner + generator.choice([0.0, generator.random()]) * (other - corner)
+        corner, second_corner, _ = generator.permutation(mesh.vertices_m[generator.choice(mesh.faces)])
+        position = corner + generator.choice([0.0, generator.random()]) * (second_corner - corner)
         directions = random_directions(200, seed=generator.integers(1000))
-        hits = caster.cast(place, directions, endless(directions))
-        there = np.abs(normals @ place - away) < 1e-9
-        slope = (normals[there] @ directions.astype(np.float64)).max(axis=0)
-        for body, some, planes, reach in ((0, slope > 0.01, walls, walls_away), (1, slope < -0.01, normals, away)):
-            steep = planes @ directions[:, some]
-            gap = (reach - planes @ place)[:, None] * np.ones_like(steep)
+        hits = caster.cast(position, directions, endless(directions))
+        is_on_face = np.abs(normals @ position - distances_m) < 1e-9
+        slope = (normals[is_on_face] @ directions.astype(np.float64)).max(axis=0)
+        for body, selected, planes, reach in (
+            (0, slope > 0.01, walls, wall_distances_m),
+            (1, slope < -0.01, normals, distances_m),
+        ):
+            steep = planes @ directions[:, selected]
+            gap = (reach - planes @ position)[:, None] * np.ones_like(steep)
             expected = np.divide(gap, steep, out=np.full_like(steep, np.inf), where=(steep > 0) & (gap > 1e-9)).min(
                 axis=0
             )
-            assert (hits.body_indices[some] == body).all()
-            np.testing.assert_allclose(hits.range_m[some], expected, atol=2e-3)
+            assert (hits.body_indices[selected] == body).all()
+            np.testing.assert_allclose(hits.range_m[selected], expected, atol=2e-3)
 
 
 @pytest.mark.parametrize("limit_m", [1e-6, 0.3, 1.0, 7.0, np.inf])
 def test_rays_that_leave_a_face_keep_limits(limit_m):
     turned = build_transform(convert_euler_to_rotation(37.0, 21.0, -13.0), [1.0, 2.0, 3.0])
-    floor, place = (
+    floor, position = (
         Plane(type="plane", size_m=(200, 200)).build_mesh().transform(turned),
         (turned @ [5.1, 7.2, 0.0, 1.0])[:3],
     )
-    away = turned[:3, 2]
-    wall = Mesh(place + 5.0 * away + floor.vertices_m - turned[:3, 3], floor.faces)
+    up = turned[:3, 2]
+    wall = Mesh(position + 5.0 * up + floor.vertices_m - turned[:3, 3], floor.faces)
     upwards = random_directions(500)
-    upwards = upwards[:, away @ upwards > 0.06]
-    hits = RayCaster([floor, wall]).cast(place, upwards, np.full(upwards.shape[1], limit_m, np.float32))
-    expected = 5.0 / (away @ upwards)
+    upwards = upwards[:, up @ upwards > 0.06]
+    hits = RayCaster([floor, wall]).cast(position, upwards, np.full(upwards.shape[1], limit_m, np.float32))
+    expected = 5.0 / (up @ upwards)
     assert (hits.range_m <= np.float32(limit_m)).all()
     np.testing.assert_array_equal(hits.body_indices, np.where(expected <= limit_m, 1, -1))
     np.testing.assert_allclose(hits.range_m, np.minimum(expected, limit_m), rtol=1e-4)
@@ -294,25 +297,25 @@ def test_sheets_do_not_enclose_positions():
     """Convex bodies against half spaces, nested bodies, and a body of two touching parts."""
     ball, cube = Ellipsoid(type="ellipsoid", size_m=(4, 3, 2)).build_mesh(), box_at(0.0, size=2.0)
     caster = RayCaster([ball, Plane(type="plane", size_m=(9, 9)).build_mesh(), cube])
-    places = NUMBERS(0).uniform(-2.2, 2.2, (2000, 3))
-    places[:100, :2] = 0.0  # above and below vertices, edges and the middles of faces
-    for place in places:
-        within = [number for number, body in ((0, ball), (2, cube)) if behind_all(body, place)]
-        assert caster.find_enclosing_bodies(place).tolist() == within
+    positions_m = NUMBERS(0).uniform(-2.2, 2.2, (2000, 3))
+    positions_m[:100, :2] = 0.0  # above and below vertices, edges and the middles of faces
+    for position in positions_m:
+        expected_bodies = [number for number, body in ((0, ball), (2, cube)) if behind_all(body, position)]
+        assert caster.find_enclosing_bodies(position).tolist() == expected_bodies
     ahead = cube.transform(build_transform(np.eye(3), [2, 0, 0]))
     vertices_m, faces = (
         np.concatenate([cube.vertices_m, ahead.vertices_m]),
         np.concatenate([cube.faces, cube.faces + 8]),
     )
-    both = RayCaster([Mesh(vertices_m, faces)])
-    found = [len(both.find_enclosing_bodies(np.array([x, 0.2, 0.1]))) for x in (-1.5, 0.0, 1.0, 2.0, 3.5)]
-    assert found == [0, 1, 1, 1, 0]
+    caster = RayCaster([Mesh(vertices_m, faces)])
+    enclosing_counts = [len(caster.find_enclosing_bodies(np.array([x, 0.2, 0.1]))) for x in (-1.5, 0.0, 1.0, 2.0, 3.5)]
+    assert enclosing_counts == [0, 1, 1, 1, 0]
 
 
-def behind_all(mesh, place):
+def behind_all(mesh, position):
     """Return True for a position behind every face of a convex body."""
     a, b, c = mesh.vertices_m[mesh.faces].transpose(1, 0, 2)
-    return bool((((place - a) * np.cross(b - a, c - a)).sum(axis=1) < 0).all())
+    return bool((((position - a) * np.cross(b - a, c - a)).sum(axis=1) < 0).all())
 
 
 def test_positions_on_body_surfaces_are_not_inside():

@@ -18,27 +18,27 @@ def rectangle(x, y):
 
 
 def test_default_regions_are_paper_regions_and_near_field():
-    asked = RegionsOfInterest().build_query_plan(ROBOT_M)
-    assert [region.name for region in asked.regions] == ["20m", "80m", "160m", *SIDES]
-    assert (asked.grid.x_m, asked.grid.y_m, asked.grid.cell_m, asked.bands_m) == (
+    plan = RegionsOfInterest().build_query_plan(ROBOT_M)
+    assert [region.name for region in plan.regions] == ["20m", "80m", "160m", *SIDES]
+    assert (plan.grid.x_m, plan.grid.y_m, plan.grid.cell_m, plan.bands_m) == (
         (-40.0, 160.0),
         (-40.0, 40.0),
         0.25,
         ((-0.5, 0.5), (0.5, 2.0)),
     )
     # One area for all of the near field, and the grid last.
-    assert asked.areas[3:] == (((-3.5, 3.5), (-3.4, 3.4)), (asked.grid.x_m, asked.grid.y_m))
+    assert plan.areas[3:] == (((-3.5, 3.5), (-3.4, 3.4)), (plan.grid.x_m, plan.grid.y_m))
     assert [region.name for region in RegionsOfInterest().build_query_plan().regions] == ["20m", "80m", "160m"]
 
 
 @pytest.mark.parametrize("cell", [0.1, 0.25, 0.5])
 def test_near_field_parts_cover_it_exactly_once(cell):
-    asked = RegionsOfInterest().build_query_plan(ROBOT_M, cell)
-    covered = sum(region.mask_cells(asked.grid).long() for region in asked.regions if region.name in SIDES)
-    x, y = asked.grid.x_centers_m, asked.grid.y_centers_m[:, None]
-    around = (x >= -3.5) & (x < 3.5) & (y >= -3.4) & (y < 3.4)
+    plan = RegionsOfInterest().build_query_plan(ROBOT_M, cell)
+    covered = sum(region.mask_cells(plan.grid).long() for region in plan.regions if region.name in SIDES)
+    x, y = plan.grid.x_centers_m, plan.grid.y_centers_m[:, None]
+    is_near_field = (x >= -3.5) & (x < 3.5) & (y >= -3.4) & (y < 3.4)
     vehicle = (x >= -0.5) & (x < 0.5) & (y >= -0.4) & (y < 0.4)
-    assert torch.equal(covered, (around & ~vehicle).long())
+    assert torch.equal(covered, (is_near_field & ~vehicle).long())
 
 
 def test_default_regions_outside_the_grid_are_omitted():
@@ -55,15 +55,15 @@ def test_default_regions_outside_the_grid_are_omitted():
 
 
 def test_distant_regions_enlarge_the_default_grid():
-    asked = RegionsOfInterest(regions={"side": rectangle((-41.1, 0.0), (30.0, 55.0))}).build_query_plan(ROBOT_M)
-    assert (asked.grid.x_m, asked.grid.y_m) == ((-41.25, 160.0), (-40.0, 55.0))
-    assert asked.areas == (((-41.1, 0.0), (30.0, 55.0)), (asked.grid.x_m, asked.grid.y_m))
+    plan = RegionsOfInterest(regions={"side": rectangle((-41.1, 0.0), (30.0, 55.0))}).build_query_plan(ROBOT_M)
+    assert (plan.grid.x_m, plan.grid.y_m) == ((-41.25, 160.0), (-40.0, 55.0))
+    assert plan.areas == (((-41.1, 0.0), (30.0, 55.0)), (plan.grid.x_m, plan.grid.y_m))
 
 
 def test_regions_outside_a_given_grid_are_refused():
-    given = {"x_m": (-5.0, 5.0), "y_m": (-5.0, 5.0)}
+    grid_keys = {"x_m": (-5.0, 5.0), "y_m": (-5.0, 5.0)}
     with pytest.raises(ValueError, match="region 'side' spans x = 0 to 6 m, beyond the grid's -5 to 5 m; enlarge"):
-        RegionsOfInterest(regions={"side": rectangle((0.0, 6.0), (0.0, 1.0))}, grid=given).build_query_plan(ROBOT_M)
+        RegionsOfInterest(regions={"side": rectangle((0.0, 6.0), (0.0, 1.0))}, grid=grid_keys).build_query_plan(ROBOT_M)
 
 
 def test_regions_inside_the_vehicle_cause_a_warning():
@@ -86,8 +86,8 @@ def test_yaml_and_python_regions_are_equal(tmp_path):
         "heights: {dog: [0.05, 0.5], child: [0.1, 1.1]}\n"
         "grid: {x_m: [-10, 10], y_m: [-10, 10], cell_m: 0.1}\n"
     )
-    told = RegionsOfInterest.load(tmp_path / "ask.yaml")
-    assert told == RegionsOfInterest(
+    regions = RegionsOfInterest.load(tmp_path / "ask.yaml")
+    assert regions == RegionsOfInterest(
         regions={
             "behind": rectangle((-4.0, -0.5), (-1.0, 1.0)),
             "corner": {"polygon_m": ((0.5, 0.4), (3.5, 0.4), (0.5, 3.4))},
@@ -95,9 +95,9 @@ def test_yaml_and_python_regions_are_equal(tmp_path):
         heights={"dog": (0.05, 0.5), "child": (0.1, 1.1)},
         grid={"x_m": (-10.0, 10.0), "y_m": (-10.0, 10.0), "cell_m": 0.1},
     )
-    asked = told.build_query_plan(ROBOT_M)
-    assert asked.grid.heights == {"dog": (0.05, 0.5), "child": (0.1, 1.1)}
-    assert asked.areas[1] == ((0.5, 3.5), (0.4, 3.4))
+    plan = regions.build_query_plan(ROBOT_M)
+    assert plan.grid.heights == {"dog": (0.05, 0.5), "child": (0.1, 1.1)}
+    assert plan.areas[1] == ((0.5, 3.5), (0.4, 3.4))
 
 
 @pytest.mark.parametrize(
@@ -123,9 +123,9 @@ def test_empty_regions_are_refused(tmp_path, content, message):
 
 
 def test_grids_too_large_for_memory_are_refused():
-    given = {"x_m": (-1000.0, 1000.0), "y_m": (-1000.0, 1000.0), "cell_m": 0.1}
+    grid_keys = {"x_m": (-1000.0, 1000.0), "y_m": (-1000.0, 1000.0), "cell_m": 0.1}
     with pytest.raises(ValueError, match="800,000,000 cells, over 100,000,000: use larger cells"):
-        RegionsOfInterest(grid=given).build_query_plan()
+        RegionsOfInterest(grid=grid_keys).build_query_plan()
 
 
 def test_the_sides_are_named_by_their_reach():
@@ -137,10 +137,10 @@ def test_the_sides_are_named_by_their_reach():
 # Rooms.
 
 
-def office(size_m=(14.0, 10.0), ego=None, **others):
+def office(size_m=(14.0, 10.0), ego=None, **keys):
     floor = {"name": "floor", "ground": True, "shape": {"type": "plane", "size_m": size_m}}
     ego = {"shape": {"type": "box", "size_m": (0.9, 0.6, 0.5)}} | (ego or {})
-    return Scenario.model_validate({"name": "office", "ego": ego, "bodies": [floor], **others})
+    return Scenario.model_validate({"name": "office", "ego": ego, "bodies": [floor], **keys})
 
 
 def test_rooms_are_walls_in_the_vehicle_frame(tmp_path):
@@ -174,11 +174,12 @@ def test_grid_and_regions_fit_room_and_range(max_range_m, name, x, forward):
     result = evaluate(rig, office(), num_frames=1, num_rays=256, test_targets="none")
     grid = result.coverage.grid
     assert grid.x_m == x
-    near = ["front_3m", "rear_3m", "left_3m", "right_3m"]
-    assert [region.name for region in result.regions] == [*forward, name, *near]
-    whole = next(region for region in result.regions if region.name == name)
-    assert (whole.x_m, whole.y_m) == (grid.x_m, grid.y_m)
-    asked = RegionsOfInterest(grid={"x_m": (-10.0, 50.0)})
-    assert evaluate(
-        rig, office(), num_frames=1, num_rays=256, test_targets="none", regions=asked
-    ).coverage.grid.x_m == (-10.0, 50.0)
+    near_field_names = ["front_3m", "rear_3m", "left_3m", "right_3m"]
+    assert [region.name for region in result.regions] == [*forward, name, *near_field_names]
+    matching_region = next(region for region in result.regions if region.name == name)
+    assert (matching_region.x_m, matching_region.y_m) == (grid.x_m, grid.y_m)
+    plan = RegionsOfInterest(grid={"x_m": (-10.0, 50.0)})
+    assert evaluate(rig, office(), num_frames=1, num_rays=256, test_targets="none", regions=plan).coverage.grid.x_m == (
+        -10.0,
+        50.0,
+    )

@@ -89,16 +89,16 @@ def test_invalid_materials_are_reported():
 
 
 @pytest.mark.parametrize(
-    ("given", "told"),
+    ("keys", "message"),
     [
         ({"range_at_10_percent_m": 0.0}, "a number above 0"),
         ({"range_at_10_percent_m": 50.0, "log_range_std": 0.0}, "a number above 0"),
         ({"range_factors": [1.0]}, "one for each of the 2 rows is needed; got 1"),
     ],
 )
-def test_invalid_lidar_keys_are_reported(given, told):
-    with pytest.raises(ValueError, match=told):
-        Lidar(**KEYS | given)
+def test_invalid_lidar_keys_are_reported(keys, message):
+    with pytest.raises(ValueError, match=message):
+        Lidar(**KEYS | keys)
 
 
 PLAIN = {
@@ -122,7 +122,7 @@ ROOF = {
 }
 
 
-def seen(weather=None, index=0, bodies=None, **keys):
+def simulate(weather=None, index=0, bodies=None, **keys):
     """Simulate a LiDAR on a plane in one frame."""
     scenario = Scenario.model_validate(PLAIN | {"weather": weather or {}} | ({"bodies": bodies} if bodies else {}))
     rig = Rig.model_validate({"name": "rig", "sensors": [ROOF | keys]})
@@ -130,7 +130,7 @@ def seen(weather=None, index=0, bodies=None, **keys):
 
 
 def test_returns_from_a_plane_follow_the_law():
-    every, returned = seen(range_at_10_percent_m=None), seen()
+    every, returned = simulate(range_at_10_percent_m=None), simulate()
     road = Material.load("road")
     is_road = every.points[:, 2] < 1e-3
     excess = compute_log_excess(
@@ -141,11 +141,11 @@ def test_returns_from_a_plane_follow_the_law():
         ROOF["range_at_10_percent_m"],
     )
     expected = compute_return_probability(excess, ROOF["log_range_std"], road.log_reflectivity_std)
-    there = np.isin(every.ray_indices, returned.ray_indices)
+    is_returned = np.isin(every.ray_indices, returned.ray_indices)
     for low_m in range(15, 75, 15):
-        some = is_road & (every.range_m > low_m) & (every.range_m < low_m + 15)
-        error = np.sqrt((expected * (1 - expected))[some].sum()) / some.sum()
-        assert there[some].mean() == pytest.approx(expected[some].mean(), abs=4 * error + 1e-9)
+        in_bin = is_road & (every.range_m > low_m) & (every.range_m < low_m + 15)
+        error = np.sqrt((expected * (1 - expected))[in_bin].sum()) / in_bin.sum()
+        assert is_returned[in_bin].mean() == pytest.approx(expected[in_bin].mean(), abs=4 * error + 1e-9)
 
 
 @pytest.mark.parametrize(
@@ -162,14 +162,14 @@ def test_returns_from_a_plane_follow_the_law():
 )
 def test_worse_conditions_never_add_returns(worse, keys):
     """With the same random numbers, no return is added and some are lost."""
-    clear, bad = seen(), seen(worse, **keys)
+    clear, bad = simulate(), simulate(worse, **keys)
     assert set(bad.ray_indices.tolist()) < set(clear.ray_indices.tolist())
 
 
 def test_rows_have_separate_range_factors():
     """The rows of the lower half have few returns."""
     factors = np.where(np.arange(40) < 20, 1e-3, 1.0).tolist()
-    lower, every = seen(range_factors=factors).points, seen().points
+    lower, every = simulate(range_factors=factors).points, simulate().points
     assert len(lower) < 0.6 * len(every)
     assert np.hypot(*lower[:, :2].T).min() > 20 > np.hypot(*every[:, :2].T).min()
 
@@ -179,11 +179,12 @@ def test_reflective_surfaces_return_from_farther_away():
 
     def of(material):
         ground = {"name": "plain", "shape": {"type": "plane", "size_m": [400.0, 400.0]}, "material": material}
-        return len(seen(bodies=[ground]).ray_indices)
+        return len(simulate(bodies=[ground]).ray_indices)
 
     assert of("glass") < of("tyre") < of("road") < of("lane_paint") < of("sign")
     assert of("sign") == pytest.approx(
-        MAX_RETURN_PROBABILITY * len(seen(range_at_10_percent_m=None, bodies=PLAIN["bodies"][:1]).ray_indices), rel=0.01
+        MAX_RETURN_PROBABILITY * len(simulate(range_at_10_percent_m=None, bodies=PLAIN["bodies"][:1]).ray_indices),
+        rel=0.01,
     )
 
 
@@ -195,7 +196,7 @@ def test_material_paths_are_relative_to_the_scenario(tmp_path):
         ground = PLAIN["bodies"][0] | {"material": "own.yaml"}
         (tmp_path / "scenario.yaml").write_text(yaml.safe_dump(PLAIN | {"bodies": [ground]}))
         scenario = Scenario.load(tmp_path / "scenario.yaml")
-        of.append((len(seen(bodies=scenario.bodies).points), scenario.collect_content()))
+        of.append((len(simulate(bodies=scenario.bodies).points), scenario.collect_content()))
     assert of[0] == of[2]
     assert of[0][0] == 0 < of[1][0]
     assert of[0][1] != of[1][1]
@@ -212,9 +213,9 @@ def test_saved_rigs_keep_materials_of_housings(tmp_path, monkeypatch):
     rig = Rig.load("rig.yaml")
     rig.save("there/again.yaml")
     monkeypatch.chdir(tmp_path / "there")
-    again = Rig.load("again.yaml")
-    assert again.sensors[0].housing[0].material == str(tmp_path / "own.yaml")
-    assert again.collect_content() == Rig.load(tmp_path / "rig.yaml").collect_content()
+    loaded_rig = Rig.load("again.yaml")
+    assert loaded_rig.sensors[0].housing[0].material == str(tmp_path / "own.yaml")
+    assert loaded_rig.collect_content() == Rig.load(tmp_path / "rig.yaml").collect_content()
 
 
 def test_reflectivity_is_constant_over_body_and_time():
@@ -231,12 +232,12 @@ def test_reflectivity_is_constant_over_body_and_time():
             for number in range(24)
         ),
     ]
-    every, shares = seen(range_at_10_percent_m=None, bodies=bodies), []
+    every, shares = simulate(range_at_10_percent_m=None, bodies=bodies), []
     on_car = every.points[:, 2] > 0.01
     car = np.round(np.arctan2(every.points[:, 1], every.points[:, 0]) * 4).astype(int)
     for index in (0, 1):
-        there = np.isin(every.ray_indices, seen(index=index, bodies=bodies).ray_indices)
-        shares.append(np.array([there[on_car & (car == number)].mean() for number in np.unique(car[on_car])]))
+        is_returned = np.isin(every.ray_indices, simulate(index=index, bodies=bodies).ray_indices)
+        shares.append(np.array([is_returned[on_car & (car == number)].mean() for number in np.unique(car[on_car])]))
     assert np.ptp(shares[0]) > 0.9
     assert np.abs(shares[0] - shares[1]).max() < 0.25
 
@@ -256,17 +257,17 @@ def test_ideal_rigs_have_no_range_at_10_percent():
 
 
 @pytest.mark.parametrize(
-    ("given", "told"),
+    ("keys", "message"),
     [
         ({"weather": {"visibility_m": 0.0}}, "visibility_m: a number above 0"),
         ({"weather": {"rain_mm_h": -1.0}}, "a number of at least 0"),
         ({"bodies": [PLAIN["bodies"][0] | {"material": "raod"}]}, "is 'road' meant"),
     ],
 )
-def test_invalid_weather_and_materials_are_reported(given, told, tmp_path):
+def test_invalid_weather_and_materials_are_reported(keys, message, tmp_path):
     path = tmp_path / "world.yaml"
-    path.write_text(yaml.safe_dump(PLAIN | given))
-    with pytest.raises(ValueError, match=told):
+    path.write_text(yaml.safe_dump(PLAIN | keys))
+    with pytest.raises(ValueError, match=message):
         Scenario.load(path)
 
 

@@ -45,15 +45,15 @@ def world_of(scenario, run=0, seed=0, **keys):
     return SceneCache(scenario, seed, **keys).build(run, scenario.build_ego_mesh())
 
 
-def same(one, other):
-    if isinstance(one, np.ndarray):
-        return (one.dtype, one.shape, one.tobytes()) == (other.dtype, other.shape, other.tobytes())
-    if dataclasses.is_dataclass(one):
-        names = [field.name for field in dataclasses.fields(one)]
-        return type(one) is type(other) and all(same(getattr(one, name), getattr(other, name)) for name in names)
-    if isinstance(one, tuple):
-        return type(one) is type(other) and len(one) == len(other) and all(map(same, one, other))
-    return type(one) is type(other) and one == other
+def same(first, second):
+    if isinstance(first, np.ndarray):
+        return (first.dtype, first.shape, first.tobytes()) == (second.dtype, second.shape, second.tobytes())
+    if dataclasses.is_dataclass(first):
+        names = [field.name for field in dataclasses.fields(first)]
+        return type(first) is type(second) and all(same(getattr(first, name), getattr(second, name)) for name in names)
+    if isinstance(first, tuple):
+        return type(first) is type(second) and len(first) == len(second) and all(map(same, first, second))
+    return type(first) is type(second) and first == second
 
 
 @pytest.mark.parametrize(
@@ -68,34 +68,36 @@ def same(one, other):
 def test_cached_scenes_equal_built_scenes(disk, traffic):
     files, built = disk
     scenario = Scenario(name="drawn", traffic=traffic)
-    worlds, ego = SceneCache(scenario, 5), scenario.build_ego_mesh()
-    first, again = worlds.build(2, ego), worlds.build(2, ego)
+    cache, ego = SceneCache(scenario, 5), scenario.build_ego_mesh()
+    first, cached = cache.build(2, ego), cache.build(2, ego)
     assert built == [2]
     assert len(files()) == 1
-    assert same(first, again)
+    assert same(first, cached)
     bodies = {id(mesh) for mesh in load_bodies().values()} | {id(ego)}
-    assert {id(actor.mesh) for actor in (again.ego, *again.objects)} <= bodies
-    shared = [{id(actor.trajectory.times_s) for actor in world.actors} for world in (first, again)]
+    assert {id(actor.mesh) for actor in (cached.ego, *cached.objects)} <= bodies
+    shared = [{id(actor.trajectory.times_s) for actor in world.actors} for world in (first, cached)]
     assert len(shared[1]) <= len(shared[0])
 
 
 def test_actors_that_share_a_mesh_share_it_again(tmp_path):
-    mesh, way = Box(type="box", size_m=(4, 2, 1.5)).build_mesh(), Trajectory.create_static([9.0, 0.0, 0.0])
-    ego, *actors = (Actor(name, "car", mesh, way) for name in ("ego", "a", "b"))
+    mesh, trajectory = Box(type="box", size_m=(4, 2, 1.5)).build_mesh(), Trajectory.create_static([9.0, 0.0, 0.0])
+    ego, *actors = (Actor(name, "car", mesh, trajectory) for name in ("ego", "a", "b"))
     world = Scene((), ego, tuple(actors))
     np.savez(tmp_path / "a.npz", **encode_scene("a", world, {}))
-    again = read_scene(tmp_path / "a.npz", {})
-    assert same(world, again)
-    assert again.ego.mesh is again.actors[0].mesh is again.actors[1].mesh
+    cached = read_scene(tmp_path / "a.npz", {})
+    assert same(world, cached)
+    assert cached.ego.mesh is cached.actors[0].mesh is cached.actors[1].mesh
 
 
 def test_frames_are_the_same_to_the_bit(disk):
     rigs, reference = {"roof": Rig.load("front_roof_128")}, PaperReference(64, 64)
-    seen = [Simulator(lot(), rigs, reference, no_cache=no_cache).simulate_frame(8) for no_cache in (True, False, False)]
+    observations = [
+        Simulator(lot(), rigs, reference, no_cache=no_cache).simulate_frame(8) for no_cache in (True, False, False)
+    ]
     assert disk[1] == [1, 1]
-    for other in seen[1:]:
-        np.testing.assert_array_equal(other.clouds["roof"], seen[0].clouds["roof"])
-        np.testing.assert_array_equal(other.reference, seen[0].reference)
+    for other in observations[1:]:
+        np.testing.assert_array_equal(other.clouds["roof"], observations[0].clouds["roof"])
+        np.testing.assert_array_equal(other.reference, observations[0].reference)
 
 
 def test_cache_keys_depend_on_all_inputs_only(disk, tmp_path):
@@ -103,14 +105,14 @@ def test_cache_keys_depend_on_all_inputs_only(disk, tmp_path):
     body = tmp_path / "ego.yaml"
     parts = "name: ego\nparts: [{{name: all, shape: {{type: box, size_m: [4, 2, {height}]}}}}]\n"
     body.write_text(parts.format(height=1.5))
-    own = {"shape": {"type": "vehicle", "vehicle": str(body)}}
+    ego_keys = {"shape": {"type": "vehicle", "vehicle": str(body)}}
     makes = [
         lambda: world_of(lot()),
         lambda: world_of(lot(), run=1),
         lambda: world_of(lot(), seed=1),
         lambda: world_of(lot(parked_share=0.2)),
-        lambda: world_of(lot(ego=own)),
-        lambda: (body.write_text(parts.format(height=1.6)), world_of(lot(ego=own))),
+        lambda: world_of(lot(ego=ego_keys)),
+        lambda: (body.write_text(parts.format(height=1.6)), world_of(lot(ego=ego_keys))),
     ]
     for count, make in enumerate(makes, 1):
         make()
@@ -138,8 +140,8 @@ def harm(content, how):
         return b""
     if how == "not ours":
         return b"torchcover" * 99
-    at = {"a number": 3 * len(content) // 4, "a word": 400}[how]
-    return content[:at] + bytes([content[at] ^ 1]) + content[at + 1 :]
+    offset = {"a number": 3 * len(content) // 4, "a word": 400}[how]
+    return content[:offset] + bytes([content[offset] ^ 1]) + content[offset + 1 :]
 
 
 @pytest.mark.parametrize("how", ["a number", "a word", "cut short", "empty", "not ours", "another scene"])
@@ -196,12 +198,14 @@ def test_foreign_files_stay_and_do_not_interfere(disk, monkeypatch, tmp_path):
         special(path.with_name(name), kind, target)
         os.utime(path.with_name(name), (0, 0), follow_symlinks=False)
     before = [
-        (place.lstat().st_ino, place.lstat().st_mtime) for place in sorted(path.parent.glob("*")) if place != path
+        (file_path.lstat().st_ino, file_path.lstat().st_mtime)
+        for file_path in sorted(path.parent.glob("*"))
+        if file_path != path
     ]
     monkeypatch.setenv("TORCHCOVER_CACHE_GB", str(2.5 * path.stat().st_size / 1e9))
     for run in range(4):
         world_of(lot(), run)
-    after = [(place.lstat().st_ino, place.lstat().st_mtime) for place in sorted(path.parent.glob("*"))]
+    after = [(file_path.lstat().st_ino, file_path.lstat().st_mtime) for file_path in sorted(path.parent.glob("*"))]
     assert set(before) <= set(after)
     assert len(after) == len(before) + 2
     assert (built, target.stat().st_size) == ([0, 1, 2, 3], 10_000_000)
@@ -298,14 +302,14 @@ def test_without_a_disk_runs_continue_with_one_warning(disk, monkeypatch, tmp_pa
     lacks(monkeypatch, tmp_path)
 
     def run():
-        worlds = SceneCache(lot(), 0)
+        cache = SceneCache(lot(), 0)
         for number in (0, 1, 0):
-            worlds.build(number, lot().build_ego_mesh())
+            cache.build(number, lot().build_ego_mesh())
         world_of(lot())
 
-    with pytest.warns(UserWarning, match=r"scenes are not cached .* --set no_cache=true") as said:
+    with pytest.warns(UserWarning, match=r"scenes are not cached .* --set no_cache=true") as caught:
         run()
-    assert len({str(warning.message) for warning in said}) == 1
+    assert len({str(warning.message) for warning in caught}) == 1
     assert disk[1] == [0, 1, 0, 0]
     assert disk[0]() == []
 

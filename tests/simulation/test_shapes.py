@@ -128,7 +128,7 @@ def test_closed_meshes_cause_no_warning_in_any_format(tmp_path, shape):
     mesh_file(tmp_path, ply_of(mesh._replace(faces=np.vstack([mesh.faces, [[0, 0, 1]]])))).build_mesh()
 
 
-def in_millimetres(size_m):
+def format_in_millimeters(size_m):
     return ply_of(Box(type="box", size_m=tuple(1000 * length for length in size_m)).build_mesh())
 
 
@@ -140,7 +140,7 @@ def test_wrong_units_of_actors_are_reported(tmp_path, unit):
 
 
 def test_bodies_in_millimeters_are_reported(tmp_path):
-    shape = mesh_file(tmp_path, in_millimetres((4.9, 1.94, 1.63)))
+    shape = mesh_file(tmp_path, format_in_millimeters((4.9, 1.94, 1.63)))
     with pytest.warns(UserWarning, match=r"body 'parked car': its body is 4,900 x 1,940 x 1,630 m"):
         Body(name="parked car", shape=shape).build_meshes()
     # With the remedy there is no warning, nor for a city of 5 km or a train.
@@ -220,11 +220,11 @@ def test_vehicles_inherit_parts_and_mount_regions(tmp_path):
     pulled = vehicle_of(tmp_path, "pulled", PART.format("bar", "[0.5, 0.1, 0.1]", "{x_m: 1.25}"), extends=cart.name)
     with pytest.warns(UserWarning, match=r"shift the center of its bounding box.* by x \+0.25, y \+0.00 m"):
         assert np.ptp(Vehicle.load(pulled).build_mesh().vertices_m, axis=0)[0] == 2.5
-    for name, base, told in (
+    for name, base, message in (
         ("a", "pulled.yaml", "extends 'cart.yaml' itself"),
         ("b", "b.yaml", "extends 'b.yaml' itself"),
     ):
-        with pytest.raises(ValueError, match=told):
+        with pytest.raises(ValueError, match=message):
             Vehicle.load(vehicle_of(tmp_path, name, PART.format("x", "[1, 1, 1]", "{}"), extends=base))
 
 
@@ -235,12 +235,12 @@ def test_rig_bodies_occlude_like_vehicle_parts(tmp_path):
     pose, shape = {"x_m": 1.0, "z_m": 1.5}, {"type": "box", "size_m": [0.1, 1.0, 0.3]}
     loaded = Rig.model_validate({**plain, "bodies": [{"name": "box", "shape": shape, "poses": [pose]}]})
     extended = vehicle_of(tmp_path, "suv_box", box, extends="suv")
-    both = SimulatedFrames("courtyard", rigs={"plain": Rig.load("front_roof_32"), "loaded": loaded}, num_frames=1)
-    other = SimulatedFrames("courtyard", "front_roof_32", num_frames=1, vehicle=extended)[0]
-    np.testing.assert_array_equal(both[0].clouds["loaded"], other.sensor)
-    assert len(both[0].clouds["plain"]) - len(other.sensor) > 500
-    assert both[0].counts["sensor_self_hits"] > 2 * 3380  # the warning of the vehicle, twice
-    assert [note.split(":")[0] for note in both.reference_record["notes"]] == ["plain", "loaded"]
+    frames = SimulatedFrames("courtyard", rigs={"plain": Rig.load("front_roof_32"), "loaded": loaded}, num_frames=1)
+    vehicle_frame = SimulatedFrames("courtyard", "front_roof_32", num_frames=1, vehicle=extended)[0]
+    np.testing.assert_array_equal(frames[0].clouds["loaded"], vehicle_frame.sensor)
+    assert len(frames[0].clouds["plain"]) - len(vehicle_frame.sensor) > 500
+    assert frames[0].counts["sensor_self_hits"] > 2 * 3380  # the warning of the vehicle, twice
+    assert [note.split(":")[0] for note in frames.reference_record["notes"]] == ["plain", "loaded"]
 
 
 def test_floating_actors_are_lowered_with_a_warning(tmp_path):

@@ -29,8 +29,8 @@ def test_warp_and_embree_hits_agree(scenario, device):
         SimulatedFrames(scenario, "kitti", num_frames=2, frame_interval_s=1.0, device=each)[1]
         for each in (None, device)
     )
-    for one, other in ((by_embree.sensor, by_warp.sensor), (by_embree.reference, by_warp.reference)):
-        for queries, points in ((one, other), (other, one)):
+    for expected, actual in ((by_embree.sensor, by_warp.sensor), (by_embree.reference, by_warp.reference)):
+        for queries, points in ((expected, actual), (actual, expected)):
             assert (nearest(queries, points).distance > 1e-3).float().mean() < 1e-4
 
 
@@ -53,10 +53,10 @@ def test_self_hits_are_excluded_and_counted():
 
 def test_points_of_all_sensors_are_merged():
     grille, roof = Rig.load("front_grille_128").sensors[0], Rig.load("front_roof_128").sensors[0]
-    both = frames(rig=Rig(name="both", sensors=(grille, roof)))[0]
-    one, other = frames(rig="front_grille_128")[0], frames(rig="front_roof_128")[0]
-    assert torch.equal(both.sensor, torch.cat([one.sensor, other.sensor]))
-    assert both.counts["sensor_rays"] == 2 * 128 * 1800
+    merged = frames(rig=Rig(name="both", sensors=(grille, roof)))[0]
+    first, second = frames(rig="front_grille_128")[0], frames(rig="front_roof_128")[0]
+    assert torch.equal(merged.sensor, torch.cat([first.sensor, second.sensor]))
+    assert merged.counts["sensor_rays"] == 2 * 128 * 1800
 
 
 @pytest.mark.parametrize("index", [-7, 6, 100])
@@ -116,10 +116,10 @@ def test_rigs_share_scene_and_reference_points():
         _ = both.sensor
 
 
-@pytest.mark.parametrize("given", [{}, {"rig": "front_roof_128", "rigs": {"a": "front_roof_128"}}])
-def test_one_rig_or_several_are_needed(given):
+@pytest.mark.parametrize("keys", [{}, {"rig": "front_roof_128", "rigs": {"a": "front_roof_128"}}])
+def test_one_rig_or_several_are_needed(keys):
     with pytest.raises(ValueError, match="one rig is needed, or several"):
-        SimulatedFrames("courtyard", num_frames=1, **given)
+        SimulatedFrames("courtyard", num_frames=1, **keys)
 
 
 def test_range_noise_is_along_the_ray():
@@ -139,8 +139,8 @@ def test_range_noise_is_along_the_ray():
 def test_dropout_removes_its_share_of_points():
     exact = SimulatedFrames(scenario(), lidar(), num_frames=2, reference_sensor=SMALL)
     thinned = SimulatedFrames(scenario(), lidar(dropout=0.3), num_frames=2, reference_sensor=SMALL)
-    count, kept = len(exact[0].sensor), len(thinned[0].sensor)
-    assert abs(kept / count - 0.7) < 4 * (0.21 / count) ** 0.5
+    count, remaining_count = len(exact[0].sensor), len(thinned[0].sensor)
+    assert abs(remaining_count / count - 0.7) < 4 * (0.21 / count) ** 0.5
     assert set(map(tuple, thinned[0].sensor.tolist())) <= set(map(tuple, exact[0].sensor.tolist()))
     assert not torch.equal(thinned[0].sensor[:50], thinned[1].sensor[:50])
 
@@ -161,18 +161,18 @@ def test_traffic_is_reproducible_in_any_order(name):
     short = Scenario.model_validate({"name": name, "traffic": {"type": name, "duration_s": 1.0, "time_step_s": 0.5}})
     made = SimulatedFrames(short, lidar(), num_frames=5, seed=1, reference_sensor=SMALL)
     in_order = [made[index] for index in range(5)]
-    again = SimulatedFrames(short, lidar(), num_frames=5, seed=1, reference_sensor=SMALL)
-    assert all(same(in_order[index], again[index]) for index in (4, 2, 3, 0))
+    repeated = SimulatedFrames(short, lidar(), num_frames=5, seed=1, reference_sensor=SMALL)
+    assert all(same(in_order[index], repeated[index]) for index in (4, 2, 3, 0))
     assert not torch.equal(in_order[0].sensor, in_order[3].sensor)
-    other = SimulatedFrames(short, lidar(), num_frames=1, seed=2, reference_sensor=SMALL)[0]
-    assert not torch.equal(in_order[0].sensor, other.sensor)
+    other_seed_frame = SimulatedFrames(short, lidar(), num_frames=1, seed=2, reference_sensor=SMALL)[0]
+    assert not torch.equal(in_order[0].sensor, other_seed_frame.sensor)
 
 
 def test_longer_frame_intervals_show_later_time_steps():
-    few = PaperReference(rows=2, columns=2)
-    each = SimulatedFrames("parking", "front_roof_32", num_frames=1301, seed=1, reference_sensor=few)
+    small_reference = PaperReference(rows=2, columns=2)
+    each = SimulatedFrames("parking", "front_roof_32", num_frames=1301, seed=1, reference_sensor=small_reference)
     spread = SimulatedFrames(
-        "parking", "front_roof_32", num_frames=3, seed=1, reference_sensor=few, frame_interval_s=65.0
+        "parking", "front_roof_32", num_frames=3, seed=1, reference_sensor=small_reference, frame_interval_s=65.0
     )
     assert (each.frame_interval_s, spread.frame_interval_s) == (0.1, 65.0)
     for index in range(3):  # the last frame is in another scene

@@ -29,19 +29,19 @@ def same(a, b):
 
 @pytest.mark.parametrize("reference_sensor", [SMALL, SURFACE])
 def test_frames_are_observations_as_tensors(reference_sensor):
-    seen = simulator(reference_sensor, seed=5).simulate_frame(2)
-    rigs = {name: name for name in seen.clouds}
+    observation = simulator(reference_sensor, seed=5).simulate_frame(2)
+    rigs = {name: name for name in observation.clouds}
     frame = SimulatedFrames("courtyard", rigs=rigs, num_frames=3, seed=5, reference_sensor=reference_sensor)[2]
-    assert list(frame.clouds) == list(seen.clouds)
-    for name, points in seen.clouds.items():
+    assert list(frame.clouds) == list(observation.clouds)
+    for name, points in observation.clouds.items():
         assert points.dtype == np.float32
         np.testing.assert_array_equal(frame.clouds[name].numpy(), points)
-    np.testing.assert_array_equal(frame.reference.numpy(), seen.reference)
-    assert frame.counts == seen.counts
-    if seen.reference_weights is None:
+    np.testing.assert_array_equal(frame.reference.numpy(), observation.reference)
+    assert frame.counts == observation.counts
+    if observation.reference_weights is None:
         assert frame.reference_weights is None
     else:
-        np.testing.assert_array_equal(frame.reference_weights.numpy(), seen.reference_weights)
+        np.testing.assert_array_equal(frame.reference_weights.numpy(), observation.reference_weights)
 
 
 def test_observations_depend_on_seed_and_index_only():
@@ -55,25 +55,25 @@ def test_observations_depend_on_seed_and_index_only():
 
 def test_replacing_the_reference_sensor_keeps_the_scene():
     base = simulator(frame_interval_s=0.5)
-    other = base.replace_reference_sensor(SURFACE)
-    assert other.get_scene_geometry(3)[0] is base.get_scene_geometry(3)[0]
-    assert (base.reference_sensor, other.reference_sensor) == (SMALL, SURFACE)
-    assert (base.frame_interval_s, other.frame_interval_s) == (0.5, 0.5)
-    assert len(other.simulate_frame(1).reference_weights) == len(other.simulate_frame(1).reference)
+    replaced = base.replace_reference_sensor(SURFACE)
+    assert replaced.get_scene_geometry(3)[0] is base.get_scene_geometry(3)[0]
+    assert (base.reference_sensor, replaced.reference_sensor) == (SMALL, SURFACE)
+    assert (base.frame_interval_s, replaced.frame_interval_s) == (0.5, 0.5)
+    assert len(replaced.simulate_frame(1).reference_weights) == len(replaced.simulate_frame(1).reference)
 
 
 def test_labels_are_within_the_reference_range():
-    far = simulator(PaperReference(8, 8, max_range_m=60.0), Scenario.model_validate(SHORT))
-    near = far.replace_reference_sensor(PaperReference(8, 8, max_range_m=20.0))
-    names = [{label.name for label in made.compute_labels(1)} for made in (near, far)]
+    far_simulator = simulator(PaperReference(8, 8, max_range_m=60.0), Scenario.model_validate(SHORT))
+    near_simulator = far_simulator.replace_reference_sensor(PaperReference(8, 8, max_range_m=20.0))
+    names = [{label.name for label in made.compute_labels(1)} for made in (near_simulator, far_simulator)]
     assert names[0] < names[1]
-    assert all(np.hypot(*label.center_m[:2]) < 65.0 for label in far.compute_labels(1))
+    assert all(np.hypot(*label.center_m[:2]) < 65.0 for label in far_simulator.compute_labels(1))
 
 
 def test_without_rigs_only_the_reference_is_simulated():
-    seen = Simulator(Scenario.load("courtyard"), {}, SMALL).simulate_frame(0)
-    assert seen.clouds == {}
-    np.testing.assert_array_equal(seen.reference, simulator().simulate_frame(0).reference)
+    observation = Simulator(Scenario.load("courtyard"), {}, SMALL).simulate_frame(0)
+    assert observation.clouds == {}
+    np.testing.assert_array_equal(observation.reference, simulator().simulate_frame(0).reference)
 
 
 @pytest.mark.parametrize(

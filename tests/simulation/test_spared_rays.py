@@ -44,12 +44,12 @@ def is_near(scan, balls):
 @pytest.mark.parametrize("name", SENSORS)
 @pytest.mark.parametrize("radius_m", [0.1, 0.4, 2.0])
 def test_needed_points_do_not_change_by_a_bit(scene, name, radius_m):
-    instant, sensor = scene.get_snapshot(30, max_distance_m=90.0), SENSORS[name]
+    snapshot, sensor = scene.get_snapshot(30, max_distance_m=90.0), SENSORS[name]
     mounted = MountedSensor(sensor, scene, sensor.max_range_m)
 
-    def scan(**asked):
+    def scan(**options):
         draws = SensorNoise(np.random.default_rng(7), num_rays=len(mounted.ray_pixel_indices))
-        return mounted.scan(instant, draws, num_threads=2, **asked)
+        return mounted.scan(snapshot, draws, num_threads=2, **options)
 
     full, generator = scan(), np.random.default_rng(8)
     places_m = full.points[generator.choice(len(full.points), 12)] + generator.normal(0, radius_m / 2, (12, 3))
@@ -58,10 +58,10 @@ def test_needed_points_do_not_change_by_a_bit(scene, name, radius_m):
     of_full, of_spared = is_near(full, balls), is_near(spared, balls)
     assert of_full.sum() > 0
     for column in ("points", "ray_indices", "range_m", "range_error_m", "measured_points"):
-        one, other = getattr(full, column), getattr(spared, column)
-        assert (one is None) == (other is None)
-        if one is not None:
-            np.testing.assert_array_equal(one[of_full], other[of_spared], err_msg=column)
+        expected, actual = getattr(full, column), getattr(spared, column)
+        assert (expected is None) == (actual is None)
+        if expected is not None:
+            np.testing.assert_array_equal(expected[of_full], actual[of_spared], err_msg=column)
     assert (spared.num_rays, spared.self_hits) == (full.num_rays, full.self_hits)
     assert (spared.num_omitted_rays > 0.3 * full.num_rays) == (name != "lidar that takes time") or radius_m > 1
 
@@ -88,35 +88,39 @@ def test_rays_are_selected_if_they_pass_spheres():
 @pytest.mark.parametrize("name", ["lidar", "camera"])
 def test_many_points_share_larger_spheres(scene, name):
     """Larger spheres select all rays of the spheres that they replace; if nearly all are needed, all are cast."""
-    sensor, instant = SENSORS[name], scene.get_snapshot(0, max_distance_m=90.0)
+    sensor, snapshot = SENSORS[name], scene.get_snapshot(0, max_distance_m=90.0)
     mounted, generator = MountedSensor(sensor, scene, 90.0), np.random.default_rng(9)
-    full = mounted.scan(instant, SensorNoise(np.random.default_rng(7), num_rays=len(mounted.ray_pixel_indices)))
+    full = mounted.scan(snapshot, SensorNoise(np.random.default_rng(7), num_rays=len(mounted.ray_pixel_indices)))
     ahead = full.points[(full.points[:, 0] > 2) & (np.abs(full.points[:, 1]) < 4)]
     ahead_m = ahead[generator.integers(0, len(ahead), MAX_SEPARATE_POINTS + 1)] + generator.normal(
         0, 0.3, (MAX_SEPARATE_POINTS + 1, 3)
     )
-    around, each = SearchSpheres.from_points(ahead_m, 0.4), SearchSpheres(ahead_m, 0.4)
-    assert 1 < len(around.centers_m) < MAX_SEPARATE_POINTS
+    merged_spheres, single_spheres = SearchSpheres.from_points(ahead_m, 0.4), SearchSpheres(ahead_m, 0.4)
+    assert 1 < len(merged_spheres.centers_m) < MAX_SEPARATE_POINTS
     assert (
-        (np.linalg.norm(ahead_m[:, None] - around.centers_m, axis=2) + 0.4 <= around.radius_m + 1e-9).any(axis=1).all()
+        (np.linalg.norm(ahead_m[:, None] - merged_spheres.centers_m, axis=2) + 0.4 <= merged_spheres.radius_m + 1e-9)
+        .any(axis=1)
+        .all()
     )
     for tile in mounted.tiles:
-        own = each.find_rays_through(tile, mounted.vehicle_T_sensor)
-        assert around.find_rays_through(tile, mounted.vehicle_T_sensor)[own].all()
+        needed = single_spheres.find_rays_through(tile, mounted.vehicle_T_sensor)
+        assert merged_spheres.find_rays_through(tile, mounted.vehicle_T_sensor)[needed].all()
     spared = mounted.scan(
-        instant, SensorNoise(np.random.default_rng(7), num_rays=len(mounted.ray_pixel_indices)), search_spheres=around
+        snapshot,
+        SensorNoise(np.random.default_rng(7), num_rays=len(mounted.ray_pixel_indices)),
+        search_spheres=merged_spheres,
     )
-    of_full, of_spared = is_near(full, each), is_near(spared, each)
+    of_full, of_spared = is_near(full, single_spheres), is_near(spared, single_spheres)
     np.testing.assert_array_equal(full.points[of_full], spared.points[of_spared])
     assert 0.2 * full.num_rays < spared.num_omitted_rays
     everywhere = SearchSpheres.from_points(generator.normal(0, 9, (MAX_SEPARATE_POINTS + 1, 3)), 4.0)
-    assert mounted.scan(instant, SensorNoise(None), search_spheres=everywhere).num_omitted_rays == 0
+    assert mounted.scan(snapshot, SensorNoise(None), search_spheres=everywhere).num_omitted_rays == 0
 
 
 def test_rigs_share_snapshots_and_few_are_cached(scene):
     first = scene.get_snapshot(0, max_distance_m=90.0)
     assert scene.get_snapshot(0, max_distance_m=90.0) is first
     assert scene.get_snapshot(0, max_distance_m=80.0) is not first
-    for step in range(1, 9):
-        scene.get_snapshot(step, max_distance_m=90.0)
+    for time_step_index in range(1, 9):
+        scene.get_snapshot(time_step_index, max_distance_m=90.0)
     assert scene.get_snapshot(0, max_distance_m=90.0) is not first

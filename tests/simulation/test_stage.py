@@ -29,31 +29,31 @@ ORDER = np.random.default_rng(0).permutation(24).tolist()
 @pytest.fixture
 def built(monkeypatch):
     """Record the runs whose scenes were built, in order."""
-    episodes, world = [], Scenario.build_scene
+    run_indices, build_scene = [], Scenario.build_scene
 
     def counted(self, seed=0, run_index=0, ego_mesh=None):
-        episodes.append(run_index)
-        return world(self, seed, run_index, ego_mesh)
+        run_indices.append(run_index)
+        return build_scene(self, seed, run_index, ego_mesh)
 
     monkeypatch.setattr(Scenario, "build_scene", counted)
-    return episodes
+    return run_indices
 
 
 def simulator():
     return Simulator(SHORT, {"roof": Rig.load("front_roof_128")}, PaperReference(8, 8))
 
 
-def places(made):
+def get_ego_positions(made):
     """Get the ego position of each frame, in a shuffled order."""
     scenes = {index: made.get_scene_geometry(index) for index in ORDER}
     return {index: scene.scene.ego.trajectory.positions_m[step] for index, (scene, step) in scenes.items()}
 
 
 def test_shuffled_frames_build_each_scene_once(built):
-    found = places(simulator())
+    positions_m = get_ego_positions(simulator())
     assert sorted(built) == [0, 1, 2, 3]
     alone = SHORT.build_scene(run_index=1).ego.trajectory.positions_m
-    np.testing.assert_array_equal([found[index] for index in range(6, 12)], alone)
+    np.testing.assert_array_equal([positions_m[index] for index in range(6, 12)], alone)
 
 
 @pytest.mark.parametrize(("room_for", "workers"), [(0.5, 1), (2.5, 1), (2.5, 4)])
@@ -84,7 +84,7 @@ def test_dropped_scenes_need_no_garbage_collection():
 
 def test_scenes_share_casters_and_sensors():
     stages = stage.MountedRigStore(stage.SceneStore(SHORT, seed=0), {"roof": Rig.load("front_roof_128")})
-    one, other = stages.get_mounted_rigs(0), stages.get_mounted_rigs(1)
-    casters = [set(stage.scene_geometry.get_snapshot(0).moving_bodies.casters) for stage in (one, other)]
+    first, second = stages.get_mounted_rigs(0), stages.get_mounted_rigs(1)
+    casters = [set(stage.scene_geometry.get_snapshot(0).moving_bodies.casters) for stage in (first, second)]
     assert casters[0] & casters[1]
-    assert one.sensors_by_rig is other.sensors_by_rig
+    assert first.sensors_by_rig is second.sensors_by_rig

@@ -35,14 +35,14 @@ def driving(start, way, turn_deg=0.0):
     )
 
 
-def world(ego_mps=0.0, cars_mps=0.0, turn_deg=0.0, step_s=PERIOD_S):
+def build_scene(ego_mps=0.0, cars_mps=0.0, turn_deg=0.0, step_s=PERIOD_S):
     """Build an ego between two walls, an approaching car next to it, and a car that crosses far ahead."""
     ground, wall = Plane(type="plane", size_m=(400, 400)).build_mesh(), box(60, 0.5, 4)
     walls = [wall.transform(Pose(y_m=y_m).to_matrix()) for y_m in (-9.0, 12.0)]
     ego = Actor("ego", "ego", box(4, 2, 1), driving((0, 0, 0), (5 * ego_mps, 0, 0), turn_deg))
-    beside = Actor("beside", "car", box(4, 2, 1.5), driving((6, 5, 0), (-5 * cars_mps, 0, 0)))
+    near_car = Actor("beside", "car", box(4, 2, 1.5), driving((6, 5, 0), (-5 * cars_mps, 0, 0)))
     ahead = Actor("ahead", "car", box(4, 2, 1.5), driving((15, -2, 0), (0, 5 * cars_mps, 0), 2 * turn_deg))
-    return Scene((ground, *walls), ego, (beside, ahead), time_step_s=step_s, duration_s=1.0)
+    return Scene((ground, *walls), ego, (near_car, ahead), time_step_s=step_s, duration_s=1.0)
 
 
 def swept(made, time_s=0.5, lidar=LIDAR, draws=EXACT):
@@ -56,72 +56,77 @@ def swept(made, time_s=0.5, lidar=LIDAR, draws=EXACT):
 )
 def test_columns_equal_scans_at_their_own_time(ego_mps, cars_mps, turn_deg):
     """Compared with a slow implementation that places the whole scene for each column."""
-    made = world(ego_mps, cars_mps, turn_deg)
-    mounted, seen = swept(made)
+    made = build_scene(ego_mps, cars_mps, turn_deg)
+    mounted, sweep = swept(made)
     _, raw = swept(made, lidar=LIDAR.model_copy(update={"scan": ScanTimes(period_s=PERIOD_S, deskewed=False)}))
-    np.testing.assert_array_equal(raw.points, seen.points)
-    fine = SceneGeometry(world(ego_mps, cars_mps, turn_deg, step_s=STEP_S))
+    np.testing.assert_array_equal(raw.points, sweep.points)
+    fine = SceneGeometry(build_scene(ego_mps, cars_mps, turn_deg, step_s=STEP_S))
     now, at_once = round(0.5 / STEP_S), LIDAR.model_copy(update={"scan": None})
     world_T_now = made.ego.trajectory.interpolate(0.5)
     compared = moved = 0
     for column in range(COLUMNS):
         step = now - 2 * (COLUMNS - column) + 1
-        then, time_s = fine.get_snapshot(step), step * STEP_S
-        there = MountedSensor(at_once, fine, LIDAR.max_range_m).scan(then, EXACT)
-        own, mine = (mounted.ray_pixel_indices[scan.ray_indices] % COLUMNS == column for scan in (there, seen))
-        np.testing.assert_array_equal(there.ray_indices[own], seen.ray_indices[mine])
-        np.testing.assert_allclose(seen.range_m[mine], there.range_m[own], rtol=1e-4, atol=2e-3)
-        np.testing.assert_allclose(raw.measured_points[mine], there.points[own], atol=5e-3)
-        struck = then.scan(at_once.mount.to_matrix(), mounted.tiles, max_range_m=60).find_attributes()
-        now_T_then = invert(world_T_now) @ made.ego.trajectory.interpolate(time_s)
-        true = transform_points(now_T_then, there.points[own])
-        np.testing.assert_allclose(
-            (seen.points if seen.measured_points is None else seen.measured_points)[mine], true, atol=5e-3
+        snapshot, time_s = fine.get_snapshot(step), step * STEP_S
+        column_scan = MountedSensor(at_once, fine, LIDAR.max_range_m).scan(snapshot, EXACT)
+        in_column, in_sweep = (
+            mounted.ray_pixel_indices[scan.ray_indices] % COLUMNS == column for scan in (column_scan, sweep)
         )
-        others = [actor for actor in made.actors if actor.trajectory.is_moving]
+        np.testing.assert_array_equal(column_scan.ray_indices[in_column], sweep.ray_indices[in_sweep])
+        np.testing.assert_allclose(sweep.range_m[in_sweep], column_scan.range_m[in_column], rtol=1e-4, atol=2e-3)
+        np.testing.assert_allclose(raw.measured_points[in_sweep], column_scan.points[in_column], atol=5e-3)
+        struck = snapshot.scan(at_once.mount.to_matrix(), mounted.tiles, max_range_m=60).find_attributes()
+        now_T_then = invert(world_T_now) @ made.ego.trajectory.interpolate(time_s)
+        true = transform_points(now_T_then, column_scan.points[in_column])
+        np.testing.assert_allclose(
+            (sweep.points if sweep.measured_points is None else sweep.measured_points)[in_sweep], true, atol=5e-3
+        )
+        moving_actors = [actor for actor in made.actors if actor.trajectory.is_moving]
         for actor, number in zip(
-            others, [body for body in then.moving_bodies.body_indices if body != then.ego_index], strict=True
+            moving_actors,
+            [body for body in snapshot.moving_bodies.body_indices if body != snapshot.ego_index],
+            strict=True,
         ):
-            on_body, trajectory = struck.body_indices[own] == number, actor.trajectory
+            on_body, trajectory = struck.body_indices[in_column] == number, actor.trajectory
             travelled = (
                 invert(world_T_now) @ trajectory.interpolate(0.5) @ invert(trajectory.interpolate(time_s)) @ world_T_now
             )
             true[on_body] = transform_points(travelled, true[on_body])
             moved += int(on_body.sum())
-        np.testing.assert_allclose(seen.points[mine], true, atol=5e-3)
+        np.testing.assert_allclose(sweep.points[in_sweep], true, atol=5e-3)
         compared += len(true)
     assert compared > 200
     assert (moved > 15) == (cars_mps > 0)
 
 
 def test_static_scenes_give_identical_bits():
-    _, still = swept(world())
-    _, at_once = swept(world(), lidar=LIDAR.model_copy(update={"scan": None}))
+    _, still = swept(build_scene())
+    _, at_once = swept(build_scene(), lidar=LIDAR.model_copy(update={"scan": None}))
     np.testing.assert_array_equal(still.points.view(np.int32), at_once.points.view(np.int32))
     assert still.measured_points is None
     # An ego at rest among moving actors: hits on static bodies are the same, and their measured points are exact.
-    moving = world(cars_mps=15.0)
-    _, seen = swept(moving)
+    moving = build_scene(cars_mps=15.0)
+    _, sweep = swept(moving)
     _, at_once = swept(moving, lidar=LIDAR.model_copy(update={"scan": None}))
-    both = np.intersect1d(seen.ray_indices, at_once.ray_indices)
-    same = (seen.points[np.isin(seen.ray_indices, both)] == at_once.points[np.isin(at_once.ray_indices, both)]).all(
-        axis=1
-    )
+    common_rays = np.intersect1d(sweep.ray_indices, at_once.ray_indices)
+    same = (
+        sweep.points[np.isin(sweep.ray_indices, common_rays)]
+        == at_once.points[np.isin(at_once.ray_indices, common_rays)]
+    ).all(axis=1)
     assert same.mean() > 0.85
 
 
 @pytest.mark.parametrize("car_mps", [0.0, 12.0])
 def test_motion_distortion_is_speed_times_time(car_mps):
     """The rear of a car 8 m ahead of an ego at 20 m/s: three clouds in closed form."""
-    made = world(ego_mps=20.0)
+    made = build_scene(ego_mps=20.0)
     car = Actor("car", "car", box(4, 6, 1.5), driving((20.0 - car_mps / 2, 0, 0), (5 * car_mps, 0, 0)))
-    mounted, seen = swept(replace(made, static_meshes=made.static_meshes[:1], actors=(car,)))
-    pixel = mounted.ray_pixel_indices[seen.ray_indices]
+    mounted, sweep = swept(replace(made, static_meshes=made.static_meshes[:1], actors=(car,)))
+    pixel = mounted.ray_pixel_indices[sweep.ray_indices]
     time_s = LIDAR.compute_ray_times_s().reshape(-1)[pixel]
     directions = LIDAR.mount.to_matrix()[:3, :3] @ LIDAR.compute_directions().reshape(3, -1)[:, pixel]
-    as_cast_m = LIDAR.mount.to_matrix()[:3, 3] + (directions * seen.range_m).T
-    rear = (seen.points[:, 2] > 0.3) & (seen.points[:, 2] < 1.4) & (np.abs(seen.points[:, 0] - 8.0) < 0.01)
-    landed = seen.points if seen.measured_points is None else seen.measured_points
+    as_cast_m = LIDAR.mount.to_matrix()[:3, 3] + (directions * sweep.range_m).T
+    rear = (sweep.points[:, 2] > 0.3) & (sweep.points[:, 2] < 1.4) & (np.abs(sweep.points[:, 0] - 8.0) < 0.01)
+    landed = sweep.points if sweep.measured_points is None else sweep.measured_points
     assert rear.sum() > 5
     # Without motion compensation: distorted by the speed relative to the ego.
     np.testing.assert_allclose(as_cast_m[rear, 0], 8.0 + (car_mps - 20.0) * time_s[rear], atol=2e-3)
@@ -132,7 +137,7 @@ def test_motion_distortion_is_speed_times_time(car_mps):
 
 def test_first_frames_are_simulated_like_later_frames():
     """Motion before the begin of a scene is taken from its first frames."""
-    made = world(ego_mps=20.0)
+    made = build_scene(ego_mps=20.0)
     made = replace(made, static_meshes=made.static_meshes[:1], actors=())
     (_, first), (_, later), (_, at_once) = (
         swept(made, time_s, lidar)
@@ -162,7 +167,7 @@ def test_lidar_columns_and_camera_rows_are_consecutive(sensor, axis):
 
 def test_range_errors_are_along_the_distorted_ray():
     """Errors are along the ray as it was cast, from the sensor position at that time."""
-    made = world(ego_mps=20.0)
+    made = build_scene(ego_mps=20.0)
     exact, erring = (
         swept(made, lidar=LIDAR.model_copy(update={"range_noise_m": sigma_m}), draws=draws)[1]
         for sigma_m, draws in ((0.0, EXACT), (0.5, SensorNoise(np.random.default_rng(1))))
@@ -182,6 +187,6 @@ def test_scans_longer_than_time_steps_are_refused():
         with pytest.raises(
             ValueError, match=r"'roof': a scan of period_s 0\.1 is longer than the time step .* 0\.05 s"
         ):
-            swept(world(ego_mps=ego_mps, step_s=0.05))
+            swept(build_scene(ego_mps=ego_mps, step_s=0.05))
     with pytest.raises(ValueError, match=r"scan\.period_s: a number above 0"):
         Lidar(**{**LIDAR.model_dump(), "scan": {"period_s": 0.0}})

@@ -41,12 +41,12 @@ def test_headings_that_look_like_radians_are_reported(tmp_path, unit):
         rows = [f"{0.1 * k:.1f},{x_m[k]:.4f},{y_m[k]:.4f},0,0,0,{yaw[k]:.4f}" for k in range(30)]
         boxes = [f"{0.1 * k:.1f},a,car,{x_m[k]:.4f},{y_m[k]:.4f},0,4,2,1.5,{yaw[k]:.4f}" for k in range(30)]
         parked = f"0,a,car,5,5,0,4,2,1.5,{1.5708 if unit == 'rad' else 90}"
-        for read, text, told in (
+        for read, text, message in (
             (read_trajectory, HEADER + "\n".join(rows), "yaw: up to .* along the way as radians only"),
             (read_box_actors, BOXES + "\n".join(boxes), "yaw: up to .* along the way as radians only"),
             (read_box_actors, BOXES + parked, "yaw: 1.5708 looks like 90 degrees in radians"),
         ):
-            with pytest.warns(UserWarning, match=told) if unit == "rad" else nullcontext():
+            with pytest.warns(UserWarning, match=message) if unit == "rad" else nullcontext():
                 read(write(tmp_path, text))
 
 
@@ -107,10 +107,10 @@ def scenario_at(folder, ego_s, actor_s, boxes_s):
 
 @pytest.mark.parametrize("start_s", [0, UNIX_S, 1e5])
 def test_trajectories_of_another_clock_move_alike(tmp_path, start_s):
-    world = scenario_at(tmp_path, start_s, start_s + 1, start_s).build_scene()
+    scene = scenario_at(tmp_path, start_s, start_s + 1, start_s).build_scene()
     places_m = [
         actor.trajectory.interpolate_positions_m(np.array([0.0, 1.5, 3.0]))[:, 0]
-        for actor in (world.ego, *world.actors)
+        for actor in (scene.ego, *scene.actors)
     ]
     np.testing.assert_allclose(places_m, [[0, 3, 6], [0, 1.5, 6], [0, 6, 12]], atol=1e-5)
 
@@ -202,9 +202,9 @@ def test_a_scenario_of_files_plays(tmp_path):
     write(tmp_path, HEADER + "0,0,0,0,0,0,0\n4,40,0,0,0,0,0\n", "ego.csv")
     write(tmp_path, HEADER + "0,30,4,0,0,0,0\n4,30,4.004,0,0,0,0\n", "bus.csv")
     write(tmp_path, BOXES + "1,a,car,20,-5,0,4,2,1.5,0\n2,a,car,20,-5,0,4,2,1.5,0\n", "boxes.csv")
-    world = Scenario.load(write(tmp_path, SCENARIO, "s.yaml")).build_scene()
-    assert world.num_time_steps == 5
-    scene = SceneGeometry(world)
+    scene = Scenario.load(write(tmp_path, SCENARIO, "s.yaml")).build_scene()
+    assert scene.num_time_steps == 5
+    scene = SceneGeometry(scene)
     sphere = split_into_tiles(
         compute_unit_directions(np.linspace(-60, 30, 90)[:, None], np.linspace(-180, 179, 360)[None])
     )
@@ -218,6 +218,6 @@ def test_a_scenario_of_files_plays(tmp_path):
 
 
 def test_actors_have_either_pose_or_trajectory(tmp_path):
-    both = SCENARIO.replace("trajectory: ego.csv", "trajectory: ego.csv, pose: {x_m: 1}")
+    invalid = SCENARIO.replace("trajectory: ego.csv", "trajectory: ego.csv, pose: {x_m: 1}")
     with pytest.raises(ValueError, match="ego: give a pose or a trajectory, not both"):
-        Scenario.load(write(tmp_path, both, "s.yaml"))
+        Scenario.load(write(tmp_path, invalid, "s.yaml"))

@@ -30,11 +30,11 @@ def visible_area(scene, place_m, box_m, rays, seed, max_range_m=250.0):
     hits = scene.run(origins, towards, output=True)
     range_m = hits["tfar"].astype(np.float64)
     points_m = place_m + range_m[:, None] * towards
-    seen = (hits["geomID"] >= 0) & (hits["geomID"] != EGO) & (range_m <= max_range_m)
-    seen &= ((points_m >= low) & (points_m < high)).all(axis=1)
-    normals = hits["Ng"][seen].astype(np.float64)
-    cosine = np.abs((normals * towards[seen]).sum(axis=1)) / np.linalg.norm(normals, axis=1)
-    return points_m[seen], range_m[seen] ** 2 / (cosine * per_angle[seen])
+    is_visible = (hits["geomID"] >= 0) & (hits["geomID"] != EGO) & (range_m <= max_range_m)
+    is_visible &= ((points_m >= low) & (points_m < high)).all(axis=1)
+    normals = hits["Ng"][is_visible].astype(np.float64)
+    cosine = np.abs((normals * towards[is_visible]).sum(axis=1)) / np.linalg.norm(normals, axis=1)
+    return points_m[is_visible], range_m[is_visible] ** 2 / (cosine * per_angle[is_visible])
 
 
 def _scene(world, step):
@@ -57,22 +57,22 @@ BANDS = ((-0.5, 0.5), (0.5, 2.0))
 
 @pytest.mark.parametrize(("made", "seed"), [(Scenario.load("courtyard"), 0), (Scenario.model_validate(URBAN), 4)])
 def test_both_references_measure_the_same_visible_area(made, seed, monkeypatch):
-    places = []
+    positions = []
 
     def remembered(ego, shell_m, generator):
-        places.append(sample_position_in_shell(ego, shell_m, generator))
-        return places[-1]
+        positions.append(sample_position_in_shell(ego, shell_m, generator))
+        return positions[-1]
 
     monkeypatch.setattr("torchcover.simulation.surface_reference.sample_position_in_shell", remembered)
     simulator = Simulator(made, {}, SurfaceReference((AREA,), num_rays=16_384, bands_m=BANDS), seed=seed)
     points, twins = [], []
     for index in range(8):
-        places.clear()
+        positions.clear()
         step = simulator.simulate_frame(index)
         points.append((step.reference, step.reference_weights))
         scene, time_step = simulator.get_scene_geometry(index)
         twin = _scene(scene.scene, time_step)
-        for place_m in places[-4:]:
+        for place_m in positions[-4:]:
             points_m, m2 = visible_area(twin, place_m, (*AREA, (-0.6, 2.1)), 2**15, seed=index)
             twins.append((points_m, m2 / 4))
     for low, high in BANDS:
@@ -81,9 +81,9 @@ def test_both_references_measure_the_same_visible_area(made, seed, monkeypatch):
         assert ours[1:] / ours[0] == pytest.approx(theirs[1:] / theirs[0], rel=0.01, abs=0.15)
 
 
-def _sums(found, low, high):
+def _sums(points, low, high):
     """Compute the area in a band, and the area-weighted sums of the distance from the vehicle and of y."""
-    points_m, m2 = (np.concatenate(part).astype(np.float64) for part in zip(*found, strict=True))
+    points_m, m2 = (np.concatenate(part).astype(np.float64) for part in zip(*points, strict=True))
     m2 = m2 * (points_m[:, 2] >= low) * (points_m[:, 2] < high)
     # The box is slightly higher than the bands, since its rays are few at the borders.
     return np.array([m2.sum(), (m2 * np.linalg.norm(points_m, axis=1)).sum(), (m2 * points_m[:, 1]).sum()])

@@ -50,6 +50,7 @@ def suggest_key(key: str, known_keys: Sequence[str]) -> str:
     """
     if key in FOREIGN_KEYS:
         return FOREIGN_KEYS[key]
+    known_keys = [name for name in known_keys if name != key]  # a key of another document is unknown here as well
     units = ("rad", "deg", "mm", "cm", "m", "km", "ft", "in", "s", "ms", "hz", "mps", "kmh")
     stem, _, suffix = key.rpartition("_")
     quantity = stem if suffix in units else key

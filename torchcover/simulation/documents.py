@@ -44,7 +44,7 @@ class Document(BaseModel):
         except ValidationError as error:
             raise ValueError(f"{type(self).__name__}: {explain_document_error(error)}") from None
 
-    # As pydantic marks its own: documents within documents are validated without a call of it.
+    # The marker of pydantic's own constructor: nested documents are validated without calling this one.
     __init__.__pydantic_base_init__ = True  # type: ignore[attr-defined]
 
     @model_validator(mode="before")
@@ -53,7 +53,7 @@ class Document(BaseModel):
         if not isinstance(content, dict):
             return content
         converted = {key: _to_python_value(value) for key, value in content.items()}
-        # Other tools give these angles in radians.
+        # These angles are often given in radians by mistake.
         angle_keys = ["yaw_deg", "pitch_deg", "roll_deg", "fov_deg", "horizontal_fov_deg", "vertical_fov_deg"]
         angle_keys.append("facing_deg")
         warn_about_radians({key: converted[key] for key in angle_keys if has_only_numbers(converted.get(key))})

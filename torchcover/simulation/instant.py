@@ -221,9 +221,9 @@ class SceneSnapshot:
     def _get_motion(self, ray_times: Sequence[RayTimes]) -> ScanMotion | None:
         """Get the motion during a scan; scans of about the same interval share it."""
         interval_s = 0.005  # scans begin and end at multiples of this
-        edges_s = [time_s for times in ray_times if len(times.times_s) for time_s in times.times_s[[0, -1]]]
-        begin_s = interval_s * math.floor(min(edges_s, default=0.0) / interval_s)
-        end_s = interval_s * math.ceil(max(edges_s, default=0.0) / interval_s)
+        times_s = np.concatenate([tile_times.times_s for tile_times in ray_times])
+        begin_s = interval_s * math.floor(times_s.min() / interval_s) if len(times_s) else 0.0
+        end_s = interval_s * math.ceil(times_s.max() / interval_s) if len(times_s) else 0.0
         if (begin_s, end_s) not in self._motions:
             current_poses = BodyPoses(self.static_T_vehicle, self.moving_bodies.vehicle_T_part)
             self._motions[begin_s, end_s] = ScanMotion.from_poses(

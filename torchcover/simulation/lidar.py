@@ -41,7 +41,7 @@ class ScanPattern(RangeSensor):
         min_range_m, max_range_m, range_noise_m, dropout: See `RangeSensor`.
     """
 
-    # Limits are 100 times those of products on the market.
+    # Limits are 100 times the values of products on the market.
     channels: Annotated[int, Field(gt=0, le=100_000)] | None = None
     vertical_fov_deg: tuple[Elevation, Elevation] | None = None
     elevations_deg: tuple[Elevation, ...] | None = Field(default=None, min_length=1)
@@ -155,7 +155,7 @@ class LidarModel(ScanPattern, BuiltInDocument):
     description: str = ""
 
     def complete_keys(self, sensor_keys: dict[str, Any]) -> dict[str, Any]:
-        """Complete the keys of a sensor with those of the model.
+        """Complete the keys of a sensor with keys of the model.
 
         Args:
             sensor_keys: Keys of the sensor, which take precedence. A sensor with evenly spaced rows takes no row table

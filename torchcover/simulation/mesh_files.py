@@ -169,7 +169,7 @@ def _triangulate_obj(data: bytes) -> bytes:
         for polygon in np.flatnonzero(find_bad_fans(positions[polygons])).tolist():
             corners = _split_corners(lines[polygon_lines[polygon]])
             triangles = triangulate(positions[polygons[polygon]], [np.arange(size)])
-            triangle_lines = [b"f " + b" ".join(corners[k] for k in triangle) for triangle in triangles.tolist()]
+            triangle_lines = [b"f %s %s %s" % (corners[a], corners[b], corners[c]) for a, b, c in triangles.tolist()]
             lines[polygon_lines[polygon]] = b"\n".join(triangle_lines)
     return b"\n".join(lines)
 
@@ -230,7 +230,8 @@ def _triangulate_ply(
 def _read_off_polygons(text: str) -> Iterator[NDArray[np.int64]]:
     """Read the vertex indices of each face of an OFF file that trimesh has accepted."""
     text = re.split("C?OFF", text, maxsplit=1)[1]
-    rows = [words for line in text.splitlines() if (words := line.partition("#")[0].split())]
+    rows = [line.partition("#")[0].split() for line in text.splitlines()]
+    rows = [words for words in rows if words]
     num_vertices, num_faces = int(rows[0][0]), int(rows[0][1])
     for words in rows[num_vertices + 1 : num_vertices + num_faces + 1]:
         yield np.array(words[1 : int(words[0]) + 1], dtype=np.int64)

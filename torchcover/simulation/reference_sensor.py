@@ -25,7 +25,7 @@ PoseSampler = Callable[[BoundingBox, np.random.Generator], Float64]
 
 @dataclass(frozen=True, eq=False)
 class ReferenceContext:
-    """One frame as a reference sensor needs it.
+    """Input of a reference sensor for one frame.
 
     Args:
         scene_geometry: Geometry of the scene.

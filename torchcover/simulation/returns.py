@@ -19,7 +19,7 @@ from torchcover.geometry.arrays import Float32
 from torchcover.simulation.builtin import list_builtin_names
 from torchcover.simulation.documents import BuiltInDocument
 
-# Materials from user files that this process has loaded; their indices follow those of the built-in materials.
+# Materials from user files that this process has loaded; their indices follow the built-in materials.
 _USER_MATERIALS: list["Material"] = []
 _LOCK = Lock()
 # Brightness offset of a body relative to its material, in standard deviations, indexed by body index modulo 4096. It is
@@ -230,7 +230,7 @@ class Weather(BuiltInDocument):
 
     @property
     def extinction_per_m(self) -> float:
-        """One-way extinction coefficient of the air in 1/m."""
+        """Extinction coefficient of the air in 1/m, for one way."""
         return compute_extinction_per_m(self.visibility_m, self.rain_mm_h)
 
 

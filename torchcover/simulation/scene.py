@@ -133,16 +133,14 @@ class SceneGeometry:
         if key not in self._surfaces:
             ego, objects = self.scene.ego, self.scene.objects
             object_indices = {id(actor): index for index, actor in enumerate(objects)}
-            static_poses = {
-                object_indices[id(actor)]: pose
-                for actor, pose in zip(self._static_actors, self._local_T_static_actors, strict=True)
-                if actor is not ego
-            }
-            moving_objects = {
-                body_index: object_indices[id(actor)]
-                for body_index, actor in enumerate(self._moving_actors, self._first_moving_index)
-                if actor is not ego
-            }
+            static_poses: dict[int, Matrix] = {}
+            for actor, pose in zip(self._static_actors, self._local_T_static_actors, strict=True):
+                if actor is not ego:
+                    static_poses[object_indices[id(actor)]] = pose
+            moving_objects: dict[int, int] = {}
+            for body_index, actor in enumerate(self._moving_actors, self._first_moving_index):
+                if actor is not ego:
+                    moving_objects[body_index] = object_indices[id(actor)]
             self._surfaces[key] = SceneSurface(
                 self._build_scenery(),
                 [self._geometries.get_geometry(actor.mesh).patches for actor in objects],

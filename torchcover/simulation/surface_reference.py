@@ -137,7 +137,7 @@ class SurfaceReference:
         bounds = np.array([(*area, band) for area in self.areas for band in self.bands_m], dtype=np.float64)
         boxes = UprightBoxes(*bounds.transpose(2, 0, 1))
         snapshot = context.snapshot
-        # All positions are sampled before the first point: they are the same for any number of rays.
+        # Positions are sampled before the first point, so that they are the same for any number of rays.
         samples = [context.sample_free_pose(self._sample_pose) for _ in range(self.num_poses)]
         positions_m = [pose[:3, 3] for pose, _ in samples]
         lower_m, upper_m = boxes.lower_m.min(axis=0), boxes.upper_m.max(axis=0)

@@ -263,7 +263,7 @@ def _sample_stratum(
     required = num_points * total_m2 / inside_m2
     expected = float(round(required)) if required >= 1 else required
     count = int(expected + rng.random())
-    # One sample in each of `count` equal parts of the area: consecutive patches are close to each other.
+    # Each of `count` equal parts of the area has one sample; consecutive patches are close to each other.
     samples_m2 = (np.arange(count) + rng.random(count)) / max(count, 1) * total_m2
     # Rounding must not move the last sample beyond the end, where patches that do not face the position may follow.
     samples_m2 = np.minimum(samples_m2, np.nextafter(total_m2, 0.0))
@@ -296,7 +296,7 @@ def _sample_objects(
     end_m2 = cumulative_m2[np.append(objects.first_positions[1:], len(is_sampled)) - 1]
     start_m2 = np.append(0.0, end_m2[:-1])
     density_per_m2[objects.object_indices] = points_per_object / (end_m2 - start_m2)
-    # One sample in each equal part of the area of the object; rounding must not move the last one to the next object.
+    # Each equal part of the area of an object has one sample; rounding must not move the last one to the next object.
     parts = (np.arange(points_per_object) + rng.random((len(end_m2), points_per_object))) / points_per_object
     samples_m2 = start_m2[:, None] + parts * (end_m2 - start_m2)[:, None]
     samples_m2 = np.minimum(samples_m2, np.nextafter(end_m2, 0.0)[:, None])
