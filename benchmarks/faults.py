@@ -18,7 +18,7 @@ from pathlib import Path
 from unittest import mock
 
 from benchmarks import table
-from tests.cli.hostile import PLAIN, cases
+from tests.cli.hostile import PLAIN, list_cases
 from tests.damaged.good_files import kinds
 from tests.damaged.mutated_files import attempt, attempt_pipe, bombs, largest_mb, mutated, silence_libraries
 from torchcover.cli import app
@@ -113,7 +113,7 @@ def show_documents():
     signal.signal(signal.SIGPROF, _stop)
     assert ending_of(PLAIN, limit_s=0)[0] == "ran"  # imports what the others need, be it as slow as it likes
     endings, slowest, before = Counter(), (0.0, ""), _peak_mb()
-    for case in cases():
+    for case in list_cases():
         start = time.process_time()
         ending, words = ending_of(case)
         slowest = max(slowest, (time.process_time() - start, case.name))

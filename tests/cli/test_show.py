@@ -128,7 +128,7 @@ def test_urdf_becomes_vehicle_and_rig(torchcover, tmp_path):
     ("<robot name='a'><link name='b'><visual><geometry><sphere radius='0'/></geometry></visual></link></robot>",
      "link 'b': <sphere>: size_m.0: a number above 0 is needed; got 0.0"),
     ("<robot name='a'><link name='b'/><joint name='j'><parent link='b'/><child link='c'/></joint></robot>",
-     "joint 'j' is about 'c', which is no link"),
+     "joint 'j' refers to 'c', which is no link"),
 ])  # fmt: skip
 def test_invalid_urdf_is_one_line(torchcover, tmp_path, text, message):
     path = tmp_path / "bad.urdf"
