@@ -11,7 +11,7 @@ from PIL import Image
 
 from torchcover.cli import show
 from torchcover.evaluation import build_sensor_views, scene_figures
-from torchcover.evaluation.task import load_named_rig, make_rig_names
+from torchcover.evaluation.rig_names import load_named_rig, make_rig_names
 from torchcover.simulation import Rig, Scenario, list_builtin_names
 
 

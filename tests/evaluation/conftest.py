@@ -1,4 +1,4 @@
-"""Frames made by hand."""
+"""Frames with random points, and blank maps."""
 
 import pytest
 import torch
@@ -8,7 +8,7 @@ from torchcover.data import Frame
 
 @pytest.fixture
 def frame_of():
-    """Frame number k: a sensor point of `a` and one of `b` above 20 random reference points; odd counts."""
+    """Return a function from an index to a frame with 5 points of each rig and 20 weighted reference points."""
 
     def make(index):
         generator = torch.Generator().manual_seed(index)
@@ -22,6 +22,6 @@ def frame_of():
 
 @pytest.fixture(autouse=True)
 def _maps(request):
-    """Blank, unless a test asks for `drawn_maps`: what is on them is the business of tests/report."""
+    """Plot blank maps unless a test uses `drawn_maps`; their content is tested in tests/report."""
     if "drawn_maps" not in request.fixturenames:
         request.getfixturevalue("blank_maps")

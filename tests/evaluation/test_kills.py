@@ -1,4 +1,4 @@
-"""A result is safe from kills; `python -m benchmarks kills` asks all commands."""
+"""A killed process leaves a complete result; `python -m benchmarks kills` tests all commands."""
 
 import json
 import os
@@ -14,7 +14,7 @@ from torchcover.files import BadFileError
 
 
 class Drive(FrameDataset):
-    """Two points that a sensor sees one of."""
+    """Two reference points, one of which a sensor detects."""
 
     rigs = ("low",)
     sensors = {}  # noqa: RUF012
@@ -34,21 +34,22 @@ class Drive(FrameDataset):
 
 
 @pytest.mark.usefixtures("blank_maps")
-def test_a_kill_at_any_file_operation_leaves_the_earlier_or_the_new_result(tmp_path):
-    earlier, new = (torchcover.evaluate(frames=Drive(), cell_m=8.0, num_frames=steps) for steps in (2, 3))
+def test_kills_leave_the_earlier_or_the_new_result(tmp_path):
+    earlier, new = (torchcover.evaluate(frames=Drive(), cell_m=8.0, num_frames=num_frames) for num_frames in (2, 3))
     earlier.save(tmp_path / "out")
     copies = tmp_path / "copies"
     count, code = operations_of(lambda: new.save(tmp_path / "out"), copied=(tmp_path / "out", copies))
     assert (count > 40, code) == (True, 0)
-    steps = []
-    for out in (copies / str(at) for at in range(count)):
+    saved_frames = []
+    for index in range(count):
+        out = copies / str(index)
         summary = json.loads((out / "summary.json").read_text())
         if summary.get("writing"):
             with pytest.raises(BadFileError, match="an incomplete result"):
                 Coverage.load(out / "coverage.npz")
             continue
-        steps.append(Coverage.load(out / "coverage.npz").counts["num_frames"])
-        assert summary["counts"]["num_frames"] == steps[-1]
+        saved_frames.append(Coverage.load(out / "coverage.npz").counts["num_frames"])
+        assert summary["counts"]["num_frames"] == saved_frames[-1]
         assert [name for name in summary["files"] if not os.path.isfile(out / name)] == []
-    assert steps == sorted(steps)
-    assert set(steps) == {2, 3}
+    assert saved_frames == sorted(saved_frames)
+    assert set(saved_frames) == {2, 3}

@@ -1,4 +1,4 @@
-"""What a run left out."""
+"""Omissions of a run."""
 
 import sys
 
@@ -10,7 +10,7 @@ from torchcover.evaluation import list_omissions
 from torchcover.simulation import CameraSensor
 
 
-def test_points_outside_the_grid_are_counted_over_all_rigs():
+def test_outside_points_are_summed_over_rigs():
     grid = BevGrid(x_m=(0.0, 2.0), y_m=(0.0, 2.0), cell_m=1.0)
     metric = CoverageMetric(grid)
     metric.update(torch.zeros(1, 3), torch.tensor([[0.5, 0.5, 0.0], [9.0, 0.0, 0.0], [-1.0, 0.0, 0.0]]))
@@ -21,17 +21,19 @@ def test_points_outside_the_grid_are_counted_over_all_rigs():
     assert f"{others}: not requested, not computed" in records
 
 
-def test_aggregations_that_were_asked_for_are_not_left_out():
+def test_requested_aggregations_are_no_omissions():
     metric = CoverageMetric(BevGrid(x_m=(0.0, 2.0), y_m=(0.0, 2.0), cell_m=1.0), aggregations=[Maximum()])
     metric.update(torch.zeros(1, 3), torch.tensor([[0.5, 0.5, 0.0]]))
     (listed,) = [
-        row.description for row in list_omissions({}, [metric.compute()], [Maximum()]) if "not computed" in row.description
+        row.description
+        for row in list_omissions({}, [metric.compute()], [Maximum()])
+        if "not computed" in row.description
     ]
     assert [kind.description in listed for kind in AGGREGATIONS] == [kind is not Maximum for kind in AGGREGATIONS]
 
 
 @pytest.mark.parametrize("count", [0, 7])
-def test_what_was_not_left_out_is_not_listed(count):
+def test_omissions_with_count_zero_are_not_listed(count):
     metric = CoverageMetric(BevGrid(x_m=(0.0, 2.0), y_m=(0.0, 2.0), cell_m=1.0))
     metric.update(torch.zeros(1, 3), torch.tensor([[0.5, 0.5, 0.0]]))
     counts = {"moving_bodies_out_of_range": count, "moving_bodies": 9}
@@ -42,12 +44,12 @@ def test_what_was_not_left_out_is_not_listed(count):
 @pytest.mark.parametrize(
     ("lens", "coefficients"), [("brown_conrady", (0.1, 0, 0, 0)), ("kannala_brandt", (0.1, 0, 0, 0))]
 )
-def test_nobody_is_told_that_the_distortion_of_a_lens_was_left_out(lens, coefficients, monkeypatch):
-    """The lens may need no kornia, and who makes the frames may be another process."""
+def test_lens_distortion_is_never_an_omission(lens, coefficients, monkeypatch):
+    """Some lenses need no kornia, and frames may be made in another process."""
     monkeypatch.delitem(sys.modules, "kornia", raising=False)
     size = {"width": 8, "height": 6, "fx": 5, "fy": 5, "cx": 4, "cy": 3, "max_range_m": 50}
-    straight = CameraSensor(name="a", **size)
-    bent = CameraSensor(name="b", lens=lens, coefficients=(0.1, 0.0, 0.0, 0.0), **size)
+    pinhole = CameraSensor(name="a", **size)
+    distorted = CameraSensor(name="b", lens=lens, coefficients=(0.1, 0.0, 0.0, 0.0), **size)
 
     def listed(*sensors, **options):
         return [
@@ -56,6 +58,6 @@ def test_nobody_is_told_that_the_distortion_of_a_lens_was_left_out(lens, coeffic
             if "lenses with distortion" in row.description
         ]
 
-    assert listed(straight) == ["kornia, for lenses with distortion: not imported"]
-    assert listed(straight, bent) == []
-    assert listed(straight, num_workers=2) == []
+    assert listed(pinhole) == ["kornia, for lenses with distortion: not imported"]
+    assert listed(pinhole, distorted) == []
+    assert listed(pinhole, num_workers=2) == []

@@ -1,4 +1,4 @@
-"""The one loop: every observer has seen the same frames, however it ends."""
+"""Observation loop: all observers receive the same frames in order, also if the run ends early."""
 
 import multiprocessing
 import os
@@ -15,8 +15,9 @@ from torch.utils.data import Subset
 
 from torchcover import BevGrid, CoverageMetric, Scenario, evaluate
 from torchcover.data import BadFrameError, RigSubset, SimulatedFrames
-from torchcover.evaluation import CoverageObserver, observe, pipeline
-from torchcover.evaluation.pipeline import MAX_FRAMES_PER_TASK, MeasuredFrames, group_by_scene
+from torchcover.evaluation import CoverageObserver, frame_workers, observe, pipeline
+from torchcover.evaluation.frame_workers import MAX_FRAMES_PER_TASK, group_by_scene
+from torchcover.evaluation.pipeline import MeasuredFrames
 from torchcover.evaluation.progress import Progress, handle_termination, show_wait
 from torchcover.frames import build_scene_lookup
 from torchcover.simulation import PaperReference
@@ -25,7 +26,7 @@ GRID = BevGrid(x_m=(0.0, 4.0), y_m=(0.0, 2.0), cell_m=1.0, heights={"all": (-1.0
 
 
 class Occupancy:
-    """How often each voxel of 1 m had a sensor point in it: a second observer, in one place."""
+    """Observer that counts the frames with a sensor point in each voxel of 1 m."""
 
     def __init__(self, size=4):
         self.steps = torch.zeros(size, size, size, dtype=torch.int64)
@@ -43,7 +44,9 @@ class Occupancy:
         self.steps += other.steps
 
 
-class Names:
+class NameObserver:
+    """Observer that collects the names of frames and then calls a function."""
+
     def __init__(self, then=lambda: None):
         self.names, self.then = [], then
 
@@ -52,8 +55,8 @@ class Names:
         self.then()
 
 
-class Spoiled:
-    """A dataset in which some frames are bad."""
+class FramesWithErrors:
+    """Dataset whose frames with the indices `bad` raise an error."""
 
     def __init__(self, frames, bad):
         self.frames, self.bad = frames, bad
@@ -75,9 +78,9 @@ def coverage(rig="a"):
 
 
 def values(observer):
-    """A copy of what an observer has found."""
-    found = observer.compute()
-    return getattr(found, "radius", found).clone()
+    """Copy the result of an observer."""
+    result = observer.compute()
+    return getattr(result, "radius", result).clone()
 
 
 @pytest.fixture
@@ -86,18 +89,18 @@ def frames(frame_of):
 
 
 @pytest.mark.parametrize("make", [coverage, Occupancy])
-def test_observers_of_parts_merge_into_one_of_the_whole(frames, make):
-    whole, first, rest = make(), make(), make()
-    observe(frames, [whole])
+def test_merged_observers_equal_one_of_all_frames(frames, make):
+    total, first, second = make(), make(), make()
+    observe(frames, [total])
     observe(frames[:2], [first])
-    observe(frames[2:], [rest])
-    before = values(rest)
-    first.merge_state(rest)
-    torch.testing.assert_close(values(first), values(whole), rtol=1e-12, atol=0, equal_nan=True)
-    torch.testing.assert_close(values(rest), before, rtol=0, atol=0, equal_nan=True)
+    observe(frames[2:], [second])
+    before = values(second)
+    first.merge_state(second)
+    torch.testing.assert_close(values(first), values(total), rtol=1e-12, atol=0, equal_nan=True)
+    torch.testing.assert_close(values(second), before, rtol=0, atol=0, equal_nan=True)
 
 
-def test_coverage_is_that_of_the_metric_with_weights_and_places_in_time(frames):
+def test_coverage_equals_the_metric_with_weights_and_blocks(frames):
     observers = {rig: coverage(rig) for rig in ("a", "b")}
     run = observe(frames, observers.values())
     for rig, observer in observers.items():
@@ -110,35 +113,35 @@ def test_coverage_is_that_of_the_metric_with_weights_and_places_in_time(frames):
 
 
 @pytest.mark.parametrize("workers", [0, 2])
-def test_workers_change_nothing_and_frames_come_in_order(frames, workers):
-    names, occupancy = Names(), Occupancy()
+def test_workers_keep_the_order_of_frames(frames, workers):
+    names, occupancy = NameObserver(), Occupancy()
     run = observe(frames, [names, occupancy], num_workers=workers, num_frames=5)
     assert names.names == ["f0", "f1", "f2", "f3", "f4"]
     assert run.num_frames == 5
     assert int(occupancy.compute().max()) <= 5
 
 
-@pytest.mark.parametrize("others", [(), (Occupancy,)])
-def test_frames_are_measured_where_they_are_made_and_travel_only_if_somebody_else_looks_at_them(frames, others):
-    apart = [coverage("a"), *(make() for make in others), coverage("b")]
-    seen = MeasuredFrames(frames, apart, "cpu")[2]
-    assert (seen.frame is None, seen.counts) == (not others, frames[2].counts)
-    assert set(seen.sums) == {number for number, one in enumerate(apart) if isinstance(one, CoverageObserver)}
-    assert MeasuredFrames(frames, apart, "cuda")[2].sums == {}
-    assert all(one.metric.num_frames == 0 for one in (apart[0], apart[-1])), "what is measured apart adds nothing"
+@pytest.mark.parametrize("further", [(), (Occupancy,)])
+def test_workers_send_frames_only_if_observers_need_them(frames, further):
+    observers = [coverage("a"), *(make() for make in further), coverage("b")]
+    measured = MeasuredFrames(frames, observers, "cpu")[2]
+    assert (measured.frame is None, measured.counts) == (not further, frames[2].counts)
+    assert set(measured.sums) == {k for k, observer in enumerate(observers) if isinstance(observer, CoverageObserver)}
+    assert MeasuredFrames(frames, observers, "cuda")[2].sums == {}
+    assert observers[0].metric.num_frames == observers[-1].metric.num_frames == 0, "measuring a frame adds nothing"
     alone = coverage("b")
     for frame in frames:
         alone.update(frame)
     for workers in (0, 2):
-        together = [coverage("a"), *(make() for make in others), coverage("b")]
-        observe(frames, together, num_workers=workers)
-        state = together[-1].state_dict()
+        observers = [coverage("a"), *(make() for make in further), coverage("b")]
+        observe(frames, observers, num_workers=workers)
+        state = observers[-1].state_dict()
         assert all(torch.equal(value, state[name]) for name, value in alone.state_dict().items())
 
 
 @pytest.mark.parametrize("workers", [0, 2])
-def test_what_cannot_be_measured_ends_the_run_with_what_was_seen_before(frames, workers):
-    """The metric wants square metres, which one frame lacks."""
+def test_errors_of_a_metric_end_the_run(frames, workers):
+    """The metric needs area weights, which one frame lacks."""
     observer = CoverageObserver(CoverageMetric(GRID, has_area_weights=True), "a")
     frames[4] = replace(frames[4], reference_weights=None)
     run = observe(frames, [observer], num_workers=workers, keep_partial=True, skip_bad_frames=True)
@@ -146,7 +149,7 @@ def test_what_cannot_be_measured_ends_the_run_with_what_was_seen_before(frames, 
     assert "weights: the area of each reference point in m2 is needed" in str(run.failure)
 
 
-def test_of_several_workers_one_makes_the_frames_of_a_world_and_all_come_in_order():
+def test_one_worker_makes_the_frames_of_a_scene():
     spread = SimulatedFrames("urban", "front_roof_32", num_frames=15, frame_interval_s=10.0)
     tasks = list(group_by_scene(range(15), spread.get_scene_id))
     assert tasks == [[*range(7)], [*range(7, 13)], [13, 14]]
@@ -154,13 +157,13 @@ def test_of_several_workers_one_makes_the_frames_of_a_world_and_all_come_in_orde
     dense = list(group_by_scene(range(700), SimulatedFrames("urban", "front_roof_32", num_frames=1000).get_scene_id))
     assert [index for task in dense for index in task] == [*range(700)]
     assert max(map(len, dense)) == MAX_FRAMES_PER_TASK
-    still = SimulatedFrames("courtyard", "front_roof_32", num_frames=3)  # of which every process has the whole
-    for alone in (still, []):
-        assert list(group_by_scene(range(3), build_scene_lookup(alone))) == [[0], [1], [2]]
+    static = SimulatedFrames("courtyard", "front_roof_32", num_frames=3)  # every process has its only scene
+    for source in (static, []):
+        assert list(group_by_scene(range(3), build_scene_lookup(source))) == [[0], [1], [2]]
 
 
 class Wrapped:
-    """Frames of another source, in a user's own class."""
+    """Frames of another source in a class of the user."""
 
     def __init__(self, frames):
         self.frames = frames
@@ -172,59 +175,61 @@ class Wrapped:
         return self.frames[index]
 
 
-class Told(Wrapped):
-    """And says all that the other one says."""
+class Forwarding(Wrapped):
+    """Wrapper with all attributes of the other source."""
 
     def __getattr__(self, name):
         return getattr(self.frames, name)
 
 
-def test_whoever_wraps_frames_keeps_their_worlds():
+def test_wrapped_frames_keep_their_scenes():
     frames = SimulatedFrames("urban", "front_roof_32", num_frames=15, frame_interval_s=10.0)
-    chosen, told = RigSubset(frames, {"mine": "front_roof_32"}), Told(frames)
-    part = Subset(Told(chosen), [14, 0, 6, 7])
-    worlds = [frames.get_scene_id(index) for index in range(15)]
-    assert [build_scene_lookup(chosen)(index) for index in range(15)] == worlds == [0] * 7 + [1] * 6 + [2] * 2
-    assert [build_scene_lookup(told)(index) for index in range(15)] == worlds
+    subset, forwarding = RigSubset(frames, {"mine": "front_roof_32"}), Forwarding(frames)
+    part = Subset(Forwarding(subset), [14, 0, 6, 7])
+    scene_ids = [frames.get_scene_id(index) for index in range(15)]
+    assert [build_scene_lookup(subset)(index) for index in range(15)] == scene_ids == [0] * 7 + [1] * 6 + [2] * 2
+    assert [build_scene_lookup(forwarding)(index) for index in range(15)] == scene_ids
     assert [build_scene_lookup(part)(index) for index in range(4)] == [2, 0, 0, 1]
 
 
-def test_each_world_is_built_by_one_worker_whoever_gives_the_frames(monkeypatch, tmp_path):
-    few = PaperReference(rows=4, columns=4)
-    frames = SimulatedFrames("parking", "front_roof_32", num_frames=4, frame_interval_s=35.0, reference_sensor=few)
+def test_each_scene_is_built_by_one_worker(monkeypatch, tmp_path):
+    reference = PaperReference(rows=4, columns=4)
+    frames = SimulatedFrames(
+        "parking", "front_roof_32", num_frames=4, frame_interval_s=35.0, reference_sensor=reference
+    )
     build = Scenario.build_scene
 
-    def world(self, seed, run, *rest):
+    def build_scene(self, seed, run, *args):
         with (tmp_path / "built").open("a") as file:
             file.write(f"{run}\n")
-        return build(self, seed, run, *rest)
+        return build(self, seed, run, *args)
 
-    monkeypatch.setattr(Scenario, "build_scene", world)
-    evaluate(frames=Told(frames), cell_m=8.0, num_workers=2)
+    monkeypatch.setattr(Scenario, "build_scene", build_scene)
+    evaluate(frames=Forwarding(frames), cell_m=8.0, num_workers=2)
     assert sorted((tmp_path / "built").read_text().split()) == ["0", "1"]
 
 
 @pytest.mark.parametrize("frames_of", [Wrapped, lambda frames: Subset(Wrapped(frames), [0, 1])])
-def test_a_source_that_does_not_know_its_worlds_is_refused_where_it_matters(frames, frames_of):
-    source = frames_of(Told(frames))
-    assert observe(source, [Names()], num_workers=1).num_frames == len(source)
+def test_several_workers_need_sources_with_scenes(frames, frames_of):
+    source = frames_of(Forwarding(frames))
+    assert observe(source, [NameObserver()], num_workers=1).num_frames == len(source)
     with pytest.raises(TypeError, match=r"^frames: Wrapped does not name the scene of a frame, so"):
-        observe(source, [Names()], num_workers=2, keep_partial=True)
+        observe(source, [NameObserver()], num_workers=2, keep_partial=True)
 
 
 @pytest.mark.parametrize("scenario", ["urban", "courtyard"])
-def test_no_list_is_made_of_all_the_steps_there_may_be(scenario):
+def test_tasks_of_long_runs_need_little_memory(scenario):
     frames = SimulatedFrames(scenario, "front_roof_32", num_frames=20_000)
     tracemalloc.start()
     tasks = group_by_scene(range(20_000), frames.get_scene_id)
     assert sum(map(len, tasks)) == 20_000
-    _, most_bytes = tracemalloc.get_traced_memory()
+    _, peak_bytes = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    assert most_bytes < 100_000
+    assert peak_bytes < 100_000
 
 
-class Counted(Spoiled):
-    """A dataset that knows, in all processes, how many frames were made."""
+class CountingFrames(FramesWithErrors):
+    """Dataset that counts in all processes how many frames were made."""
 
     def __init__(self, frames):
         super().__init__(frames, ())
@@ -237,42 +242,42 @@ class Counted(Spoiled):
 
 
 def test_a_worker_makes_one_task_ahead(frames):
-    counted, ahead = Counted(frames), []
+    counting, ahead = CountingFrames(frames), []
 
     def wait():
         if not ahead:
             time.sleep(0.3)
-            ahead.append(counted.made.value)
+            ahead.append(counting.made.value)
 
-    observe(counted, [Names(then=wait)], num_workers=1)
+    observe(counting, [NameObserver(then=wait)], num_workers=1)
     assert ahead[0] <= 2
 
 
-def test_of_two_rigs_none_is_meant_until_it_is_named(frames):
-    with pytest.raises(ValueError, match="clouds of 2 rigs .a, b.: name one"):
+def test_observers_of_several_rigs_need_a_name(frames):
+    with pytest.raises(ValueError, match=r"clouds of 2 rigs \(a, b\): name one"):
         observe(frames, [coverage(rig=None)])
-    with pytest.raises(ValueError, match="cannot merge the coverage of rig 'b' into that of 'a'"):
+    with pytest.raises(ValueError, match="cannot merge the coverage of rig 'b' into the coverage of 'a'"):
         coverage("a").merge_state(coverage("b"))
 
 
-def test_a_bad_frame_ends_the_run_and_is_noted_for_who_keeps_what_there_is(frames):
-    names = Names()
-    run = observe(Spoiled(frames, {3}), [names], keep_partial=True)
+def test_a_bad_frame_ends_the_run(frames):
+    names = NameObserver()
+    run = observe(FramesWithErrors(frames, {3}), [names], keep_partial=True)
     assert (run.num_frames, names.names, run.is_complete) == (3, ["f0", "f1", "f2"], False)
     with pytest.raises(BadFrameError, match="f3"):
         run.raise_failure()
 
 
-def test_what_ended_a_run_is_raised_unless_the_caller_keeps_what_there_is(frames):
+def test_errors_are_raised_unless_partial_results_are_kept(frames):
     with pytest.raises(BadFrameError, match="f3"):
-        observe(Spoiled(frames, {3}), [Names()])
-    names = Names(then=lambda: len(names.names) < 3 or os.kill(os.getpid(), signal.SIGINT))
+        observe(FramesWithErrors(frames, {3}), [NameObserver()])
+    names = NameObserver(then=lambda: len(names.names) < 3 or os.kill(os.getpid(), signal.SIGINT))
     with pytest.raises(KeyboardInterrupt):
         observe(frames, [names])
     assert names.names == ["f0", "f1", "f2"]
 
 
-def test_square_metres_are_not_made_up(frames):
+def test_area_average_needs_area_weights(frames):
     metric = CoverageMetric(GRID, has_area_weights=True)
     with pytest.raises(ValueError, match="the area of each reference point in m2 is needed"):
         CoverageObserver(metric, "a").update(replace(frames[0], reference_weights=None))
@@ -281,21 +286,21 @@ def test_square_metres_are_not_made_up(frames):
 
 
 @pytest.mark.parametrize("workers", [0, 2])
-def test_bad_frames_are_skipped_if_that_is_asked_for(frames, workers):
-    names = Names()
-    run = observe(Spoiled(frames, {0, 3}), [names], skip_bad_frames=True, num_workers=workers)
+def test_bad_frames_are_skipped_on_request(frames, workers):
+    names = NameObserver()
+    run = observe(FramesWithErrors(frames, {0, 3}), [names], skip_bad_frames=True, num_workers=workers)
     assert names.names == ["f1", "f2", "f4", "f5"]
     assert run.skipped_frames == ["f0 (frame 0): rubbish", "f3 (frame 3): rubbish"]
     assert run.is_complete
     run.raise_failure()
 
 
-def together(monkeypatch):
+def group_in_tasks(monkeypatch):
     monkeypatch.setattr(pipeline, "group_by_scene", lambda *_: [[0, 1, 2, 3], [4, 5]])
 
 
 class OddError(ValueError):
-    """What cannot be built again from its text alone."""
+    """Error that cannot be built from its text alone."""
 
     def __init__(self, what, where):
         super().__init__(f"{what} at {where}", lambda: what)
@@ -304,8 +309,8 @@ class OddError(ValueError):
         return self.args[0]
 
 
-class Invalid(Spoiled):
-    """A dataset in which some frames are errors that name no frame."""
+class FramesWithOddErrors(FramesWithErrors):
+    """Dataset whose bad frames raise an error without their name."""
 
     def __getitem__(self, index):
         if index in self.bad:
@@ -314,10 +319,10 @@ class Invalid(Spoiled):
 
 
 @pytest.mark.parametrize("workers", [0, 1, 2])
-def test_of_frames_that_are_made_together_a_bad_one_costs_itself_only(frames, workers, monkeypatch):
-    together(monkeypatch)
-    names = Names()
-    run = observe(Spoiled(frames, {1, 4}), [names], skip_bad_frames=True, num_workers=workers)
+def test_other_frames_of_a_task_survive_bad_ones(frames, workers, monkeypatch):
+    group_in_tasks(monkeypatch)
+    names = NameObserver()
+    run = observe(FramesWithErrors(frames, {1, 4}), [names], skip_bad_frames=True, num_workers=workers)
     assert names.names == ["f0", "f2", "f3", "f5"]
     assert run.skipped_frames == ["f1 (frame 1): rubbish", "f4 (frame 4): rubbish"]
 
@@ -325,42 +330,43 @@ def test_of_frames_that_are_made_together_a_bad_one_costs_itself_only(frames, wo
 @pytest.mark.parametrize("workers", [0, 1, 2])
 @pytest.mark.parametrize(
     ("dataset", "error", "message"),
-    [(Spoiled, BadFrameError, "f2 (frame 2): rubbish"), (Invalid, ValueError, "a sensor in a wall at 2")],
+    [
+        (FramesWithErrors, BadFrameError, "f2 (frame 2): rubbish"),
+        (FramesWithOddErrors, ValueError, "a sensor in a wall at 2"),
+    ],
 )
-def test_the_frames_before_a_bad_one_are_kept(frames, workers, dataset, error, message, monkeypatch):
-    together(monkeypatch)
-    names = Names()
+def test_frames_before_a_bad_one_are_kept(frames, workers, dataset, error, message, monkeypatch):
+    group_in_tasks(monkeypatch)
+    names = NameObserver()
     run = observe(dataset(frames, {2}), [names], keep_partial=True, num_workers=workers)
     assert (run.num_frames, names.names, run.skipped_frames) == (2, ["f0", "f1"], [])
     with pytest.raises(error) as raised:
         run.raise_failure()
     assert str(raised.value) == message
-    assert f"raise {'OddError' if dataset is Invalid else 'BadFrameError'}(" in "".join(format_exception(raised.value))
+    assert f"raise {'OddError' if dataset is FramesWithOddErrors else 'BadFrameError'}(" in "".join(
+        format_exception(raised.value)
+    )
 
 
 def test_without_a_good_frame_there_is_no_result(frames):
     with pytest.raises(BadFrameError, match="f0"):
-        observe(Spoiled(frames, {0}), [Names()])
+        observe(FramesWithErrors(frames, {0}), [NameObserver()])
     with pytest.raises(ValueError, match="no frame could be used"):
-        observe(Spoiled(frames, set(range(6))), [Names()], skip_bad_frames=True)
+        observe(FramesWithErrors(frames, set(range(6))), [NameObserver()], skip_bad_frames=True)
 
 
-def test_an_error_of_the_last_observer_costs_no_step_of_the_others(frames):
-    names = Names()
-    run = observe(frames, [names, Names(then=lambda: 1 / (4 - run_so_far(names)))], keep_partial=True)
+def test_errors_of_one_observer_keep_earlier_frames(frames):
+    names = NameObserver()
+    run = observe(frames, [names, NameObserver(then=lambda: 1 / (4 - len(names.names)))], keep_partial=True)
     assert (run.num_frames, names.names, run.is_complete) == (3, ["f0", "f1", "f2", "f3"], False)
     with pytest.raises(ZeroDivisionError):
         run.raise_failure()
     with pytest.raises(ZeroDivisionError):
-        observe(frames, [Names(then=lambda: 1 / 0)], keep_partial=True)  # nothing to keep
+        observe(frames, [NameObserver(then=lambda: 1 / 0)], keep_partial=True)  # nothing to keep
 
 
-def run_so_far(names):
-    return len(names.names)
-
-
-class Deadly(Spoiled):
-    """A dataset in which some frames end the process that makes them, as a want of memory would."""
+class KillingFrames(FramesWithErrors):
+    """Dataset whose bad frames kill the process that makes them, as a lack of memory does."""
 
     def __getitem__(self, index):
         if index in self.bad:
@@ -368,11 +374,11 @@ class Deadly(Spoiled):
         return self.frames[index]
 
 
-# torch may find out about the worker once more when its iterator is taken down.
+# torch may report the worker again when its iterator is deleted.
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-def test_what_there_is_outlives_a_worker_that_is_killed(frames):
-    names = Names()
-    run = observe(Deadly(frames, {5}), [names], num_workers=1, keep_partial=True)
+def test_results_survive_a_killed_worker(frames):
+    names = NameObserver()
+    run = observe(KillingFrames(frames, {5}), [names], num_workers=1, keep_partial=True)
     assert (run.num_frames, run.is_complete) == (len(names.names), False)
     assert names.names == ["f0", "f1", "f2", "f3", "f4"][: len(names.names)]
     with pytest.raises(
@@ -382,33 +388,33 @@ def test_what_there_is_outlives_a_worker_that_is_killed(frames):
 
 
 @pytest.mark.parametrize("method", ["spawn", "forkserver"])
-def test_workers_may_be_started_in_other_ways_than_by_a_fork(frames, method, monkeypatch):
+def test_workers_support_all_start_methods(frames, method, monkeypatch):
     monkeypatch.setattr(pipeline, "get_start_method", lambda: method)
-    names = Names()
+    names = NameObserver()
     observe(frames, [names], num_workers=1)
     assert names.names == ["f0", "f1", "f2", "f3", "f4", "f5"]
 
 
-@pytest.mark.parametrize(("method", "tells"), [("fork", False), ("spawn", True), ("forkserver", True)])
-def test_a_program_that_starts_itself_is_told_how_it_should(method, tells, monkeypatch):
+@pytest.mark.parametrize(("method", "has_advice"), [("fork", False), ("spawn", True), ("forkserver", True)])
+def test_programs_without_main_guard_get_advice(method, has_advice, monkeypatch):
     monkeypatch.setattr(multiprocessing, "get_start_method", lambda **_: method)
-    died = RuntimeError("DataLoader worker (pid(s) 7) exited unexpectedly")
-    assert ("__main__" in str(pipeline.find_killed_worker(died, num_workers=2, num_frames=0))) == tells
+    error = RuntimeError("DataLoader worker (pid(s) 7) exited unexpectedly")
+    assert ("__main__" in str(frame_workers.find_killed_worker(error, num_workers=2, num_frames=0))) == has_advice
 
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-def test_who_ends_the_workers_too_has_ended_the_run(frames, monkeypatch):
-    """A scheduler ends all processes of a job, and a worker may be the first to go."""
+def test_signals_to_workers_end_the_run(frames, monkeypatch):
+    """A scheduler ends all processes of a job, and a worker may end first."""
     monkeypatch.setattr(pipeline, "clear_frames", lambda _: os.kill(os.getpid(), signal.SIGTERM))
-    names = Names()
+    names = NameObserver()
     with handle_termination(lambda _: None) as signals:
-        run = observe(Deadly(frames, {5}), [names], num_workers=1, keep_partial=True)
+        run = observe(KillingFrames(frames, {5}), [names], num_workers=1, keep_partial=True)
     assert signals == [signal.SIGTERM]
     assert run.num_frames == len(names.names) > 0
     assert isinstance(run.failure, KeyboardInterrupt)
 
 
-def test_ctrl_c_within_a_frame_waits_for_all_observers(frames):
+def test_ctrl_c_waits_for_all_observers(frames):
     calls = []
 
     def press():
@@ -416,7 +422,7 @@ def test_ctrl_c_within_a_frame_waits_for_all_observers(frames):
         if len(calls) == 3:
             os.kill(os.getpid(), signal.SIGINT)
 
-    before, first, last = signal.getsignal(signal.SIGINT), Names(press), Names()
+    before, first, last = signal.getsignal(signal.SIGINT), NameObserver(press), NameObserver()
     run = observe(frames, [first, last], keep_partial=True)
     assert first.names == last.names == ["f0", "f1", "f2"]
     assert (run.num_frames, type(run.failure), run.is_complete) == (3, KeyboardInterrupt, False)
@@ -425,8 +431,8 @@ def test_ctrl_c_within_a_frame_waits_for_all_observers(frames):
         run.raise_failure()
 
 
-def test_it_runs_in_any_thread(frames):
-    names = Names()
+def test_observe_runs_in_any_thread(frames):
+    names = NameObserver()
     thread = threading.Thread(target=observe, args=(frames, [names]))
     thread.start()
     thread.join()
@@ -434,7 +440,7 @@ def test_it_runs_in_any_thread(frames):
 
 
 class AfterThree:
-    """A rule that is content after three steps."""
+    """Rule that is reached after three frames."""
 
     progress_text = "nearly there"
 
@@ -446,29 +452,29 @@ class AfterThree:
 
 
 @pytest.mark.parametrize("progress", [False, True])
-def test_a_rule_ends_the_run_and_a_bar_tells_of_it(frames, progress, capsys):
-    run = observe(frames, [Names()], stopping_rule=AfterThree(), show_progress=progress, title="frames")
+def test_stopping_rules_end_the_run(frames, progress, capsys):
+    run = observe(frames, [NameObserver()], stopping_rule=AfterThree(), show_progress=progress, title="frames")
     assert (run.num_frames, run.is_complete) == (3, True)
-    told = capsys.readouterr().err
-    assert ("3/3" in told and "nearly there" in told) == progress
-    assert bool(told) == progress
+    output = capsys.readouterr().err
+    assert ("3/3" in output and "nearly there" in output) == progress
+    assert bool(output) == progress
 
 
 @pytest.mark.parametrize(("workers", "threads"), [(0, 2), (1, 1), (2, 1)])
-def test_each_worker_is_left_a_core(frame_of, monkeypatch, workers, threads):
-    monkeypatch.setattr("torchcover.evaluation.pipeline.count_cores", lambda: 2)
-    before, seen = torch.get_num_threads(), []
+def test_observers_leave_cores_to_workers(frame_of, monkeypatch, workers, threads):
+    monkeypatch.setattr("torchcover.evaluation.frame_workers.count_cores", lambda: 2)
+    before, thread_counts = torch.get_num_threads(), []
     torch.set_num_threads(2)
     try:
-        names = Names(lambda: seen.append(torch.get_num_threads()))
+        names = NameObserver(lambda: thread_counts.append(torch.get_num_threads()))
         observe([frame_of(index) for index in range(3)], [names], num_workers=workers)
-        assert (seen, torch.get_num_threads()) == ([threads] * 3, 2)
+        assert (thread_counts, torch.get_num_threads()) == ([threads] * 3, 2)
     finally:
         torch.set_num_threads(before)
 
 
 @pytest.mark.parametrize("shown", [True, False])
-def test_a_wait_without_steps_is_shown_on_a_terminal(capsys, monkeypatch, shown):
+def test_waits_are_shown_on_terminals(capsys, monkeypatch, shown):
     for variable in ("FORCE_COLOR", "TTY_COMPATIBLE", "TTY_INTERACTIVE"):
         monkeypatch.setenv(variable, "1")
     with show_wait("preparing the scene", is_shown=shown):
@@ -476,8 +482,8 @@ def test_a_wait_without_steps_is_shown_on_a_terminal(capsys, monkeypatch, shown)
     assert ("preparing the scene" in capsys.readouterr().err) == shown
 
 
-def test_rates_count_the_start_and_are_means_over_rounds_of_all_workers(monkeypatch):
-    """Four workers start in 8 s; then each round gives four steps at once, every 4 s: a step a second."""
+def test_rates_are_means_over_rounds_of_workers(monkeypatch):
+    """Four workers start in 8 s; then each round gives four frames every 4 s: one frame per second."""
     now_s = 0.0
     monkeypatch.setattr("torchcover.evaluation.progress.time.monotonic", lambda: now_s)
     bar, rates = Progress(100, "run", is_shown=True, num_workers=4), []

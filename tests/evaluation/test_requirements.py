@@ -1,4 +1,4 @@
-"""Requirements: what keeps a bound, where bodies are put, what is measured there, and what says nothing."""
+"""Requirements: verdicts on bounds, positions of test targets, measured numbers, and invalid files."""
 
 import re
 from itertools import permutations
@@ -12,7 +12,8 @@ from tests.targets.scenes import build_lidar, build_rig, build_scenario, write_t
 from torchcover.encounters import Criterion
 from torchcover.encounters.encounter import EncounterSet
 from torchcover.evaluation import Readings, Requirements, check, evaluate, evaluate_encounters, judge_requirements
-from torchcover.evaluation.requirements import TargetPositions, TargetRequirement
+from torchcover.evaluation.requirements import TargetRequirement
+from torchcover.evaluation.target_positions import TargetPositions
 from torchcover.geometry import BoundingBox
 from torchcover.placement.selection_space import SelectionSpace
 from torchcover.placement.space import SearchSpace
@@ -27,81 +28,81 @@ AHEAD = {"target": "child", "positions": {"points_m": [[5.0, 0.0]]}, "points": 5
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
-def asked(*requirements, **keys):
+def build_requirements(*requirements, **keys):
     return Requirements.model_validate({"requirements": list(requirements), **keys})
 
 
-def judged(bound, value, low=None, high=None):
-    """The verdict on (N,) numbers, called by their places in the list."""
+def judge(bound, value, low=None, high=None):
+    """Judge (N,) values; the locations are their indices."""
     value = np.array(value, dtype=np.float64)
     ends = (np.array(value if end is None else end, dtype=np.float64) for end in (low, high))
-    numbers = Readings(value, *ends, [str(k) for k in range(len(value))])
-    key, least, most = bound
-    one = {"region": "20m", "band": "ground", "number": key} | {
-        k: v for k, v in (("min_value", least), ("max_value", most)) if v
-    }
-    (found,) = judge_requirements(asked(one), [{key: numbers}])
-    return found
+    readings = Readings(value, *ends, [str(k) for k in range(len(value))])
+    key, min_value, max_value = bound
+    requirement = {"region": "20m", "band": "ground", "number": key}
+    requirement |= {"min_value": min_value} if min_value else {"max_value": max_value}
+    (verdict,) = judge_requirements(build_requirements(requirement), [{key: readings}])
+    return verdict
 
 
-LEAST, MOST = ("detection_0.4m", 0.9, None), ("radius_m", None, 0.5)
+MINIMUM = ("detection_0.4m", 0.9, None)
+MAXIMUM = ("radius_m", None, 0.5)
 
 
 @pytest.mark.parametrize(
-    ("bound", "value", "low", "high", "state", "worst", "where"),
+    ("bound", "value", "low", "high", "state", "worst", "locations"),
     [
-        (LEAST, [0.9, 0.95], None, None, "met", 0, ("0", "1")),
-        (LEAST, [0.95, 0.89], None, None, "not met", 1, ("1",)),
-        (LEAST, [0.95], [0.91], [0.97], "met", 0, ("0",)),
-        (LEAST, [0.95], [0.89], [0.97], "not decided", 0, ("0",)),
-        (LEAST, [0.85], [0.80], [0.91], "not decided", 0, ("0",)),
-        (LEAST, [0.85], [0.80], [0.89], "not met", 0, ("0",)),
-        (LEAST, [0.95], [np.nan], [np.nan], "not decided", 0, ("0",)),
-        (LEAST, [np.nan, 0.95], None, None, "not decided", 1, ("0",)),
-        (LEAST, [np.nan, 0.1], None, None, "not met", 1, ("1",)),
-        (LEAST, [], None, None, "not decided", None, ()),
-        (LEAST, [0.95, 0.85], [0.95, 0.85], [np.inf, np.inf], "not decided", 1, ("1",)),
-        (LEAST, [0.95], [0.95], [np.inf], "met", 0, ("0",)),
-        (LEAST, [0.95, 0.8, 0.85], [0.95, 0.8, 0.85], [np.inf, np.inf, 0.85], "not met", 1, ("2",)),
-        (MOST, [0.4], [0.3], [0.49], "met", 0, ("0",)),
-        (MOST, [0.4, 0.45], [0.3, 0.4], [0.49, 0.51], "not decided", 1, ("1",)),
-        (MOST, [0.4, 0.7, np.inf], None, None, "not met", 2, ("2", "1")),
+        (MINIMUM, [0.9, 0.95], None, None, "met", 0, ("0", "1")),
+        (MINIMUM, [0.95, 0.89], None, None, "not met", 1, ("1",)),
+        (MINIMUM, [0.95], [0.91], [0.97], "met", 0, ("0",)),
+        (MINIMUM, [0.95], [0.89], [0.97], "not decided", 0, ("0",)),
+        (MINIMUM, [0.85], [0.80], [0.91], "not decided", 0, ("0",)),
+        (MINIMUM, [0.85], [0.80], [0.89], "not met", 0, ("0",)),
+        (MINIMUM, [0.95], [np.nan], [np.nan], "not decided", 0, ("0",)),
+        (MINIMUM, [np.nan, 0.95], None, None, "not decided", 1, ("0",)),
+        (MINIMUM, [np.nan, 0.1], None, None, "not met", 1, ("1",)),
+        (MINIMUM, [], None, None, "not decided", None, ()),
+        (MINIMUM, [0.95, 0.85], [0.95, 0.85], [np.inf, np.inf], "not decided", 1, ("1",)),
+        (MINIMUM, [0.95], [0.95], [np.inf], "met", 0, ("0",)),
+        (MINIMUM, [0.95, 0.8, 0.85], [0.95, 0.8, 0.85], [np.inf, np.inf, 0.85], "not met", 1, ("2",)),
+        (MAXIMUM, [0.4], [0.3], [0.49], "met", 0, ("0",)),
+        (MAXIMUM, [0.4, 0.45], [0.3, 0.4], [0.49, 0.51], "not decided", 1, ("1",)),
+        (MAXIMUM, [0.4, 0.7, np.inf], None, None, "not met", 2, ("2", "1")),
     ],
 )
-def test_a_bound_is_kept_where_all_of_the_interval_is_known_to_keep_it(bound, value, low, high, state, worst, where):
-    found = judged(bound, value, low, high)
-    assert (found.state, found.worst_locations, found.total_count) == (state, where, len(value))
+def test_a_bound_needs_the_whole_interval(bound, value, low, high, state, worst, locations):
+    verdict = judge(bound, value, low, high)
+    assert (verdict.state, verdict.worst_locations, verdict.total_count) == (state, locations, len(value))
     if worst is None:
-        assert np.isnan([found.value, found.margin]).all()
+        assert np.isnan([verdict.value, verdict.margin]).all()
     else:
         sign, limit = (1, bound[1]) if bound[1] else (-1, bound[2])
         margin = np.nan if state == "not decided" else sign * (value[worst] - limit)
-        np.testing.assert_allclose([found.value, found.margin], [value[worst], margin])
+        np.testing.assert_allclose([verdict.value, verdict.margin], [value[worst], margin])
 
 
-def test_bodies_are_put_where_a_place_says():
-    """Areas are filled to their border in steps that are no longer than asked for; other forms are what they say."""
+def test_positions_are_computed_around_the_vehicle():
+    """Areas are sampled up to their border with at most the given spacing; points and lines are exact."""
     behind = TargetPositions(x_m=(-1.0, -0.2), relative_to="rear", spacing_m=0.3).compute_positions_m(CAR)
     assert behind.min(0) == pytest.approx([-3.0, -1.0])
     assert behind.max(0) == pytest.approx([-2.2, 1.0])
     assert np.diff(np.unique(behind[:, 0].round(9))).max() <= 0.3
     assert len(np.unique(behind.round(9), axis=0)) == len(behind) == 4 * 8
-    beside = TargetPositions(y_m=(0.5, 1.0), relative_to="left", spacing_m=1.0).compute_positions_m(CAR)
-    assert beside.min(0).tolist() == [-2.0, 1.5]  # of the vehicle's length
+    left = TargetPositions(y_m=(0.5, 1.0), relative_to="left", spacing_m=1.0).compute_positions_m(CAR)
+    assert left.min(0).tolist() == [-2.0, 1.5]  # along the whole vehicle
     triangle = TargetPositions(polygon_m=((0, 0), (4, 0), (0, 4)), spacing_m=1.0).compute_positions_m(CAR)
-    assert len(triangle) == 15  # on its border, too
+    assert len(triangle) == 15  # including its border
     assert (triangle.sum(axis=1) <= 4).all()
     line = TargetPositions(line_m=((3, -1), (3, 1), (5, 1)), spacing_m=0.6).compute_positions_m(CAR)
     assert len(line) == 8
     assert np.linalg.norm(np.diff(line, axis=0), axis=1).max() <= 0.6
     assert TargetPositions(points_m=((1, 2),), relative_to="front").compute_positions_m(CAR).tolist() == [[3.0, 2.0]]
     around = TargetPositions(within_m=1.0, spacing_m=0.5)
-    each = [around.model_copy(update={"sides": (side,)}).compute_positions_m(CAR) for side in SIDES]
-    everywhere = around.compute_positions_m(CAR)
-    away = np.linalg.norm(everywhere - np.clip(everywhere, (-2, -1), (2, 1)), axis=1)
-    assert away.max() <= 1.0
-    inside = int((away == 0).sum())
-    assert sum(map(len, each)) - 4 * inside == len(everywhere) - inside
+    side_positions = [around.model_copy(update={"sides": (side,)}).compute_positions_m(CAR) for side in SIDES]
+    positions_m = around.compute_positions_m(CAR)
+    distance_m = np.linalg.norm(positions_m - np.clip(positions_m, (-2, -1), (2, 1)), axis=1)
+    assert distance_m.max() <= 1.0
+    inside = int((distance_m == 0).sum())
+    assert sum(map(len, side_positions)) - 4 * inside == len(positions_m) - inside
 
 
 @pytest.mark.parametrize(
@@ -153,14 +154,14 @@ def test_bodies_are_put_where_a_place_says():
         ({"encounters": "crossing_like"}, "nothing is required"),
     ],
 )
-def test_a_requirement_that_says_nothing_is_an_error(requirement, message):
+def test_incomplete_requirements_are_rejected(requirement, message):
     with pytest.raises(ValueError, match=message):
-        asked(requirement, position_sets={"kerb": {"points_m": [[3, 0]]}})
+        build_requirements(requirement, position_sets={"kerb": {"points_m": [[3, 0]]}})
 
 
-def test_requirements_that_read_alike_are_told_apart_or_refused():
-    """What differs stands in their words: by them tables and JUnit call them."""
-    asked(
+def test_requirements_need_different_texts():
+    """Tables and JUnit files identify requirements by their texts, which contain all differences."""
+    build_requirements(
         AHEAD,
         {**AHEAD, "detection_points": 3},
         {**AHEAD, "name": "again"},
@@ -168,29 +169,32 @@ def test_requirements_that_read_alike_are_told_apart_or_refused():
         {**AHEAD, "counted_sensors": "lidar"},
     )
     late = {"encounters": "crossing_like", "braking": {"deceleration_mps2": 9}}
-    found = asked(
+    requirements = build_requirements(
         {**late, "consecutive_scans": 1}, {**late, "points": 3}, {**late, "braking": {"deceleration_mps2": 4}}
     )
-    assert len({one.text for one in found.requirements}) == 3
+    assert len({requirement.text for requirement in requirements.requirements}) == 3
     with pytest.raises(ValueError, match=r"several requirements read 'child_110cm, .*: points >= 5'; give each a name"):
-        asked(AHEAD, {**AHEAD, "target": "child_110cm"})
+        build_requirements(AHEAD, {**AHEAD, "target": "child_110cm"})
 
 
 @pytest.mark.parametrize(
-    "one",
+    "requirement",
     [
         *({**AHEAD, key: 3} for key in ("by", "at", "without", "target", "shape")),
-        *({**AHEAD, "positions": at} for at in ({"x": 1}, {"points_m": [[1, 2, 3]]}, {"polygon_m": [[1, 2]]})),
+        *(
+            {**AHEAD, "positions": positions}
+            for positions in ({"x": 1}, {"points_m": [[1, 2, 3]]}, {"polygon_m": [[1, 2]]})
+        ),
         {"encounters": 3, "ttc_s": 1},
         {"encounters": "crossing_like", "braking": True},
     ],
 )
-def test_messages_are_about_keys_of_the_file_and_not_of_the_program(one):
-    with pytest.raises(ValidationError) as told:
-        asked(one)
-    words = explain_document_error(told.value)
-    assert words.startswith("requirements.0.")
-    assert not re.search(r"\(place\)|tuple|literal|function|instance|validation|\.str", words.partition(" (got")[0])
+def test_messages_name_keys_of_the_file(requirement):
+    with pytest.raises(ValidationError) as raised:
+        build_requirements(requirement)
+    message = explain_document_error(raised.value)
+    assert message.startswith("requirements.0.")
+    assert not re.search(r"\(place\)|tuple|literal|function|instance|validation|\.str", message.partition(" (got")[0])
 
 
 @pytest.mark.parametrize(
@@ -201,9 +205,9 @@ def test_messages_are_about_keys_of_the_file_and_not_of_the_program(one):
         ({"positions": {"x_m": [0, 9000], "y_m": [0, 1]}}, "use a larger spacing_m"),
     ],
 )
-def test_what_the_rig_has_not_or_nobody_can_wait_for_is_an_error(keys, message):
+def test_unknown_sensors_and_huge_areas_are_rejected(keys, message):
     with pytest.raises(ValueError, match=message):
-        check(build_rig(), asked({**AHEAD, **keys}), build_scenario())
+        check(build_rig(), build_requirements({**AHEAD, **keys}), build_scenario())
 
 
 CAMERA = {"type": "camera", "name": "front", "width": 80, "height": 60, "fov_deg": 90, "stride": 2, "max_range_m": 50}
@@ -215,14 +219,14 @@ THREE = build_rig(
 )
 
 
-def test_what_is_judged_is_what_a_survey_sees():
-    """Of all, of each sensor, without one that hangs there still, at the same places."""
+def test_judged_numbers_equal_the_measured_visibility():
+    """Numbers of all sensors, of some, and without a failed one whose housing still hides others."""
     raster, child = Raster((3.5, 6.5), (-1.0, 1.0), 1.0), Target.load("child")
-    at = {"points_m": raster.positions_m.tolist()}
-    seen = measure_target_visibility(THREE, build_scenario(), child, raster, detection_points=1)
-    one = {
+    positions = {"points_m": raster.positions_m.tolist()}
+    target_map = measure_target_visibility(THREE, build_scenario(), child, raster, detection_points=1)
+    requirement = {
         "target": "child",
-        "positions": at,
+        "positions": positions,
         "points": 5,
         "sensors": 1,
         "share": 0.1,
@@ -230,70 +234,79 @@ def test_what_is_judged_is_what_a_survey_sees():
         "visual_angle_deg": 1,
         "detection_points": 1,
     }
-    requirements = asked(
-        one,
-        {**one, "counted_sensors": ["lidar"], "pixels": None},
-        {**one, "counted_sensors": ["top", "mast"], "pixels": None, "failing_sensors": "mast"},
+    requirements = build_requirements(
+        requirement,
+        {**requirement, "counted_sensors": ["lidar"], "pixels": None},
+        {**requirement, "counted_sensors": ["top", "mast"], "pixels": None, "failing_sensors": "mast"},
     )
     found = check(THREE, requirements, build_scenario()).verdicts["small"]
     all_of, lidars, top = found[:5], found[5:9], found[9:]
     worst = {v.bound.key: v.value for v in all_of}
-    assert worst["points"] == seen.min_points.min() > 0
-    assert worst["sensors"] == seen.min_sensors.min()
-    assert worst["share"] == seen.surface_share.min()
-    assert worst["pixels"] == seen.sensor_points[2].min()  # one step: least and mean are one
-    away_m = np.hypot(*(raster.positions_m - (1.8, 0.0)).T)  # none is nearer than the camera
-    angle = np.rad2deg(np.arctan(1.3 / away_m) - np.arctan((1.3 - child.solid.bounding_box.size_m[2]) / away_m))
+    assert worst["points"] == target_map.min_points.min() > 0
+    assert worst["sensors"] == target_map.min_sensors.min()
+    assert worst["share"] == target_map.surface_share.min()
+    assert worst["pixels"] == target_map.sensor_points[2].min()  # minimum and mean of one frame are equal
+    distance_m = np.hypot(*(raster.positions_m - (1.8, 0.0)).T)  # all positions are ahead of the camera
+    angle = np.rad2deg(np.arctan(1.3 / distance_m) - np.arctan((1.3 - child.solid.bounding_box.size_m[2]) / distance_m))
     assert worst["visual_angle_deg"] == pytest.approx(angle.min())
-    assert {v.bound.key: v.value for v in lidars}["points"] == seen.sensor_points[:2].sum(axis=0).min()
-    # The mast hides all of it from the LiDAR behind it: whether or not what stands on it has failed.
-    assert {v.bound.key: v.value for v in top}["points"] == seen.sensor_points[0].min() == 0
-    assert [v.total_count for v in top] == [2 * len(raster.positions_m)] * 4  # without it, and without nothing
+    assert {v.bound.key: v.value for v in lidars}["points"] == target_map.sensor_points[:2].sum(axis=0).min()
+    # The mast hides the target from the LiDAR behind it, also if the sensor on the mast has failed.
+    assert {v.bound.key: v.value for v in top}["points"] == target_map.sensor_points[0].min() == 0
+    assert [v.total_count for v in top] == [2 * len(raster.positions_m)] * 4  # with and without the failed sensor
 
 
-def test_where_a_body_cannot_stand_a_point_is_unknown_and_an_area_goes_without():
+def test_occupied_points_are_unknown_and_areas_exclude_them():
     inside, near = (
         {**AHEAD, "positions": {"points_m": [[0, 0], [5, 0]]}},
         {**AHEAD, "positions": {"x_m": [0, 5], "y_m": [0, 0.1]}},
     )
     nowhere = {**AHEAD, "positions": {"x_m": [-1, 1], "y_m": [0, 0.1]}}
-    found = check(build_rig(build_lidar(channels=61)), asked(inside, near, nowhere), build_scenario()).verdicts["small"]
-    assert [(one.state, one.undecided_count) for one in found] == [("not decided", 1), ("met", 0), ("not decided", 0)]
+    found = check(
+        build_rig(build_lidar(channels=61)), build_requirements(inside, near, nowhere), build_scenario()
+    ).verdicts["small"]
+    assert [(verdict.state, verdict.undecided_count) for verdict in found] == [
+        ("not decided", 1),
+        ("met", 0),
+        ("not decided", 0),
+    ]
     assert found[0].worst_locations == ("x = 0.00, y = 0.00 m, occupied",)
     assert 0 < found[1].total_count < 2 * 26
-    assert [one.occupied_count for one in found] == [0, 52 - found[1].total_count, 22]
+    assert [verdict.occupied_count for verdict in found] == [0, 52 - found[1].total_count, 22]
 
 
-def test_it_is_said_in_how_many_steps_a_body_had_room(tmp_path):
-    """A box drives over the place and is there in two of four steps."""
+def test_locations_name_frames_with_free_position(tmp_path):
+    """A box drives over the position and occupies it in one of four frames."""
     passing = {"name": "p", "category": "car", "shape": {"type": "box", "size_m": [2.0, 1.0, 1.0]},
                "trajectory": write_trajectory(tmp_path, (0, 5, 0, 0), (2, 13, 0, 0))}  # fmt: skip
-    there = build_scenario(actors=[passing], duration_s=2.0, time_step_s=0.5)
-    (found,) = check(build_rig(build_lidar(channels=61)), asked(AHEAD), there, num_frames=4).verdicts["small"]
+    scenario = build_scenario(actors=[passing], duration_s=2.0, time_step_s=0.5)
+    (found,) = check(build_rig(build_lidar(channels=61)), build_requirements(AHEAD), scenario, num_frames=4).verdicts[
+        "small"
+    ]
     assert (found.state, found.worst_locations) == ("met", ("x = 5.00, y = 0.00 m, free in 3 of 4 frames",))
 
 
-def test_a_kind_that_the_rig_has_not_sees_nothing_and_a_place_that_holds_nobody_is_not_checked():
+def test_missing_sensor_kinds_detect_nothing():
     tight = {**AHEAD, "positions": {"within_m": 0.01}}
-    found = check(build_rig(), asked({**AHEAD, "counted_sensors": "camera"}, tight), build_scenario()).verdicts["small"]
-    assert [(one.state, one.total_count) for one in found] == [("not met", 1), ("not decided", 0)]
+    found = check(
+        build_rig(), build_requirements({**AHEAD, "counted_sensors": "camera"}, tight), build_scenario()
+    ).verdicts["small"]
+    assert [(verdict.state, verdict.total_count) for verdict in found] == [("not met", 1), ("not decided", 0)]
     assert found[0].margin == -5.0
     with pytest.raises(ValueError, match="at least one rig"):
-        check([], asked(AHEAD))
+        check([], build_requirements(AHEAD))
 
 
-def test_numbers_of_regions_are_those_of_evaluate():
+def test_region_numbers_equal_those_of_evaluate():
     regions = {"near": {"x_m": [2.5, 8.0], "y_m": [-2.0, 2.0]}}
     keys = {"regions": regions, "grid": {"x_m": [-4, 9], "y_m": [-4, 4], "cell_m": 1.0}}
-    one = {"region": "near", "band": "ground", "failing_sensors": ["front"]}
-    found = check(
-        THREE,
-        asked({**one, "number": "detection_0.3m", "min_value": 0.001}, {**one, "number": "radius_m", "max_value": 1e-6}, **keys),
-        build_scenario(), num_frames=12, num_workers=0,
-    ).verdicts["small"]  # fmt: skip
-    asking = RegionsOfInterest.model_validate(keys)
+    requirement = {"region": "near", "band": "ground", "failing_sensors": ["front"]}
+    detection = {**requirement, "number": "detection_0.3m", "min_value": 0.001}
+    radius = {**requirement, "number": "radius_m", "max_value": 1e-6}
+    requirements = build_requirements(detection, radius, **keys)
+    found = check(THREE, requirements, build_scenario(), num_frames=12, num_workers=0).verdicts["small"]
+    regions = RegionsOfInterest.model_validate(keys)
     result = evaluate(
-        THREE, build_scenario(), num_frames=12, num_workers=0, thresholds_m=0.3, redundancy=True, regions=asking
+        THREE, build_scenario(), num_frames=12, num_workers=0, thresholds_m=0.3, redundancy=True, regions=regions
     )
     (row,) = (row for row in result.summary if row["band"] == "ground")
     for verdict, key, worse in zip(found, ("detection_0.3m", "radius_m"), (min, max), strict=True):
@@ -307,7 +320,7 @@ def test_requirements_of_regions_name_cameras_with_perfect_depth(more, is_named)
     camera = {"type": "camera", "name": "eye", "mount": {"z_m": 2.0}, "width": 16, "height": 12, "fov_deg": 90.0}
     found = check(
         build_rig({**camera, "max_range_m": 50.0, **more}),
-        asked({**NEAR, "number": "detection_0.4m", "min_value": 0.5}),
+        build_requirements({**NEAR, "number": "detection_0.4m", "min_value": 0.5}),
         "courtyard",
         num_frames=1,
         num_workers=0,
@@ -323,11 +336,11 @@ def box(tmp_path):
     return path
 
 
-def test_times_to_collision_are_the_latest_of_all_phases(box):
+def test_times_to_collision_are_minima_over_start_offsets(box):
     walker = {"body": "child_120cm", "speed_kmh": 5, "approach_distance_m": 4}
     crossings = {"name": "two", "encounters": [{"name": "a", "ego": {"speed_kmh": [10, 30]}, "road_user": walker}]}
     criterion = {"points": 1, "pixels": 20}
-    one = {
+    requirement = {
         "encounters": crossings,
         **criterion,
         "consecutive_scans": 2,
@@ -335,38 +348,42 @@ def test_times_to_collision_are_the_latest_of_all_phases(box):
         "braking": {"deceleration_mps2": 4, "latency_s": 1.0},
         "failing_sensors": ["mast"],
     }
-    requirements = asked(one)
+    requirements = build_requirements(requirement)
     ttc, spare = check(THREE, requirements, vehicle=box).verdicts["small"]
-    seen = evaluate_encounters(
+    detections = evaluate_encounters(
         THREE, requirements.requirements[0].encounters, Criterion(**criterion, consecutive_scans=2), vehicle=box
     ).detections
-    latest_s = [min(one.ttc_s.min(), one.ttc_without_sensor_s[1].min()) for one in seen]
-    needed_s = [abs(one.encounter.ego.speed_mps) / 8 + 1.0 for one in seen]
+    latest_s = [min(item.ttc_s.min(), item.ttc_without_sensor_s[1].min()) for item in detections]
+    needed_s = [abs(item.encounter.ego.speed_mps) / 8 + 1.0 for item in detections]
     assert (ttc.value, ttc.total_count) == (min(latest_s), 4)
-    assert 0.0 < ttc.value < min(one.ttc_s.max() for one in seen)
+    assert 0.0 < ttc.value < min(item.ttc_s.max() for item in detections)
     assert spare.value == pytest.approx(min(np.subtract(latest_s, needed_s)))
     assert "at 30 km/h" in spare.worst_locations[0]
 
 
-def test_who_is_seen_from_the_beginning_may_have_been_before(box):
-    """So more than that is neither kept nor not, with a sensor lost, too; and nothing has more than the whole."""
-    way = {
+def test_detections_at_the_start_are_lower_limits(box):
+    """A bound above the lower limit is not decided, also if a sensor fails."""
+    encounter = {
         "name": "a",
         "ego": {"speed_kmh": 20},
         "road_user": {"body": "adult", "speed_kmh": 5},
         "max_lead_time_s": 1.2,
     }
-    one = {
-        "encounters": {"name": "short", "encounters": [way]},
+    requirement = {
+        "encounters": {"name": "short", "encounters": [encounter]},
         "points": 2,
         "consecutive_scans": 2,
         "failing_sensors": "any",
     }
     two = build_rig(build_lidar(), build_lidar("mast", mount={"z_m": 1.2}))
     brakes = {"deceleration_mps2": 9, "latency_s": 0.75}
-    found = check(two, asked({**one, "ttc_s": 0.9}, {**one, "ttc_s": 1.1, "braking": brakes}), vehicle=box)
-    kept, ttc, spare = found.verdicts["small"]
-    assert [(each.state, each.undecided_count) for each in (kept, ttc, spare)] == [
+    found = check(
+        two,
+        build_requirements({**requirement, "ttc_s": 0.9}, {**requirement, "ttc_s": 1.1, "braking": brakes}),
+        vehicle=box,
+    )
+    met, ttc, spare = found.verdicts["small"]
+    assert [(verdict.state, verdict.undecided_count) for verdict in (met, ttc, spare)] == [
         ("met", 0),
         *[("not decided", 3)] * 2,
     ]
@@ -375,9 +392,9 @@ def test_who_is_seen_from_the_beginning_may_have_been_before(box):
     (table,) = found.build_tables()
     assert [cell.text for cell in table.rows[1]][2:5] == ["not decided", f"{ttc.value:.4g} or more", "-"]
     with pytest.raises(ValueError, match=r"1\.5 s are required, and encounter 'a' at 20 km/h .* lasts 1\.1\d s"):
-        check(two, asked({**one, "ttc_s": 1.5}), vehicle=box)
-    way["road_user"]["approach_distance_m"] = 1.65  # comes then
-    assert check(two, asked({**one, "ttc_s": 1.1}), vehicle=box).is_met is False
+        check(two, build_requirements({**requirement, "ttc_s": 1.5}), vehicle=box)
+    encounter["road_user"]["approach_distance_m"] = 1.65  # appears after the first scans
+    assert check(two, build_requirements({**requirement, "ttc_s": 1.1}), vehicle=box).is_met is False
 
 
 @pytest.mark.parametrize(
@@ -385,28 +402,30 @@ def test_who_is_seen_from_the_beginning_may_have_been_before(box):
     [("robot", EXAMPLES / "robot" / "delivery_robot.yaml", {"vehicle": EXAMPLES / "robot" / "body.ply"}),
      ("car", "kitti", {"num_frames": 16, "num_workers": 0})],
 )  # fmt: skip
-def test_the_examples_keep_what_they_require(name, rig_name, keys):
+def test_examples_meet_their_requirements(name, rig_name, keys):
     found = check(rig_name, EXAMPLES / name / "requirements.yaml", **keys)
     assert found.is_met, found.build_tables()
 
 
-def test_a_camera_of_few_pixels_shows_nothing_even_if_they_were_points_enough(box):
-    (one,) = Requirements.load("reversing_r158_cameras").requirements
-    far = one.model_copy(update={"positions": TargetPositions(points_m=((-3.5, 0.0),), relative_to="rear")})
+def test_pixels_and_points_have_different_bounds(box):
+    (reversing,) = Requirements.load("reversing_r158_cameras").requirements
+    far = reversing.model_copy(update={"positions": TargetPositions(points_m=((-3.5, 0.0),), relative_to="rear")})
     coarse = {**CAMERA, "mount": {"x_m": -2.1, "z_m": 1.0, "yaw_deg": 180}, "width": 48, "height": 36, "stride": 1}
     points = far.model_copy(update={"pixels": None, "points": 5, "name": "as points"})
-    pixels, as_points = check(build_rig(coarse), asked(far, points), vehicle=box).verdicts["small"]
+    pixels, as_points = check(build_rig(coarse), build_requirements(far, points), vehicle=box).verdicts["small"]
     assert (pixels.state, as_points.state, pixels.value) == ("not met", "met", as_points.value)
 
 
 @pytest.mark.parametrize("name", list_builtin_names("requirements"))
-def test_built_in_sets_say_where_they_are_from_and_that_they_are_no_homologation(name):
+def test_built_in_sets_state_source_and_limits(name):
     found = Requirements.load(name)
     assert found.name == name
     assert "geometry, no homologation" in found.description
     assert "In doubt: " in found.description
-    bodies = [one for one in found.requirements if isinstance(one, TargetRequirement)]
-    assert all((one.points is None) == (one.counted_sensors == ("camera",)) != (one.pixels is None) for one in bodies)
+    for requirement in found.requirements:
+        if isinstance(requirement, TargetRequirement):
+            is_camera = requirement.counted_sensors == ("camera",)
+            assert (requirement.points is None) == is_camera != (requirement.pixels is None)
     assert "memory" not in found.description
 
 
@@ -422,29 +441,29 @@ KINDS = {
 
 
 @pytest.mark.parametrize(("needed", "given"), list(permutations(KINDS, 2)))
-def test_a_file_of_another_kind_is_called_what_it_is(tmp_path, needed, given):
+def test_files_of_other_kinds_are_recognized(tmp_path, needed, given):
     (tmp_path / "file.yaml").write_text(f"name: x\n{KINDS[given][1]}\n")
     with pytest.raises(ValueError, match=rf"file\.yaml: this is {given}; {needed} is needed$"):
         KINDS[needed][0].load(tmp_path / "file.yaml")
 
 
-def test_the_keys_of_kinds_are_those_of_their_documents():
+def test_keys_of_kinds_equal_document_fields():
     for kind, (document, _) in KINDS.items():
-        of_kind = (document, SelectionSpace) if document is SearchSpace else (document,)
-        known = {name for one in of_kind for name in one.model_fields} - {"name", "description"}
+        documents_of_kind = (document, SelectionSpace) if document is SearchSpace else (document,)
+        fields = {name for item in documents_of_kind for name in item.model_fields} - {"name", "description"}
         assert document.kind == kind
-        assert set(" ".join(document_keys.KINDS[kind]).split()) == known
+        assert set(" ".join(document_keys.KINDS[kind]).split()) == fields
 
 
 @pytest.mark.parametrize(("kind", "name"), [("rigs", "urban"), ("scenarios", "kitti"), ("vehicles", "urban")])
-def test_a_built_in_name_of_another_kind_is_called_what_it_is(kind, name):
+def test_built_in_names_of_other_kinds_are_recognized(kind, name):
     document = {"rigs": Rig, "scenarios": Scenario, "vehicles": Vehicle}[kind]
     with pytest.raises(FileNotFoundError, match=rf"'{name}' is one of the built-in \w+; one of the {kind} is needed"):
         document.load(name)
 
 
-def test_a_key_in_another_unit_names_the_right_one():
-    for key, right in (("yaw_rad", "yaw_deg"), ("x_mm", "x_m"), ("pitch_rad", "pitch_deg"), ("max_range_km", None)):
-        with pytest.raises(ValueError, match="x") as told:
+def test_keys_in_other_units_get_advice():
+    for key, expected in (("yaw_rad", "yaw_deg"), ("x_mm", "x_m"), ("pitch_rad", "pitch_deg"), ("max_range_km", None)):
+        with pytest.raises(ValueError, match="x") as raised:
             Rig.model_validate({"name": "x", "sensors": [{"name": "s", "type": "lidar", "mount": {key: 1.0}}]})
-        assert f"is {right} meant?" in explain_document_error(told.value) or right is None
+        assert f"is {expected} meant?" in explain_document_error(raised.value) or expected is None

@@ -1,4 +1,4 @@
-"""The page of a result: what is on it, and that its rigs can be read back."""
+"""Page of a result: numbers, maps, settings, and rigs that can be loaded again."""
 
 import html
 import re
@@ -16,7 +16,7 @@ NASTY = "<script>alert(1)</script>"
 
 
 class Text(HTMLParser):
-    """All words of a page that a reader sees."""
+    """Visible words and tags of a page."""
 
     def __init__(self, page: str) -> None:
         super().__init__()
@@ -40,7 +40,7 @@ def result():
 
 
 @pytest.mark.usefixtures("blank_maps")
-def test_the_page_says_what_the_table_says_and_where_it_comes_from(result, tmp_path):
+def test_the_page_has_numbers_settings_and_versions(result, tmp_path):
     assert tmp_path / "report.html" in result.save(tmp_path)
     text = Text((tmp_path / "report.html").read_text(encoding="utf-8"))
     words = " ".join(text.words)
@@ -52,27 +52,29 @@ def test_the_page_says_what_the_table_says_and_where_it_comes_from(result, tmp_p
         assert fact in words
 
 
-def test_the_page_has_what_was_asked_for(result):
+def test_the_page_has_maps_of_all_quantities(result):
     page = result.page
     assert [line.name for line in page.outlines] == [region.name for region in result.regions]
-    quantities = dict.fromkeys(one.quantity for one in page.maps)
+    quantities = dict.fromkeys(page_map.quantity for page_map in page.maps)
     assert "sensors that detect within 0.4 m" in quantities
     assert "mean blind spot radius, without roof" in quantities
-    assert {one.rig for one in page.maps} == set(result.coverages)
+    assert {page_map.rig for page_map in page.maps} == set(result.coverages)
 
 
 @pytest.mark.parametrize("name", ["edgar", "kitti_cameras", "place3d_pyramid", "waymo"])
-def test_the_rig_on_the_page_can_be_read_back(name, tmp_path):
+def test_rigs_of_the_page_can_be_loaded(name, tmp_path):
     rig = Rig.load(name)
     text = html.unescape(html.escape(format_rig_yaml(name, rig.sensors)))
     (tmp_path / "rig.yaml").write_text(text, encoding="utf-8")
-    again = Rig.load(tmp_path / "rig.yaml")
-    assert [sensor.collect_content() for sensor in again.sensors] == [sensor.collect_content() for sensor in rig.sensors]
+    loaded = Rig.load(tmp_path / "rig.yaml")
+    assert [sensor.collect_content() for sensor in loaded.sensors] == [
+        sensor.collect_content() for sensor in rig.sensors
+    ]
 
 
-def test_the_page_of_a_target_draws_where_it_is_first_seen(tmp_path):
-    seen = map_target_visibility("front_roof_128", "dog", raster=Raster((-6.0, 6.0), (-4.0, 4.0), 1.0))
-    files = save_target_map(seen, tmp_path, Rig.load("front_roof_128").sensors)
+def test_the_target_page_has_the_detection_border(tmp_path):
+    target_map = map_target_visibility("front_roof_128", "dog", raster=Raster((-6.0, 6.0), (-4.0, 4.0), 1.0))
+    files = save_target_map(target_map, tmp_path, Rig.load("front_roof_128").sensors)
     assert tmp_path / "report.html" in files
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     words = " ".join(Text(page).words)

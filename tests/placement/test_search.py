@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tests.placement.surfaces import Surface, near_far, plan, space
-from torchcover.evaluation.requirements_check import CheckResult
+from torchcover.evaluation.check_result import CheckResult
 from torchcover.evaluation.verdicts import Verdict
 from torchcover.files import BadFileError
 from torchcover.placement import OptimizerParams, PlacementSearch, SearchPlan, SearchSpace, run_search

@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 from rich.progress import track
 
 from torchcover.evaluation import list_cameras, plot_rig_figures, plot_scenario, plot_vehicle_figure
+from torchcover.evaluation.rig_names import load_named_rig
 from torchcover.evaluation.settings import DEFAULT_SCENARIO
-from torchcover.evaluation.task import load_named_rig
 from torchcover.files import BadFileError, write_atomically
 from torchcover.report import Terminal, check_animation, write_animation
 from torchcover.simulation import Scenario, list_builtin_names

@@ -15,7 +15,7 @@ from torchcover.coverage import Coverage, Region
 from torchcover.coverage.averages import Average
 from torchcover.estimation import Quantity
 from torchcover.evaluation.evaluating import evaluate
-from torchcover.evaluation.task import AnyRig, load_rig
+from torchcover.evaluation.rig_names import AnyRig, load_rig
 from torchcover.simulation import RegionsOfInterest, Scenario
 
 DETECTION_THRESHOLD_M = 0.4

@@ -17,7 +17,6 @@ from torchcover.encounters.rows import (
     EncounterRow,
     build_sensor_table,
     build_speed_table,
-    build_text_cells,
     format_csv_value,
     format_detected_share,
     format_time,
@@ -27,7 +26,7 @@ from torchcover.encounters.traffic import ROAD_USER_GROUPS, Approach
 from torchcover.estimation import Estimate, Number, Quantity
 from torchcover.files import format_csv
 from torchcover.notebooks import build_dataframe, build_result_html
-from torchcover.report import PageTable, format_percent, plot_encounters, to_json_record
+from torchcover.report import PageTable, build_text_cells, format_percent, plot_encounters, to_json_record
 
 if TYPE_CHECKING:
     import pandas

@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from torchcover.report import PageTable, TextCell, format_percent
+from torchcover.report import PageTable, build_text_cells, format_percent
 
 
 class EncounterRow(NamedTuple):
@@ -70,11 +70,6 @@ class EncounterRow(NamedTuple):
         if not math.isnan(self.speed_kmh):
             return f"{self.speed_kmh:g}"
         return "sampled" if math.isnan(self.encounters_per_hour) else "any"
-
-
-def build_text_cells(*texts: str) -> tuple[TextCell, ...]:
-    """Build the cells of a table row from their texts."""
-    return tuple(TextCell(text) for text in texts)
 
 
 def format_csv_value(value: str | float) -> str:

@@ -1,3 +1,4 @@
+from .check_result import CheckResult as CheckResult
 from .checkpoint import Checkpoint as Checkpoint
 from .encounter_animation import plot_encounter_animation as plot_encounter_animation
 from .encounter_evaluation import evaluate_encounters as evaluate_encounters
@@ -23,7 +24,6 @@ from .ranks import join_ranks as join_ranks
 from .reporting import Report as Report
 from .reporting import report as report
 from .requirements import Requirements as Requirements
-from .requirements_check import CheckResult as CheckResult
 from .requirements_check import check as check
 from .result import Result as Result
 from .result_page import build_sensor_views as build_sensor_views

@@ -13,8 +13,8 @@ from torchcover.encounters import Encounter, EncounterDetection, EncounterResult
 from torchcover.encounters.detection import EncounterPointCounter, MountedRig
 from torchcover.encounters.staging import FRAME_INTERVAL_S, get_solid
 from torchcover.evaluation.encounter_evaluation import load_rigs
+from torchcover.evaluation.rig_names import AnyRig
 from torchcover.evaluation.target_visibility import build_flat_ground
-from torchcover.evaluation.task import AnyRig
 from torchcover.geometry import invert, transform_outline
 from torchcover.report import ActorMark, StaticFaces, plot_scene
 from torchcover.simulation import SensorNoise, set_ego

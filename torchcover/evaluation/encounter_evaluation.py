@@ -8,16 +8,23 @@ from typing import Literal
 import numpy as np
 
 from torchcover import __version__
-from torchcover.encounters import Criterion, EncounterResults, EncounterSet, StagedEncounter, detect_encounter
+from torchcover.encounters import (
+    Criterion,
+    EncounterResults,
+    EncounterRow,
+    EncounterSet,
+    StagedEncounter,
+    detect_encounter,
+)
 from torchcover.encounters.detection import MountedRig
 from torchcover.encounters.result import TOTAL_ROW
 from torchcover.encounters.traffic import Drive, find_approaches
 from torchcover.encounters.traffic_detection import DriveSensors, detect_approach
 from torchcover.evaluation.progress import Progress, defer_signals
 from torchcover.evaluation.result_page import format_facts
+from torchcover.evaluation.rig_names import AnyRig, load_named_rig
 from torchcover.evaluation.settings import FILES, parse_file_kinds
 from torchcover.evaluation.target_visibility import build_flat_ground
-from torchcover.evaluation.task import AnyRig, load_named_rig
 from torchcover.files import AtomicOutput
 from torchcover.recordings import Recording, open_recording
 from torchcover.report import Page, PagePicture, render_page
@@ -72,7 +79,7 @@ def evaluate_encounters(
     staged = []
     for name, rig in loaded_rigs.items():
         mounted = MountedRig(rig, set_ego(build_flat_ground(), {name: rig}, vehicle))
-        # All encounters are staged before the first scan, so that mistakes are reported at once.
+        # Encounters are staged before the first scan, so that mistakes are reported at once.
         staged += [(mounted, StagedEncounter(encounter, mounted.ego_solid)) for encounter in encounter_set.encounters]
     detections = []
     with Progress(len(staged), "encounters", is_shown=progress) as bar:
@@ -107,7 +114,11 @@ def load_rigs(rigs: AnyRig | Sequence[AnyRig], sensor_model: Literal["ideal", "r
 
 
 def _get_sensor_names(rigs: Mapping[str, Rig]) -> dict[str, tuple[str, ...]]:
-    return {name: tuple(sensor.name for sensor in rig.sensors) for name, rig in rigs.items()}
+    """Return the names of the sensors of each rig."""
+    sensor_names = {}
+    for name, rig in rigs.items():
+        sensor_names[name] = tuple(sensor.name for sensor in rig.sensors)
+    return sensor_names
 
 
 def evaluate_traffic_encounters(
@@ -240,9 +251,11 @@ def summarize_encounters(encounter_results: EncounterResults) -> tuple[str, ...]
     Returns:
         One sentence: for a set the encounters that are always in time, in traffic the late detections.
     """
-    all_rows = [row for row in encounter_results.rows if row.encounter != TOTAL_ROW and row.braking_count]
-    rows_by_rig = {rig: [row for row in all_rows if row.rig == rig] for rig in encounter_results.sensor_names}
-    if not all_rows:
+    rows_by_rig: dict[str, list[EncounterRow]] = {rig: [] for rig in encounter_results.sensor_names}
+    for row in encounter_results.rows:
+        if row.encounter != TOTAL_ROW and row.braking_count:
+            rows_by_rig[row.rig].append(row)
+    if not any(rows_by_rig.values()):
         return ("The vehicle had to brake for no road user.",)
     counts, totals = {}, []
     for rig, rows in rows_by_rig.items():
@@ -260,7 +273,14 @@ def summarize_encounters(encounter_results: EncounterResults) -> tuple[str, ...]
 
 
 def build_encounters_page(encounter_results: EncounterResults) -> Page:
-    """Build the page of encounters, with a plot for a set."""
+    """Build the page of encounters.
+
+    Args:
+        encounter_results: Results of encounters.
+
+    Returns:
+        Page with findings and tables, and for a set a plot of time to collision by speed.
+    """
     pictures = []
     if not encounter_results.scene_durations_h:
         png = BytesIO()

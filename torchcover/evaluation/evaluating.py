@@ -10,8 +10,9 @@ from torchcover.evaluation.config import DESCRIPTIONS
 from torchcover.evaluation.measurement import measure_coverage
 from torchcover.evaluation.mixed_result import MixedResult, measure_scenarios
 from torchcover.evaluation.result import Result
+from torchcover.evaluation.rig_names import make_unique_names
 from torchcover.evaluation.settings import Settings
-from torchcover.evaluation.task import build_task, make_unique_names
+from torchcover.evaluation.task import build_task
 
 
 @accept_fields(Settings, DESCRIPTIONS)
@@ -43,8 +44,9 @@ def compare(results: Result | str | Path | Sequence[Result | str | Path]) -> Res
     """Compare results with the first one, as `torchcover compare` does with saved coverages.
 
     Args:
-        results: Results of `evaluate`, or `.npz` files of `Coverage.save`, of at least two rigs that were measured in the
-            same frames: by one call, or by several with the same scenario, number of frames, seed and reference sensor.
+        results: Results of `evaluate`, or `.npz` files of `Coverage.save`, of at least two rigs that were measured
+            in the same frames: by one call, or by several with the same scenario, number of frames, seed and reference
+            sensor.
             Results of several scenarios need the same scenarios and weights.
 
     Returns:
@@ -52,7 +54,8 @@ def compare(results: Result | str | Path | Sequence[Result | str | Path]) -> Res
 
     Raises:
         FileNotFoundError: No such file.
-        ValueError: Not a coverage file, fewer than two rigs, or different frames, reference points, grids or thresholds.
+        ValueError: Not a coverage file, fewer than two rigs, or different frames, reference points, grids or
+            thresholds.
         TypeError: Neither a result nor a file.
 
     Example:
@@ -75,17 +78,26 @@ def compare(results: Result | str | Path | Sequence[Result | str | Path]) -> Res
 
 
 class _MeasuredRig(NamedTuple):
-    """Coverage of one rig with its name, the name or file that the user gave, and the source of its frames."""
+    """Measured rig of a comparison.
+
+    Args:
+        name: Name of the rig.
+        coverage: Its coverage.
+        path: Coverage file, or the name or file of the rig that the user gave.
+        source: Source of the frames.
+    """
 
     name: str
     coverage: Coverage
-    given: str | Path
+    path: str | Path
     source: Mapping[str, Any]
 
 
 def _compare_single(inputs: Sequence[Result | str | Path]) -> Result:
     """Compare rigs of a single scenario or recording."""
-    rigs = [rig for item in inputs for rig in _list_measured_rigs(item)]
+    rigs: list[_MeasuredRig] = []
+    for item in inputs:
+        rigs += _list_measured_rigs(item)
     names = make_unique_names([rig.name for rig in rigs])
     if len(names) < 2:
         raise ValueError(f"a comparison needs at least two measured rigs; got {', '.join(names) or 'none'} only")
@@ -101,15 +113,16 @@ def _compare_single(inputs: Sequence[Result | str | Path]) -> Result:
         coverages={name: rig.coverage for name, rig in zip(names, rigs, strict=True)},
         regions=rigs[0].coverage.regions,
         run=None,
-        rigs={name: str(rig.given) for name, rig in zip(names, rigs, strict=True)},
+        rigs={name: str(rig.path) for name, rig in zip(names, rigs, strict=True)},
         source=source,
         reference_record=None,
         device=None,
-        input_files=[rig.given for rig in rigs if isinstance(rig.given, Path)],
+        input_files=[rig.path for rig in rigs if isinstance(rig.path, Path)],
     )
 
 
 def _list_measured_rigs(item: Result | str | Path) -> list[_MeasuredRig]:
+    """List the rigs of a result, or the rig of a coverage file."""
     if isinstance(item, Result):
         return [
             _MeasuredRig(name, coverage, item.rigs[name] or name, item.source)

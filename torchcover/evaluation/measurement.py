@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, nullcontext, suppress
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -61,12 +62,12 @@ class _ObservedRun:
 
     Args:
         coverage: Name of each rig -> its coverage observer.
-        others: Name -> further observer.
+        further_observers: Name -> further observer.
         run: Outcome of the run.
     """
 
     coverage: Observers
-    others: Observers
+    further_observers: Observers
     run: Run
 
 
@@ -91,16 +92,16 @@ def measure_coverage(
         ValueError: As in `evaluate`.
     """
     ranks = settings.ranks
-    sensors = [sensor for rig_sensors in task.sensors.values() for sensor in rig_sensors]
+    sensors = list(chain.from_iterable(task.sensors.values()))
     check_drawable(sensors)
     settings = replace(settings, num_workers=_choose_num_workers(task, settings, params))
     metrics = load_contrib().build_metrics(task, settings) if settings.metrics else None
     metric_observers = metrics.observers if metrics else {}
-    others = {**settings.observers, **metric_observers, **_build_target_observers(task, settings, params)}
+    further_observers = {**settings.observers, **metric_observers, **_build_target_observers(task, settings, params)}
     with ranks.abort_on_error() if ranks else nullcontext():
-        observed = _observe_frames(task, settings, others, stopping_rule)
+        observed = _observe_frames(task, settings, further_observers, stopping_rule)
     coverages = {name: observer.compute() for name, observer in observed.coverage.items()}
-    target_observer = observed.others.get(NEAR_FIELD_TARGETS)
+    target_observer = observed.further_observers.get(NEAR_FIELD_TARGETS)
     if isinstance(target_observer, NearFieldObserver):
         for name, coverage in coverages.items():
             coverage.target_sums = target_observer.get_target_sums(name)
@@ -109,7 +110,7 @@ def measure_coverage(
     metric_report = None
     if metrics is not None:
         metric_report = load_contrib().compare_metrics(
-            metrics.update_from(observed.others), coverages, task.query_plan.target_regions, settings.seed
+            metrics.update_from(observed.further_observers), coverages, task.query_plan.target_regions, settings.seed
         )
     result = Result(
         coverages=coverages,
@@ -123,7 +124,7 @@ def measure_coverage(
         target_regions=task.query_plan.target_regions,
         sensors=task.sensors,
         ego_outline_m=task.frames.ego_outline_m,
-        observer_results={name: observed.others[name].compute() for name in settings.observers},
+        observer_results={name: observed.further_observers[name].compute() for name in settings.observers},
         metrics=metric_report,
         omissions=list_omissions(
             observed.run.counts,
@@ -188,12 +189,12 @@ def _build_target_observers(
     targets = [Target.load(name) for name in names]
     target_names = [target.name for target in targets]
     if len(set(target_names)) < len(target_names):
-        raise ValueError(f"test_targets: one is given twice: {', '.join(target_names)}")
+        raise ValueError(f"test_targets: a test target is given twice: {', '.join(target_names)}")
     return {NEAR_FIELD_TARGETS: NearFieldObserver(task.frames.simulator, targets, NUM_BLOCKS)}
 
 
 def _observe_frames(
-    task: Task[FrameSource], settings: Settings, others: Observers, stopping_rule: StoppingRule | None
+    task: Task[FrameSource], settings: Settings, further_observers: Observers, stopping_rule: StoppingRule | None
 ) -> _ObservedRun:
     """Pass all frames to the coverage metrics and the other observers, from and to a checkpoint, over all ranks."""
     ranks, checkpoint = settings.ranks, settings.checkpoint
@@ -203,10 +204,10 @@ def _observe_frames(
     target_rule = None
     if settings.target_error:
         target_rule = TargetErrorRule(settings.target_error, coverage, task.query_plan.target_regions)
-    observers: Sequence[AnyObserver] = [*coverage.values(), *others.values()]
+    observers: Sequence[AnyObserver] = [*coverage.values(), *further_observers.values()]
     identity: dict[str, str] = {}
     if ranks or checkpoint:
-        identity = build_run_identity(task, settings, others, ranks.num_ranks if ranks else 1)
+        identity = build_run_identity(task, settings, further_observers, ranks.num_ranks if ranks else 1)
     if ranks:
         if settings.target_error:
             raise ValueError("target error: a rank only has its share of the frames; omit it, or run without torchrun")
@@ -218,7 +219,7 @@ def _observe_frames(
             file = file.for_rank(ranks.rank if ranks else 0)
             if ranks is None or ranks.rank == 0:
                 stack.enter_context(lock_folder(file.path.parent))
-            journal = CheckpointManager(file, identity, _name_states(coverage, others, target_rule))
+            journal = CheckpointManager(file, identity, _name_states(coverage, further_observers, target_rule))
         run = observe(
             task.frames,
             observers,
@@ -237,20 +238,18 @@ def _observe_frames(
     num_rigs = len(coverage)
     return _ObservedRun(
         dict(zip(coverage, observers[:num_rigs], strict=True)),
-        dict(zip(others, observers[num_rigs:], strict=True)),
+        dict(zip(further_observers, observers[num_rigs:], strict=True)),
         run,
     )
 
 
 def _build_coverage_observers(task: Task[FrameSource], settings: Settings) -> dict[str, CoverageObserver]:
+    """Build the coverage observer of each rig."""
     sensor_names = task.get_sensor_names() if settings.redundancy else {}
     observers = {}
     for name in task.rigs:
         metric = build_metric(
-            settings,
-            task.query_plan,
-            sensor_names.get(name, ()),
-            has_area_weights=task.frames.has_area_weights,
+            settings, task.query_plan, sensor_names.get(name, ()), has_area_weights=task.frames.has_area_weights
         )
         observers[name] = CoverageObserver(metric, name)
     return observers
@@ -280,10 +279,12 @@ def _merge_ranks(run: Run, observers: Sequence[AnyObserver], ranks: Ranks) -> tu
     return merged, observers
 
 
-def _name_states(coverage: Observers, others: Observers, target_rule: TargetErrorRule | None) -> dict[str, Any]:
+def _name_states(
+    coverage: Observers, further_observers: Observers, target_rule: TargetErrorRule | None
+) -> dict[str, Any]:
     """Name the parts of a checkpoint, as its file and messages call them."""
     states: dict[str, Any] = {f"coverage of {name}": observer for name, observer in coverage.items()}
-    states |= {f"observer {name}": observer for name, observer in others.items()}
+    states |= {f"observer {name}": observer for name, observer in further_observers.items()}
     if target_rule:
         states["target error"] = target_rule
     return states

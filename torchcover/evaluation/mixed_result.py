@@ -1,7 +1,7 @@
 """Results of rigs in several scenarios, and in the weighted mixture of them."""
 
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Container, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -12,10 +12,9 @@ from matplotlib.figure import Figure
 from torchcover.coverage import Coverage, CoverageMixture
 from torchcover.evaluation.checkpoint import Checkpoint
 from torchcover.evaluation.measurement import measure_coverage
-from torchcover.evaluation.progress import defer_signals
 from torchcover.evaluation.result import Result
 from torchcover.evaluation.result_page import build_result_tables
-from torchcover.evaluation.settings import FILES, Settings, parse_file_kinds
+from torchcover.evaluation.settings import Settings
 from torchcover.evaluation.task import build_task
 from torchcover.files import SUMMARY, AtomicOutput, format_csv
 from torchcover.report import RENDERERS, CoverageTable, PageTable, build_file_stems, merge_notes, render_page
@@ -29,7 +28,8 @@ MIXTURE = "mixture"
 class MixedResult(Result):
     """Result of `evaluate` and `compare` for several scenarios: the numbers of their mixture.
 
-    Coverages, maps and published metrics belong to one scenario each; see `scenario_results`.
+    Coverages, maps and published metrics belong to one scenario each; see `scenario_results`. Their files are in a
+    folder for each scenario; `summary.csv`, `report.html` and `summary.json` are about the mixture.
 
     Args:
         scenario_results: Name of each scenario -> its result; all have the same rigs.
@@ -125,7 +125,7 @@ class MixedResult(Result):
 
     @property
     def tables(self) -> list[PageTable]:
-        """Tables of the mixture, followed by those of each scenario."""
+        """Tables of the mixture, followed by the tables of each scenario."""
         tables_by_name = {MIXTURE: build_result_tables(self.table)}
         tables_by_name |= {name: result.tables for name, result in self.scenario_results.items()}
         titled = []
@@ -146,41 +146,44 @@ class MixedResult(Result):
             for stem, figure in result.plot_maps(layer):
                 yield f"{name}/{stem}", figure
 
-    def save(self, folder: str | Path, *, file_kinds: str | Iterable[str] = FILES) -> list[Path]:
-        """Write the files of each scenario into a subfolder, as `Result.save` does, and those of the mixture.
+    def add_numbers(self, output: AtomicOutput, file_kinds: Container[str], folder: str = "") -> None:
+        """Write the numbers of each scenario into its folder, and the numbers of the mixture, if requested.
 
         Args:
-            folder: Folder of the files, created if necessary: `NAME/...` for each scenario; `summary.csv` with the rows
-                of all scenarios and of the mixture, `report.html` and `summary.json`.
-            file_kinds: Files besides `summary.json`, as in `Result.save`.
+            output: Output folder.
+            file_kinds: Requested files; `NAME/summary.json` is always written.
+            folder: Prefix of the file names; it ends with a slash.
+        """
+        for stem, result in self._get_results_by_stem().items():
+            result.add_numbers(output, file_kinds, f"{folder}{stem}/")
+            text = json.dumps(result.record, indent=2, allow_nan=False) + "\n"
+            output.add_text(f"{folder}{stem}/{SUMMARY}", text)
+        if "numbers" in file_kinds:
+            output.add_text(f"{folder}summary.csv", self._format_csv())
 
-        Returns:
-            Paths of the files.
+    def add_page_and_maps(self, output: AtomicOutput, file_kinds: Container[str], folder: str = "") -> None:
+        """Write the page and the maps of each scenario into its folder, and the page of the mixture, if requested.
+
+        Args:
+            output: Output folder.
+            file_kinds: Requested files.
+            folder: Prefix of the file names; it ends with a slash.
 
         Raises:
-            ValueError: A file kind is unknown, or there is not enough memory for the page and the maps.
+            ValueError: There is not enough memory.
         """
-        kinds, record = parse_file_kinds(file_kinds), self.record
-        results = dict(zip(build_file_stems(list(self.scenario_results)), self.scenario_results.values(), strict=True))
-        with AtomicOutput(Path(folder)) as output:
-            with defer_signals():  # the numbers are complete before a signal ends the process
-                for stem, result in results.items():
-                    if "numbers" in kinds:
-                        result.add_numbers(output, f"{stem}/")
-                    text = json.dumps(result.record, indent=2, allow_nan=False) + "\n"
-                    output.add_text(f"{stem}/{SUMMARY}", text)
-                if "numbers" in kinds:
-                    output.add_text("summary.csv", self._format_csv())
-                output.publish(record)
-            for stem, result in results.items():
-                result.add_page_and_maps(output, kinds, f"{stem}/")
-            if "page" in kinds:
-                output.add_text("report.html", render_page(self.page))
-            output.publish(record)
-        return output.paths
+        for stem, result in self._get_results_by_stem().items():
+            result.add_page_and_maps(output, file_kinds, f"{folder}{stem}/")
+        if "page" in file_kinds:
+            output.add_text(f"{folder}report.html", render_page(self.page))
+
+    def _get_results_by_stem(self) -> dict[str, Result]:
+        """Return the result of each scenario by the name of its folder."""
+        return dict(zip(build_file_stems(list(self.scenario_results)), self.scenario_results.values(), strict=True))
 
     @property
     def _tables_by_name(self) -> dict[str, CoverageTable]:
+        """Coverage table of each scenario, and of the mixture."""
         return {**{name: result.table for name, result in self.scenario_results.items()}, MIXTURE: self.table}
 
     def _format_csv(self) -> str:
@@ -192,13 +195,18 @@ class MixedResult(Result):
                 row = {"scenario": name, **record}
                 rows.append(row)
                 columns |= dict.fromkeys(row)
-        return format_csv([list(columns), *([row.get(column, "") for column in columns] for row in rows)])
+        lines = [list[object](columns)]
+        for row in rows:
+            lines.append([row.get(column, "") for column in columns])
+        return format_csv(lines)
 
     @property
     def _title(self) -> str:
+        """First line of texts about the result."""
         return f"Mixture of {', '.join(self.scenario_results)}: {', '.join(self.rigs)}"
 
     def __str__(self) -> str:
+        """Format all coverage tables as text."""
         return "\n".join([f"{name}\n{RENDERERS['text'](table)}" for name, table in self._tables_by_name.items()])
 
 
@@ -208,11 +216,14 @@ def _merge_values(values: Mapping[str, Any]) -> object:
     Args:
         values: Name of each scenario -> its value; a mapping has a value for each rig.
     """
-    first, *others = values.values()
-    if all(value == first for value in others):
+    first = next(iter(values.values()))
+    if all(value == first for value in values.values()):
         return first
     if isinstance(first, Mapping):
-        return {rig: _merge_values({name: value.get(rig) for name, value in values.items()}) for rig in first}
+        merged = {}
+        for rig in first:
+            merged[rig] = _merge_values({name: value.get(rig) for name, value in values.items()})
+        return merged
     return ", ".join(f"{name} {value}" for name, value in values.items())
 
 
@@ -243,7 +254,7 @@ def measure_scenarios(settings: Settings) -> MixedResult:
             checkpoint = checkpoint if isinstance(checkpoint, Checkpoint) else Checkpoint(Path(checkpoint))
             checkpoint = checkpoint.in_folder(stem)
         scenario_settings = replace(settings, scenario=scenario, checkpoint=checkpoint)
-        # All tasks are built before the first measurement, which may take hours.
+        # Tasks are built before the first measurement, since one measurement may take hours.
         tasks[name] = build_task(scenario_settings), scenario_settings
     regions = [tasks[name][0].query_plan.regions for name, weight in weights.items() if weight > 0.0]
     if any(scenario_regions != regions[0] for scenario_regions in regions):

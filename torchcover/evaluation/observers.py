@@ -48,7 +48,7 @@ class Observer(Protocol[ResultT]):
         """Add a frame, whose tensors are on the device of the run."""
 
     def compute(self) -> ResultT:
-        """Return the result of all frames so far."""
+        """Return the result of the frames so far."""
 
     def merge_state(self, other: Self, /) -> None:
         """Add the frames of another observer, which stays unchanged."""
@@ -118,7 +118,7 @@ class CoverageObserver:
             self.metric.add_sums(frame_sums)
 
     def compute(self) -> Coverage:
-        """Return the coverage of all frames so far."""
+        """Return the coverage of the frames so far."""
         coverage: Coverage = self.metric.compute()
         return coverage
 
@@ -127,7 +127,7 @@ class CoverageObserver:
         return self.metric.metric_state
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
-        """Replace the sums by those of another observer.
+        """Replace the sums by the sums of another observer.
 
         Args:
             state_dict: Return value of its `state_dict`.
@@ -148,7 +148,7 @@ class CoverageObserver:
             ValueError: The other observer has another rig, or a metric with other parameters.
         """
         if other.rig != self.rig:
-            raise ValueError(f"cannot merge the coverage of rig {other.rig!r} into that of {self.rig!r}")
+            raise ValueError(f"cannot merge the coverage of rig {other.rig!r} into the coverage of {self.rig!r}")
         self.metric.merge_state(other.metric)
 
 

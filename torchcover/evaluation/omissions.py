@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from torchcover.coverage import AGGREGATIONS, Aggregation, Coverage
-from torchcover.report import PageTable, TextCell
+from torchcover.report import PageTable, build_text_cells
 from torchcover.simulation import CameraSensor, Sensor
 
 # Description of each omission -> names of the frame counts that have its number and the total.
@@ -92,12 +92,19 @@ def list_omissions(
 
 
 def build_omissions_table(omissions: Sequence[Omission]) -> PageTable:
-    """Build the table of omissions of a run."""
+    """Build the table of omissions.
+
+    Args:
+        omissions: Omissions of a run.
+
+    Returns:
+        Table with description, count, total and share.
+    """
     rows = []
     for omission in omissions:
         texts = (omission.description, "", "", "")
         if omission.count is not None and omission.total is not None:
             share = f"{omission.count / omission.total:.1%}"
             texts = (omission.description, f"{omission.count:,}", f"{omission.total:,}", share)
-        rows.append(tuple(TextCell(text) for text in texts))
+        rows.append(build_text_cells(*texts))
     return PageTable("Omissions that cannot change the result", ("work", "count", "of", "share"), rows)

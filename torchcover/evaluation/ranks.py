@@ -26,7 +26,7 @@ from torchcover.evaluation.observers import AnyObserver
 
 PayloadT = TypeVar("PayloadT")
 
-# Keys of the store: the first rank that failed, after which the results so far are merged; and the first that aborted.
+# Keys of the store: report of a failure, after which the results so far are merged, and report of an abort.
 FAILED_KEY = "failed"
 ABORTED_KEY = "aborted"
 SHUTDOWN_KEY = "parted"
@@ -80,7 +80,14 @@ class Ranks:
                 yield from scene_indices
 
     def get_device(self, name: str) -> str:
-        """Return the device of this rank: the GPU with its local rank for "cuda", `name` otherwise."""
+        """Return the device of this rank.
+
+        Args:
+            name: Device of the run.
+
+        Returns:
+            For "cuda" the GPU with the local rank, otherwise `name`.
+        """
         return f"cuda:{os.environ.get('LOCAL_RANK', '0')}" if name == "cuda" else name
 
     def check_identity(self, identity: Mapping[str, str]) -> None:
@@ -197,6 +204,7 @@ class Ranks:
         return observer
 
     def _wait_for(self, keys: list[str], timeout_s: float | None = None, *, raises_on_abort: bool = True) -> None:
+        """Wait until all keys are in the store, or until the timeout."""
         end_s = time.monotonic() + (self._params.max_wait_s if timeout_s is None else timeout_s)
         while not self.store.check(keys) and time.monotonic() < end_s:
             if raises_on_abort and self.store.check([ABORTED_KEY]):
@@ -212,6 +220,7 @@ class Ranks:
         return received
 
     def _send(self, value: object, receiver: int) -> None:
+        """Send a message in parts; the key of the message is set last, with its size."""
         message_key, data = self._build_message_key(self.rank, receiver), serialize(value)
         for start in range(0, len(data), self._params.max_part_bytes):
             part = data[start : start + self._params.max_part_bytes]
@@ -237,14 +246,21 @@ class Ranks:
 
 
 def serialize(value: object) -> bytes:
-    """Pickle an object after its tensors are copied to the CPU."""
+    """Pickle an object after its tensors are copied to the CPU.
+
+    Args:
+        value: Any object that can be pickled.
+    """
     stream = io.BytesIO()
     _CpuPickler(stream, protocol=pickle.HIGHEST_PROTOCOL).dump(value)
     return stream.getvalue()
 
 
 class _CpuPickler(pickle.Pickler):
+    """Pickler that stores tensors of other devices as CPU tensors."""
+
     def reducer_override(self, value: Any) -> Any:  # noqa: ANN401  (signature of pickle)
+        """Replace a tensor of another device by its copy on the CPU."""
         if type(value) is Tensor and value.device.type != "cpu":
             return value.cpu().__reduce_ex__(pickle.HIGHEST_PROTOCOL)  # type: ignore[no-untyped-call]
         return NotImplemented

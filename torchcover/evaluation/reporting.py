@@ -10,12 +10,14 @@ from typing import Any, Literal
 
 from torchcover.encounters import EncounterResults, EncounterSet
 from torchcover.estimation import MIN_BLOCKS
+from torchcover.evaluation.check_result import CheckResult
 from torchcover.evaluation.encounter_evaluation import build_encounters_page, evaluate_encounters
 from torchcover.evaluation.measurement import measure_coverage
 from torchcover.evaluation.progress import Progress, defer_signals
 from torchcover.evaluation.requirements import Requirements
-from torchcover.evaluation.requirements_check import CheckResult, check
+from torchcover.evaluation.requirements_check import check
 from torchcover.evaluation.result import Result
+from torchcover.evaluation.rig_names import AnyRig, load_rig, make_rig_names
 from torchcover.evaluation.settings import DEFAULT_NUM_FRAMES, FILES, Settings, parse_file_kinds
 from torchcover.evaluation.target_page import (
     build_sides_table,
@@ -24,7 +26,7 @@ from torchcover.evaluation.target_page import (
     summarize_target_maps,
 )
 from torchcover.evaluation.target_visibility import build_flat_ground, map_target_visibility
-from torchcover.evaluation.task import AnyRig, AnyScenario, build_simulation_task, load_rig, make_rig_names
+from torchcover.evaluation.task import AnyScenario, build_simulation_task
 from torchcover.files import AtomicOutput
 from torchcover.notebooks import build_result_html
 from torchcover.report import (
@@ -168,7 +170,7 @@ class Report:
 
     def _add_numbers(self, files: AtomicOutput) -> None:
         """Add the files of numbers: coverage, target maps, encounters and verdicts."""
-        self.result.add_numbers(files)
+        self.result.add_numbers(files, ["numbers"])
         for stem, target_map in zip(build_file_stems(list(self.targets)), self.targets.values(), strict=True):
             files.add(f"targets/{stem}.csv", partial(write_csv, target_map))
             files.add(f"targets/{stem}.npz", partial(write_arrays, target_map))

@@ -1,40 +1,25 @@
 """Check of requirements: measure all numbers that they name, judge them, and write the verdicts."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
-from xml.etree import ElementTree
 
 import numpy as np
 
-from torchcover import __version__
 from torchcover.coverage import AGGREGATIONS, Coverage
 from torchcover.encounters import StagedEncounter
+from torchcover.evaluation.check_result import CheckResult
 from torchcover.evaluation.encounter_evaluation import evaluate_encounters
 from torchcover.evaluation.measurement import measure_coverage
-from torchcover.evaluation.requirements import (
-    EncounterRequirement,
-    RegionRequirement,
-    Requirements,
-    TargetPositions,
-    TargetRequirement,
-)
+from torchcover.evaluation.requirements import EncounterRequirement, RegionRequirement, Requirements, TargetRequirement
 from torchcover.evaluation.result_notes import describe_perfect_depth
+from torchcover.evaluation.rig_names import AnyRig, load_rig, make_rig_names
 from torchcover.evaluation.settings import DEFAULT_SCENARIO, Settings
+from torchcover.evaluation.target_positions import TargetPositions
 from torchcover.evaluation.target_visibility import build_flat_ground, load_rig_and_scenario
-from torchcover.evaluation.task import (
-    AnyRig,
-    AnyScenario,
-    build_task,
-    compute_frame_interval_s,
-    load_rig,
-    make_rig_names,
-)
+from torchcover.evaluation.task import AnyScenario, build_task, compute_frame_interval_s
 from torchcover.evaluation.verdicts import Float64, Readings, Verdict, judge_requirements
-from torchcover.files import AtomicOutput
-from torchcover.report import PageTable, TextCell, to_json_record
 from torchcover.simulation import Rig, Scenario, Sensor, set_ego
 from torchcover.simulation.camera_sensor import CameraSensor
 from torchcover.simulation.moving import BodyGeometry
@@ -43,155 +28,6 @@ from torchcover.targets.result import PositionVisibility
 from torchcover.targets.survey import THRESHOLD_M
 
 SensorModel: TypeAlias = Literal["ideal", "real"] | None
-
-HEADINGS = (
-    "requirement",
-    "",
-    "",
-    "worst value",
-    "margin",
-    "not met",
-    "not decided",
-    "total",
-    "occupied",
-    "worst location",
-)
-NOTE = (
-    "A number with a confidence interval meets a bound if its whole 95 % interval does, and does not meet it if no part "
-    "of the interval does; otherwise it is not decided, and more frames are needed. An unknown number is never met. "
-    "These verdicts are geometry, and no homologation."
-)
-
-
-@dataclass(frozen=True)
-class CheckResult:
-    """Result of `check`.
-
-    Args:
-        requirements: The requirements.
-        verdicts: Name of each rig -> its verdicts, in the order of the file.
-        settings: Settings of the measurement, for `summary.json`.
-    """
-
-    requirements: Requirements
-    verdicts: Mapping[str, Sequence[Verdict]]
-    settings: Mapping[str, Any]
-
-    @property
-    def is_met(self) -> bool:
-        """Whether every rig meets every requirement; an undecided one is not met."""
-        return all(verdict.state == "met" for verdicts in self.verdicts.values() for verdict in verdicts)
-
-    @property
-    def verdict(self) -> tuple[str, ...]:
-        """Sentence with the number of requirements that each rig meets."""
-        num_bounds, rig_texts = 0, []
-        for rig, verdicts in self.verdicts.items():
-            states = [verdict.state for verdict in verdicts]
-            parts = [f"{rig} meets {states.count('met')}"]
-            parts += [f"{states.count(state)} {state}" for state in ("not met", "not decided") if state in states]
-            rig_texts.append(", ".join(parts))
-            num_bounds = len(verdicts)
-        return (f"Of the {num_bounds} bounds of {self.requirements.name}: {'; '.join(rig_texts)}.",)
-
-    def build_tables(self) -> list[PageTable]:
-        """Build one table for each rig, with the description of the requirements as a note."""
-        scenarios = ", ".join(f"{kind} {name}" for kind, name in self.settings["scenarios"].items())
-        notes = [f"Scenarios: {scenarios}.", *self.settings["notes"], NOTE]
-        if self.requirements.description:
-            notes.insert(0, self.requirements.description)
-        tables = []
-        for rig, verdicts in self.verdicts.items():
-            rows = [tuple(TextCell(text) for text in _format_verdict(verdict)) for verdict in verdicts]
-            tables.append(PageTable(f"{rig}: {self.requirements.name}", HEADINGS, rows, notes=notes))
-        return tables
-
-    @property
-    def record(self) -> dict[str, Any]:
-        """Content of `summary.json`."""
-        rigs = {}
-        for rig, verdicts in self.verdicts.items():
-            rigs[rig] = [to_json_record(_build_verdict_record(verdict)) for verdict in verdicts]
-        about = {"requirements": self.requirements.name, "torchcover": __version__, **self.settings}
-        return {**about, "met": self.is_met, "rigs": rigs}
-
-    @property
-    def junit(self) -> str:
-        """JUnit XML: a suite for each rig, a case for each bound; not met is a failure, not decided an error."""
-        root = ElementTree.Element("testsuites", name=self.requirements.name)
-        for rig, verdicts in self.verdicts.items():
-            states = [verdict.state for verdict in verdicts]
-            counts = {
-                "tests": str(len(states)),
-                "failures": str(states.count("not met")),
-                "errors": str(states.count("not decided")),
-            }
-            suite = ElementTree.SubElement(root, "testsuite", {"name": rig, **counts})
-            for verdict in verdicts:
-                _add_junit_case(suite, rig, verdict)
-        text = ElementTree.tostring(root, encoding="unicode", xml_declaration=True)
-        # XML does not allow control characters, which names of other files may contain.
-        return "".join(character if character.isprintable() or character == "\n" else " " for character in text)
-
-    def save(self, folder: str | Path) -> list[Path]:
-        """Write `junit.xml` and `summary.json`.
-
-        Args:
-            folder: Output folder; created if it does not exist.
-
-        Returns:
-            Paths of the files.
-        """
-        with AtomicOutput(Path(folder)) as output:
-            output.add_text("junit.xml", self.junit)
-            output.publish(self.record)
-        return output.paths
-
-
-def _add_junit_case(suite: ElementTree.Element, rig: str, verdict: Verdict) -> None:
-    name = f"{verdict.requirement}: {verdict.bound.text}"
-    case = ElementTree.SubElement(suite, "testcase", classname=rig, name=name)
-    if verdict.state != "met":
-        columns = zip(HEADINGS[3:], _format_verdict(verdict)[3:], strict=True)
-        message = "; ".join(f"{heading}: {text}" for heading, text in columns)
-        kind = "failure" if verdict.state == "not met" else "error"
-        ElementTree.SubElement(case, kind, message=message).text = "\n".join(verdict.worst_locations)
-
-
-def _build_verdict_record(verdict: Verdict) -> dict[str, Any]:
-    bound_key = "min_value" if verdict.bound.is_minimum else "max_value"
-    values = verdict._asdict()
-    del values["requirement"], values["bound"]
-    return {
-        "requirement": verdict.requirement,
-        "number": verdict.bound.key,
-        bound_key: verdict.bound.value,
-        **values,
-    }
-
-
-def _format_verdict(verdict: Verdict) -> tuple[str, ...]:
-    """Format the cells of one row, under `HEADINGS`."""
-    interval = ""
-    if verdict.high == np.inf:
-        interval = " or more"
-    elif verdict.low < verdict.high:
-        interval = f" ({verdict.low:.4g} to {verdict.high:.4g})"
-    value = "-" if np.isnan(verdict.value) else f"{verdict.value:.4g}{interval}"
-    margin = "-" if np.isnan(verdict.margin) else f"{verdict.margin:+.4g}"
-    location = verdict.worst_locations[0] if verdict.worst_locations else "none"
-    return (
-        verdict.requirement,
-        verdict.bound.text,
-        verdict.state,
-        value,
-        margin,
-        str(verdict.not_met_count),
-        str(verdict.undecided_count),
-        str(verdict.total_count),
-        str(verdict.occupied_count),
-        location,
-    )
 
 
 def check(
@@ -211,7 +47,7 @@ def check(
     Args:
         rigs: One rig or several: a `Rig`, a built-in name, or a YAML file each.
         requirements: Requirements, the name of a built-in set, or a YAML file.
-        scenario: Scenario in place of that of the requirements.
+        scenario: Scenario that replaces the scenario of the requirements.
         vehicle: Ego vehicle, as in `evaluate`; if not given, each rig is on its own vehicle.
         sensor_model: Sensor model, as in `evaluate`.
         num_frames: Number of frames, as in `evaluate` and `map_target_visibility`.
@@ -242,13 +78,7 @@ def check(
     verdicts: dict[str, list[Verdict]] = {}
     for rig in named_rigs:
         coverage = _measure_regions(
-            requirements,
-            rig,
-            scenario,
-            num_frames=num_frames,
-            num_workers=num_workers,
-            progress=progress,
-            **simulation,
+            requirements, rig, scenario, num_frames=num_frames, num_workers=num_workers, progress=progress, **simulation
         )
         readings: list[Mapping[str, Readings]] = []
         for requirement in requirements.requirements:
@@ -280,7 +110,8 @@ def _load_rigs(rigs: AnyRig | Sequence[AnyRig]) -> list[Rig]:
 
 
 def _load_targets(requirements: Requirements) -> dict[str, Target]:
-    names = [one.target for one in requirements.requirements if isinstance(one, TargetRequirement)]
+    """Load the test target of each requirement that has one."""
+    names = [item.target for item in requirements.requirements if isinstance(item, TargetRequirement)]
     return {name: Target.load(name) for name in names}
 
 
@@ -295,6 +126,7 @@ def _check_rigs(rigs: Sequence[Rig], requirements: Requirements, vehicle: str | 
 
 
 def _check_durations(requirement: EncounterRequirement, scenario: Scenario) -> None:
+    """Raise ValueError if an encounter is shorter than its required time to collision."""
     if requirement.ttc_s is None:
         return
     ego = BodyGeometry(scenario.build_ego_mesh())
@@ -332,11 +164,11 @@ def _measure_regions(
     **settings: Any,  # noqa: ANN401  (of `Settings`)
 ) -> Coverage | None:
     """Measure the coverage with all required numbers of regions; None if no region is required."""
-    region_requirements = [one for one in requirements.requirements if isinstance(one, RegionRequirement)]
+    region_requirements = [item for item in requirements.requirements if isinstance(item, RegionRequirement)]
     if not region_requirements:
         return None
     keys = {requirement.number for requirement in region_requirements}
-    thresholds_m = sorted({one.threshold_m for one in region_requirements if one.threshold_m})
+    thresholds_m = sorted({item.threshold_m for item in region_requirements if item.threshold_m})
     aggregations = [kind.from_keys(keys) for kind in AGGREGATIONS]
     needs_redundancy = any(
         requirement.failing_sensors or requirement.number.startswith(("sensors", "detected_by"))
@@ -421,7 +253,8 @@ def _measure_target(
         num_frames = usual_num_frames
     frame_interval_s = compute_frame_interval_s(scenario, None)
 
-    def survey(sensor_indices: Sequence[int]) -> PositionVisibility:
+    def measure(sensor_indices: Sequence[int]) -> PositionVisibility:
+        """Measure the visibility at all positions for some sensors."""
         return measure_visibility_at_positions(
             rig,
             scenario,
@@ -438,7 +271,7 @@ def _measure_target(
     values: dict[str, list[Float64]] = {bound.key: [] for bound in requirement.bounds}
     locations: list[str] = []
     for suffix, group in groups.items():
-        target_map = survey(group)
+        target_map = measure(group)
         is_judged = (target_map.state == 0) | (positions.points_m is not None)
         frame_counts = target_map.free_frames[is_judged].tolist()
         for (x_m, y_m), count in zip(positions_m[is_judged].tolist(), frame_counts, strict=True):
@@ -453,7 +286,7 @@ def _measure_target(
             "visual_angle_deg": unobserved,
         }
         for index in group if has_angles else ():
-            points, sensor = survey([index]).min_points, rig.sensors[index]
+            points, sensor = measure([index]).min_points, rig.sensors[index]
             angle_deg = _compute_visual_angle_deg(sensor, target, positions_m)
             angle_deg = np.where(points >= requirement.detection_points, angle_deg, 0.0)
             numbers["visual_angle_deg"] = np.fmax(numbers["visual_angle_deg"], angle_deg)
@@ -470,6 +303,7 @@ def _measure_target(
 
 
 def _format_occupancy(free_frame_count: int, num_frames: int) -> str:
+    """Format in how many frames a position is free; empty if it is free in all."""
     if free_frame_count == num_frames:
         return ""
     return f", free in {free_frame_count} of {num_frames} frames" if free_frame_count else ", occupied"

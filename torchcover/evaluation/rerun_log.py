@@ -202,6 +202,7 @@ def apply_colormap(values: NDArray[Any], scale: ColorScale) -> NDArray[np.uint8]
 
 
 def _build_boxes(boxes: Boxes) -> Any:  # noqa: ANN401
+    """Build the ground-truth boxes of a frame."""
     import rerun as rr
 
     half_yaw_rad = boxes.yaw_rad.cpu().numpy() / 2
@@ -215,4 +216,5 @@ def _build_boxes(boxes: Boxes) -> Any:  # noqa: ANN401
 
 
 def _add_zero_height(points_m: NDArray[Any]) -> NDArray[np.float64]:
+    """Append z = 0 to (N, 2) points."""
     return np.column_stack([points_m, np.zeros(len(points_m))])

@@ -22,7 +22,7 @@ from torchcover.evaluation.result_notes import (
     describe_scan_periods,
     describe_sensor_models,
 )
-from torchcover.evaluation.result_page import build_page, build_result_tables, build_sensor_views
+from torchcover.evaluation.result_page import COSTS, build_page, build_result_tables, build_sensor_views
 from torchcover.evaluation.settings import FILES, parse_file_kinds
 from torchcover.evaluation.target_error import TargetError, summarize_target_error
 from torchcover.files import AtomicOutput
@@ -46,25 +46,6 @@ from torchcover.simulation.memory import check_memory_fits
 
 if TYPE_CHECKING:
     import pandas
-
-
-@dataclass(frozen=True)
-class RenderingCosts:
-    """Cost of the page and the maps of a result, measured with 1 to 16 rigs on the default grid.
-
-    Args:
-        bytes_per_cell: Memory per cell and rig, independent of the quantities.
-        bytes_per_value: Memory per cell, rig and quantity, for the value and its standard error.
-        seconds_per_map: Time to plot one map; there are three maps per rig, height band and quantity.
-        min_announced_s: Shorter times are not announced.
-        min_announced_bytes: Less memory is not announced.
-    """
-
-    bytes_per_cell: int = 40
-    bytes_per_value: int = 20
-    seconds_per_map: float = 0.1
-    min_announced_s: float = 60.0
-    min_announced_bytes: float = 2e9
 
 
 class MetricReport(Protocol):
@@ -141,7 +122,7 @@ class Result:
 
     @property
     def is_comparison(self) -> bool:
-        """Whether the result has several rigs."""
+        """True if the result has several rigs."""
         return len(self.rigs) > 1
 
     @cached_property
@@ -289,25 +270,19 @@ class Result:
             if path.resolve().parent in output_folders:
                 raise ValueError(f"{folder}: would overwrite {path}, which is compared; choose another folder")
         with AtomicOutput(Path(folder)) as output:
-            with (
-                defer_signals()
-            ):  # the numbers are complete before a signal ends the process, and before maps are plotted
-                if "numbers" in kinds:
-                    self.add_numbers(output)
+            with defer_signals():  # a signal ends the process only after the numbers are complete
+                self.add_numbers(output, kinds)
                 record = self.record
                 output.publish(record)
             self.add_page_and_maps(output, kinds)
             output.publish(record)
         return output.paths
 
-    def estimate_rendering_cost(
-        self, file_kinds: Container[str], costs: RenderingCosts = RenderingCosts()
-    ) -> tuple[float, float]:
+    def estimate_rendering_cost(self, file_kinds: Container[str]) -> tuple[float, float]:
         """Estimate the cost of the page and the maps.
 
         Args:
             file_kinds: Requested files; only "maps" and "page" have a cost.
-            costs: Costs per cell and map.
 
         Returns:
             Memory in bytes and time in seconds.
@@ -316,21 +291,20 @@ class Result:
         num_quantities = len(list_map_quantities(self._first_coverage))
         needed_bytes = seconds = 0.0
         if "maps" in file_kinds or "page" in file_kinds:
-            bytes_per_cell = costs.bytes_per_cell + costs.bytes_per_value * num_quantities
+            bytes_per_cell = COSTS.bytes_per_cell + COSTS.bytes_per_value * num_quantities
             needed_bytes = float(num_rigs * grid.num_cells * bytes_per_cell)
         if "maps" in file_kinds:
-            seconds = 3 * costs.seconds_per_map * num_rigs * num_quantities * len(grid.heights)
+            seconds = 3 * COSTS.seconds_per_map * num_rigs * num_quantities * len(grid.heights)
         return needed_bytes, seconds
 
-    def describe_rendering_cost(self, file_kinds: str | Iterable[str], costs: RenderingCosts = RenderingCosts()) -> str:
+    def describe_rendering_cost(self, file_kinds: str | Iterable[str]) -> str:
         """Describe the cost of the page and the maps in one sentence; empty if it is small.
 
         Args:
             file_kinds: Requested files, as in `save`.
-            costs: Costs per cell and map, and when they are small.
         """
-        needed_bytes, seconds = self.estimate_rendering_cost(parse_file_kinds(file_kinds), costs)
-        if needed_bytes < costs.min_announced_bytes and seconds < costs.min_announced_s:
+        needed_bytes, seconds = self.estimate_rendering_cost(parse_file_kinds(file_kinds))
+        if needed_bytes < COSTS.min_announced_bytes and seconds < COSTS.min_announced_s:
             return ""
         return (
             f"page and maps of {len(self.coverages)} rigs take about {needed_bytes / 1e9:.2g} GB of memory and "
@@ -357,13 +331,16 @@ class Result:
             for stem, figure in self.plot_maps():
                 output.add_figure(f"{folder}maps/{stem}.png", figure)
 
-    def add_numbers(self, output: AtomicOutput, folder: str = "") -> None:
-        """Write the coverages, `summary.csv` and the files of the published metrics.
+    def add_numbers(self, output: AtomicOutput, file_kinds: Container[str], folder: str = "") -> None:
+        """Write the coverages, `summary.csv` and the files of the published metrics if they are requested.
 
         Args:
             output: Output folder.
+            file_kinds: Requested files.
             folder: Prefix of the file names; it ends with a slash.
         """
+        if "numbers" not in file_kinds:
+            return
         names = [f"{folder}coverage.npz"]
         if self.is_comparison:
             names = [f"{folder}coverage/{stem}.npz" for stem in build_file_stems(list(self.coverages))]
@@ -375,14 +352,17 @@ class Result:
                 output.add_text(f"{folder}{name}", text)
 
     def _summarize_target_error(self) -> tuple[dict[str, Any] | None, list[str]]:
+        """Summarize the achieved errors as a record and as lines of text."""
         is_confirmed = self.run is not None and self.run.is_target_reached
         return summarize_target_error(self.target_error, self.coverages, self.target_regions, is_confirmed=is_confirmed)
 
     @property
     def _first_coverage(self) -> Coverage:
+        """Coverage of the first rig, with which the others are compared."""
         return next(iter(self.coverages.values()))
 
     def _build_run_record(self) -> dict[str, Any]:
+        """Build the part of the record that describes the run; None for saved results."""
         run = self.run
         if run is None:
             return dict.fromkeys(("duration_s", "complete", "frame_counts", "skipped_frames", "omissions"))
@@ -396,14 +376,18 @@ class Result:
 
     @property
     def _title(self) -> str:
+        """First line of texts about the result."""
         cut_short = ", cut short" if self.run is not None and not self.run.is_complete else ""
         return f"Result of {', '.join(self.coverages)}: {self._first_coverage.counts['num_frames']} frames{cut_short}"
 
     def _repr_html_(self) -> str:
+        """Show title, findings and one map in notebooks."""
         return build_result_html([self._title, *self.verdict], self.plot() if self.coverages else None)
 
     def __repr__(self) -> str:
+        """Return title and findings."""
         return "\n".join([self._title, *self.verdict])
 
     def __str__(self) -> str:
+        """Return title and coverage table."""
         return f"{self._title}\n{RENDERERS['text'](self.table)}"

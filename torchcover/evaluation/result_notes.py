@@ -180,6 +180,7 @@ def _get_scan_period_s(sensor: Sensor) -> float:
 
 
 def _describe_test_targets(result: "Result") -> list[str]:
+    """Describe where test targets were placed, or why a recording has none."""
     target_sums = next(iter(result.coverages.values())).target_sums
     if target_sums is not None:
         num_frames = int(target_sums.frame_counts.sum())
@@ -218,5 +219,6 @@ def _describe_repeated_frames(run: "Run", *, has_errors: bool) -> list[str]:
 
 
 def _has_errors(result: "Result") -> bool:
+    """Test whether there are enough blocks for confidence intervals."""
     block_sums: Any = next(iter(result.coverages.values())).block_sums
     return block_sums is not None and int((block_sums.frame_counts > 0).sum()) >= MIN_BLOCKS

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 import shapely
@@ -39,7 +40,11 @@ PARAMS = SceneFigureParams()
 
 
 def list_cameras(rig: Rig) -> list[CameraSensor]:
-    """List the cameras of a rig."""
+    """List the cameras of a rig.
+
+    Args:
+        rig: The rig.
+    """
     return [sensor for sensor in rig.sensors if isinstance(sensor, CameraSensor)]
 
 
@@ -137,12 +142,15 @@ def plot_vehicle_figure(vehicle: Vehicle) -> Figure:
 
 
 def _build_patch(name: str, region: MountRegion, skin: Skin) -> SkinPatch:
+    """Sample the surface of a mount region."""
     shares = np.linspace(0.0, 1.0, PARAMS.patch_points).tolist()
+    points_m = []
     try:
-        points_m = [[region.find_mount_point(skin, u, v).position_m for v in shares] for u in shares]
+        for u, v in product(shares, shares):
+            points_m.append(region.find_mount_point(skin, u, v).position_m)
     except ValueError as error:
         raise ValueError(f"mount region {name!r}: {error}") from error
-    return SkinPatch(name, region.side, np.array(points_m))
+    return SkinPatch(name, region.side, np.reshape(points_m, (len(shares), len(shares), 3)))
 
 
 def _create_frames(scenario: Scenario, rig: Rig, vehicle: str | None, last_frame: int, seed: int) -> SimulatedFrames:

@@ -26,7 +26,7 @@ from torchcover.evaluation.task import build_simulation_task
 from torchcover.files import AtomicOutput, end_with_parent, report_stopped_processes
 from torchcover.report import (
     PageTable,
-    TextCell,
+    build_text_cells,
     format_difference,
     format_difference_heading,
     format_error,
@@ -94,7 +94,7 @@ class Study:
             texts = [trial.options or BASELINE, frame_ms, frame_cpu_ms, _format_largest_bias(trial)]
             for error in self.plan.params.target_errors:
                 texts.append(_format_frames(trial, trial.estimate_num_frames(error), self.startup_s))
-            rows.append([TextCell(text) for text in texts])
+            rows.append(build_text_cells(*texts))
         return PageTable(
             "Standard error of all detection rates in front of the vehicle, in percentage points",
             ("setting", "frame (ms)", "CPU time (ms)", "bias (points)", *self._list_frames_headings()),
@@ -115,7 +115,7 @@ class Study:
                 if num_frames is not None:
                     num_frames = round_up_frames(max(num_frames, baseline.min_frames))
                 texts.append(_format_frames(baseline, num_frames, self.startup_s))
-            rows.append([TextCell(text) for text in texts])
+            rows.append(build_text_cells(*texts))
         headings = ("region", "number", f"error after {baseline.num_frames:,}", *self._list_frames_headings())
         return PageTable(f"Numbers, {BASELINE}", headings, rows)
 

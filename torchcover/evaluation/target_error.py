@@ -5,6 +5,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import groupby
+from operator import attrgetter
 from typing import Any
 
 from torchcover.coverage import Coverage, Region, list_region_bands
@@ -105,7 +106,7 @@ class ConvergenceStatus:
 
     @property
     def is_reached(self) -> bool:
-        """Whether the error is small enough, and from enough frames to be reliable."""
+        """True if the error is small enough, and from enough frames to be reliable."""
         return self.num_frames >= MIN_FRAMES and self.error <= self.target
 
     @property
@@ -222,7 +223,7 @@ class TargetErrorRule:
             return False
         coverages = {name: observer.compute() for name, observer in self.observers.items()}
         statuses = compute_convergence(self.target, coverages, self.regions)
-        self.worst = max(statuses, key=lambda status: status.excess, default=None)
+        self.worst = max(statuses, key=attrgetter("excess"), default=None)
         is_successful = self.worst is not None and self.worst.is_reached
         self._num_successful_checks = self._num_successful_checks + 1 if is_successful else 0
         if self._num_successful_checks >= self._params.num_confirmations:
@@ -267,6 +268,7 @@ class TargetErrorRule:
 
 
 def _format_error(error: float, quantity: str) -> str:
+    """Format a standard error with its unit."""
     return f"{error:.2g} m" if quantity == "radius_m" else f"{100 * error:.2g} %"
 
 
@@ -292,13 +294,16 @@ def summarize_target_error(
     if unobserved:
         lines.append(f"Not part of the target, as none of its cells is observed: {', '.join(unobserved)}.")
     # A standard error of 0 is no evidence: it only means that all blocks have the same value.
-    constant = [f"{one.region} {one.band}, {one.quantity} of {one.rig}" for one in statuses if one.error <= ROUND_OFF]
+    constant = [
+        f"{item.region} {item.band}, {item.quantity} of {item.rig}" for item in statuses if item.error <= ROUND_OFF
+    ]
     if constant:
         lines.append(f"Not part of the target, as all frames have the same value: {'; '.join(constant)}.")
     return {**_build_record(target, statuses), "reached": is_confirmed, "unobserved": unobserved}, lines
 
 
 def _build_record(target: TargetError, statuses: Sequence[ConvergenceStatus]) -> dict[str, Any]:
+    """Build the JSON record of all numbers with their errors and needed frames."""
     frames_needed, numbers = [], []
     for status in statuses:
         frames_needed.append(status.frames_needed)
@@ -306,9 +311,9 @@ def _build_record(target: TargetError, statuses: Sequence[ConvergenceStatus]) ->
         del record["num_frames"]
         record |= {"is_reached": status.is_reached, "frames_needed": status.frames_needed}
         numbers.append(to_json_record(record))
-    known = [num_frames for num_frames in frames_needed if num_frames is not None]
-    all_known = bool(known) and len(known) == len(frames_needed)
-    return {**asdict(target), "frames_needed": max(known) if all_known else None, "numbers": numbers}
+    known_frames = [num_frames for num_frames in frames_needed if num_frames is not None]
+    all_known = bool(known_frames) and len(known_frames) == len(frames_needed)
+    return {**asdict(target), "frames_needed": max(known_frames) if all_known else None, "numbers": numbers}
 
 
 def _describe_convergence(statuses: Sequence[ConvergenceStatus], num_frames: int, *, is_confirmed: bool) -> list[str]:
@@ -321,8 +326,8 @@ def _describe_convergence(statuses: Sequence[ConvergenceStatus], num_frames: int
     if all(status.is_reached for status in statuses):
         return [f"{outcome}: every error is small enough, but not yet at two consecutive checks; use more frames."]
     lines = [f"{outcome}; the largest error of each region:"]
-    for (region, band), group in groupby(statuses, key=lambda status: (status.region, status.band)):
-        worst = max(group, key=lambda status: status.excess)
+    for (region, band), group in groupby(statuses, key=attrgetter("region", "band")):
+        worst = max(group, key=attrgetter("excess"))
         location = f"  {region} {band}, {worst.quantity} of {worst.rig}"
         if worst.frames_needed is None:
             lines.append(f"{location}: not enough frames for an error")

@@ -18,7 +18,7 @@ from torchcover.report import (
     PageRig,
     PageTable,
     TargetVisibilityMap,
-    TextCell,
+    build_text_cells,
     capitalize,
     format_percent,
     format_square_meters,
@@ -142,7 +142,7 @@ def summarize_target_maps(target_maps: Mapping[str, TargetMap]) -> tuple[str, ..
     if not shares:
         return (f"No position {within} is free, so detection there is unknown.",)
     best_first = sorted(shares, key=lambda rig: -shares[rig])
-    texts = []
+    texts: list[str] = []
     for percent, rigs in groupby(best_first, lambda rig: format_whole_percent(shares[rig])):
         positions = "" if texts else f" of the positions {within}"
         texts.append(f"at {percent} %{positions} by {', '.join(rigs)}")
@@ -170,6 +170,7 @@ def _describe_failures(rig: str, target_map: TargetMap) -> str:
 
 
 def _build_maps(target_map: TargetMap) -> list[PageMap]:
+    """Build the maps of points, detection, visible surface and detecting sensors."""
     positive_points = target_map.points[target_map.points > 0]
     max_points = 10.0
     if len(positive_points):
@@ -223,7 +224,7 @@ def build_sides_table(target_map: TargetMap) -> PageTable:
                 texts.append(format_percent(side.detected_share) if side.free_cells else "-")
         undetected_m = max_undetected_m[name]
         texts.append("-" if np.isnan(undetected_m) else f"{undetected_m:.2f}" if undetected_m else "nowhere")
-        rows.append([TextCell(text) for text in texts])
+        rows.append(build_text_cells(*texts))
     headings = ["side", *[f"within {distance_m:g} m\n(%)" for distance_m in max_distances_m], "undetected up to\n(m)"]
     mean = ", mean over the frames" if target_map.num_frames > 1 else ""
     return PageTable(f"Free positions with {target_map.detection_points} points or more{mean}", headings, rows)
@@ -242,5 +243,5 @@ def build_positions_table(positions: Sequence[TargetPosition], title: str) -> Pa
         lengths = [f"{length_m:.2f}" for length_m in (position.x_m, position.y_m, position.distance_m)]
         points, sensors = f"{position.points:.4g}", f"{position.detecting_sensors:.3g}"
         texts = [position.side, *lengths, points, sensors, format_percent(position.surface_share)]
-        rows.append([TextCell(text) for text in texts])
+        rows.append(build_text_cells(*texts))
     return PageTable(title, headings, rows)

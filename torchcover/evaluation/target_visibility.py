@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 from torchcover.evaluation.progress import defer_signals
+from torchcover.evaluation.rig_names import AnyRig, load_named_rig
 from torchcover.evaluation.settings import FILES, parse_file_kinds
 from torchcover.evaluation.target_page import build_target_page, build_target_record
-from torchcover.evaluation.task import AnyRig, AnyScenario, compute_frame_interval_s, load_named_rig
+from torchcover.evaluation.task import AnyScenario, compute_frame_interval_s
 from torchcover.files import AtomicOutput
 from torchcover.report import render_page
 from torchcover.simulation import Rig, Scenario, Sensor, set_ego
@@ -74,7 +75,7 @@ def load_rig_and_scenario(
     Args:
         rig: The rig, a built-in name, or a YAML file.
         scenario: The scenario, a built-in name or a YAML file; flat ground if None.
-        vehicle: Vehicle that carries the rig; None for that of the scenario or the rig.
+        vehicle: Vehicle that carries the rig; None for the vehicle of the scenario or the rig.
         sensor_model: Sensor model; None for the default of the rig.
 
     Returns:

@@ -18,6 +18,7 @@ from torchcover.coverage import Region
 from torchcover.evaluation.config import DESCRIPTIONS
 from torchcover.evaluation.observers import AnyObserver
 from torchcover.evaluation.progress import show_wait
+from torchcover.evaluation.rig_names import AnyRig, format_rig_source, is_rig_document, load_rig, make_rig_names
 from torchcover.evaluation.settings import DEFAULT_NUM_FRAMES, MAX_NUM_FRAMES, Settings
 from torchcover.frames import FrameSource, RigSubset
 from torchcover.recordings import RecordedFrames, open_recording
@@ -30,7 +31,6 @@ from torchcover.simulation import (
     SimulatedFrames,
     Weather,
     create_reference_sensor,
-    list_builtin_names,
     set_ego,
 )
 from torchcover.simulation.recorded_rig import build_ego_box
@@ -38,31 +38,18 @@ from torchcover.simulation.regions_of_interest import DEFAULT_BAND_FRAME
 from torchcover.simulation.scenario import ROOM_M
 from torchcover.simulation.simulated_frames import DEFAULT_REFERENCE
 
-AnyRig = Rig | str | Path
 AnyScenario = Scenario | str | Path
 SourceT = TypeVar("SourceT", bound=FrameSource, covariant=True)
 
 # Stack level of warnings that point to the call of `evaluate`.
 CALLER = 4
-# Settings that are not part of the identity of a run: frames, query plan and observers describe their effect, or they do
-# not change the result.
-NOT_IN_IDENTITY = frozenset(
-    [
-        *(
-            "scenario",
-            "seed",
-            "vehicle",
-            "reference",
-            "num_rays",
-            "frame_interval_s",
-            "regions",
-            "cell_m",
-            "band_frame",
-        ),
-        *("sensor_model", "weather", "metrics", "num_frames", "device", "num_workers", "no_cache", "skip_bad_frames"),
-        *("recording", "rerun"),
-    ]
-)
+# Settings that are not part of the identity of a run: frames, query plan and observers describe their effect, or they
+# do not change the result.
+NOT_IN_IDENTITY = frozenset((
+    "scenario", "seed", "vehicle", "reference", "num_rays", "frame_interval_s", "regions", "cell_m", "band_frame",
+    "sensor_model", "weather", "metrics", "num_frames", "device", "num_workers", "no_cache", "skip_bad_frames",
+    "recording", "rerun",
+))  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -157,6 +144,7 @@ def build_task(settings: Settings) -> Task[FrameSource]:
 
 
 def _open_frames(frames: FrameSource | str | Path, settings: Settings) -> FrameSource:
+    """Open a recording, or return the frames of the user."""
     if not isinstance(frames, str | Path):
         return frames
     recording = open_recording(frames)
@@ -291,6 +279,7 @@ def _limit_frames(frames: SimulatedFrames, settings: Settings) -> int | None:
 
 
 def _build_recording_task(frames: FrameSource, settings: Settings) -> Task[FrameSource]:
+    """Build the task of a recording or of another source of frames."""
     names = make_rig_names(settings.rigs or list(frames.rigs))
     is_single = len(names) == len(frames.rigs) == 1  # the only rig of a recording may have any name
     recorded_names = frames.rigs if is_single else names
@@ -333,9 +322,9 @@ def compute_frame_interval_s(
 ) -> float:
     """Compute the time between two frames.
 
-    Without a given value it is 10 s in traffic. Otherwise it is a multiple of the time step that is coprime to the number
-    of time steps and close to the golden ratio. Any number of frames is then spread evenly over the scenario, and no
-    time step is repeated before all have been used.
+    Without a given value it is 10 s in traffic. Otherwise it is a multiple of the time step that is coprime to the
+    number of time steps and close to the golden ratio. Any number of frames is then spread evenly over the scenario,
+    and no time step is repeated before all have been used.
 
     Args:
         scenario: The scenario.
@@ -352,89 +341,8 @@ def compute_frame_interval_s(
     return min(coprime, key=lambda stride: abs(stride - golden)) * scenario.effective_time_step_s
 
 
-def make_rig_names(rigs: Sequence[AnyRig]) -> list[str]:
-    """Make the names of rigs in tables and files, numbered where two would be equal.
-
-    Args:
-        rigs: Rigs, names or paths.
-    """
-    return make_unique_names([_get_name(rig) for rig in rigs])
-
-
-def make_unique_names(stems: Sequence[str]) -> list[str]:
-    """Make names unique, also on file systems that ignore case, by numbers.
-
-    Args:
-        stems: Names.
-
-    Example:
-        >>> make_unique_names(["roof", "Roof", "grille"])
-        ['roof', 'Roof_2', 'grille']
-    """
-    names: list[str] = []
-    for stem in stems:
-        used_names = {name.lower() for name in names}
-        name, number = stem, 2
-        while name.lower() in used_names:
-            name, number = f"{stem}_{number}", number + 1
-        names.append(name)
-    return names
-
-
-def load_rig(rig: AnyRig) -> Rig:
-    """Load a rig.
-
-    Args:
-        rig: A rig, built-in name or YAML file.
-
-    Raises:
-        FileNotFoundError: Unknown file or built-in name.
-        ValueError: The file is not a rig.
-    """
-    return rig if isinstance(rig, Rig) else Rig.load(rig)
-
-
-def load_named_rig(rig: AnyRig) -> Rig:
-    """Load a rig under the name that tables and files of every command have for it.
-
-    Args:
-        rig: A rig, built-in name or YAML file.
-
-    Raises:
-        FileNotFoundError: Unknown file or built-in name.
-        ValueError: The file is not a rig.
-    """
-    return load_rig(rig).model_copy(update={"name": _get_name(rig)})
-
-
-def is_rig_document(rig: AnyRig) -> bool:
-    """Test whether a rig is more than a name of a recording: a `Rig`, a YAML file or a built-in name.
-
-    Args:
-        rig: A rig, name or path.
-    """
-    return isinstance(rig, Rig) or _is_file(rig) or str(rig) in list_builtin_names("rigs")
-
-
-def format_rig_source(rig: AnyRig) -> str:
-    """Format the name or path that the user gave for a rig.
-
-    Args:
-        rig: A rig, name or path.
-    """
-    return rig.name if isinstance(rig, Rig) else str(rig)
-
-
-def _get_name(rig: AnyRig) -> str:
-    return load_rig(rig).name if isinstance(rig, Rig) or _is_file(rig) else str(rig)
-
-
-def _is_file(rig: str | Path) -> bool:
-    return Path(rig).suffix in (".yaml", ".yml")
-
-
 def build_run_identity(
-    task: Task[FrameSource], settings: Settings, others: Mapping[str, AnyObserver], num_ranks: int = 1
+    task: Task[FrameSource], settings: Settings, observers: Mapping[str, AnyObserver], num_ranks: int = 1
 ) -> dict[str, str]:
     """Describe everything that the sums of a run depend on; checkpoints of another identity are refused.
 
@@ -443,13 +351,13 @@ def build_run_identity(
     Args:
         task: Frames, rigs and regions.
         settings: Settings of `evaluate`.
-        others: Observers besides coverage.
+        observers: Name -> observer besides coverage.
         num_ranks: Number of ranks, each of which has its own share of the frames.
 
     Returns:
         Name -> JSON text; a hash replaces long texts.
     """
-    kinds = {name: f"{type(one).__module__}.{type(one).__qualname__}" for name, one in others.items()}
+    kinds = {name: f"{type(value).__module__}.{type(value).__qualname__}" for name, value in observers.items()}
     grid = task.query_plan.grid
     identity = {
         "torchcover": __version__,
@@ -468,5 +376,6 @@ def build_run_identity(
 
 
 def _encode(value: object, max_length: int = 40) -> str:
+    """Encode a value as JSON text; a hash replaces long texts."""
     text = json.dumps(value, sort_keys=True, default=repr)
     return text if len(text) <= max_length else f"#{hashlib.sha256(text.encode()).hexdigest()}"

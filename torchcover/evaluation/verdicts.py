@@ -63,7 +63,8 @@ class Verdict(NamedTuple):
         value: Worst known value.
         low: Lower end of its 95 % confidence interval.
         high: Upper end.
-        margin: Distance from the bound to the worst value in its unit; negative if the bound is not met, NaN if not decided.
+        margin: Distance from the bound to the worst value in its unit; negative if the bound is not met, NaN if not
+            decided.
         total_count: Number of positions, regions or encounters.
         not_met_count: How many of them do not meet the bound.
         undecided_count: How many are not decided.

@@ -12,7 +12,8 @@ from torchcover.coverage import Average
 from torchcover.estimation import Estimate
 from torchcover.evaluation import CoverageObserver
 from torchcover.evaluation.cpu_cores import get_start_method
-from torchcover.evaluation.pipeline import FramesOrErrors, MeasuredFrame, find_killed_worker, iterate_batches
+from torchcover.evaluation.frame_workers import FramesOrErrors, find_killed_worker, iterate_batches
+from torchcover.evaluation.pipeline import MeasuredFrame
 from torchcover.frames import Frame
 from torchcover.placement.host_vehicle import HostVehicle
 from torchcover.placement.objective import Objective

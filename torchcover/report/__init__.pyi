@@ -54,6 +54,7 @@ from .table_layout import BOLD_MARKS as BOLD_MARKS
 from .table_layout import PageTable as PageTable
 from .table_layout import TextCell as TextCell
 from .table_layout import build_page_tables as build_page_tables
+from .table_layout import build_text_cells as build_text_cells
 from .table_notes import TableNote as TableNote
 from .table_notes import collect_table_notes as collect_table_notes
 from .table_notes import describe_range as describe_range

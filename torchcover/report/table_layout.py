@@ -43,6 +43,15 @@ class TextCell(NamedTuple):
     mark: str = ""
 
 
+def build_text_cells(*texts: str) -> tuple[TextCell, ...]:
+    """Build the cells of a row without marks.
+
+    Args:
+        texts: Text of each cell.
+    """
+    return tuple(TextCell(text) for text in texts)
+
+
 @dataclass(frozen=True)
 class PageTable:
     """Table of text.
@@ -137,7 +146,7 @@ def _build_failure_rows(table: CoverageTable, rig: str) -> PageTable:
             texts = [row.summary.region, row.summary.band]
             texts += [cell[0] if index == 0 else "" for cell in cells[: min(num_redundancy_columns, 1)]]
             change = TextCell(text, "significant" if is_significant else "")
-            rows.append([*(TextCell(text) for text in (*texts, sensor)), change])
+            rows.append([*build_text_cells(*texts, sensor), change])
     redundancy_headings = ["detecting\nsensors"][:num_redundancy_columns]
     headings = [*REGION_HEADINGS, *redundancy_headings, "without", "change"]
     return PageTable(format_failure_title(table, rig), headings, rows, len(REGION_HEADINGS))

@@ -11,7 +11,7 @@ from torchcover.report.number_format import UNKNOWN, format_number, format_squar
 from torchcover.report.overlay import SensorView, get_sensor_color
 from torchcover.report.page.content import Array, DetectionShares, TargetVisibilityMap
 from torchcover.report.table import CoverageTable
-from torchcover.report.table_layout import PageTable, TextCell
+from torchcover.report.table_layout import PageTable, build_text_cells
 from torchcover.report.table_notes import describe_criterion, describe_surface, get_main_quantity
 
 MAP_MARGIN_M = 3.4  # width of the map of test targets around the vehicle
@@ -183,16 +183,8 @@ def build_sensor_table(sensors: Sequence[SensorView]) -> PageTable:
         position = ", ".join(f"{value:.2f}" for value in view.position_m)
         low, high = view.vertical_fov_deg
         angles = ", ".join(f"{round(angle, 1) + 0.0:.1f}" for angle in (view.yaw_deg, *view.tilt_deg))
-        rows.append(
-            (
-                TextCell(f"{index + 1}  {view.name}"),
-                TextCell(position),
-                TextCell(angles),
-                TextCell(f"{view.horizontal_fov_deg:.1f}"),
-                TextCell(f"{low:.1f} to {high:.1f}"),
-                TextCell(f"{view.range_m:g}"),
-            )
-        )
+        extents = f"{view.horizontal_fov_deg:.1f}", f"{low:.1f} to {high:.1f}", f"{view.range_m:g}"
+        rows.append(build_text_cells(f"{index + 1}  {view.name}", position, angles, *extents))
     return PageTable("", headings, rows)
 
 

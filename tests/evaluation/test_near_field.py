@@ -1,4 +1,4 @@
-"""Bodies beside the vehicle in a run: rows, files, comparisons, mixtures, other processes; and not in recordings."""
+"""Test targets in the near field of a run: rows, files, comparisons, mixtures and workers."""
 
 import csv
 import json
@@ -42,24 +42,24 @@ def both():
     return evaluate(RIGS, yard("yard"), **SMALL)
 
 
-def of_bodies(result, **wanted):
+def select_target_rows(result, **values):
     rows = [row for row in result.summary if row["average"] == "target_positions"]
-    return [row for row in rows if all(row[name] == value for name, value in wanted.items())]
+    return [row for row in rows if all(row[name] == value for name, value in values.items())]
 
 
-def test_rows_of_bodies_take_the_place_of_those_of_traffic_in_the_near_field(both):
+def test_near_field_rows_are_about_test_targets(both):
     near = [(row["region"], row["band"]) for row in both.summary if row["rig"] == "roof" and row["region"] in SIDES]
     bands = [(region, "ground") for region in SIDES if (region, "ground") in near]
     assert near == [*bands, *((region, "pole_100cm") for region in SIDES)]
-    for row in of_bodies(both):
+    for row in select_target_rows(both):
         assert 0 < row["observed_cells"] <= row["cells"] == 8 * 3
         assert 0 <= row["target_surface_0.4m"] <= 1
         assert (row["radius_m"], row["z_min_m"]) == (None, None)
-    (roof,), (grille,) = (of_bodies(both, rig=name, region="front_3m") for name in ("roof", "grille"))
+    (roof,), (grille,) = (select_target_rows(both, rig=name, region="front_3m") for name in ("roof", "grille"))
     assert grille["target_positions_5_points_difference"] == pytest.approx(
         grille["target_positions_5_points"] - roof["target_positions_5_points"]
     )
-    (front,) = of_bodies(both, rig="grille", region="front_3m")
+    (front,) = select_target_rows(both, rig="grille", region="front_3m")
     assert (
         0
         <= front["target_positions_5_points_low"]
@@ -73,39 +73,43 @@ def test_rows_of_bodies_take_the_place_of_those_of_traffic_in_the_near_field(bot
     assert "free positions" in evaluate(RIGS[0], yard("yard"), **{**SMALL, "num_frames": 1}).tables[1].headings
 
 
-def test_files_keep_them_and_compare_reads_them(both, tmp_path):
+def test_files_contain_test_targets_for_comparisons(both, tmp_path):
     both.save(tmp_path)
-    again = compare([tmp_path / "coverage" / "roof.npz", tmp_path / "coverage" / "grille.npz"])
-    assert of_bodies(again) == [{**row, "vehicle": None, "sensor_model": None} for row in of_bodies(both)]
+    compared = compare([tmp_path / "coverage" / "roof.npz", tmp_path / "coverage" / "grille.npz"])
+    assert select_target_rows(compared) == [
+        {**row, "vehicle": None, "sensor_model": None} for row in select_target_rows(both)
+    ]
     loaded = Coverage.load(tmp_path / "coverage" / "roof.npz")
     scalars = both.coverages["roof"].scalars()
     assert loaded.scalars() == pytest.approx(scalars, rel=0, abs=0, nan_ok=True)
     assert (
         scalars["target_positions_5_points/left_3m/pole_100cm"]
-        == of_bodies(both, rig="roof")[2]["target_positions_5_points"]
+        == select_target_rows(both, rig="roof")[2]["target_positions_5_points"]
     )
     rows = list(csv.DictReader((tmp_path / "summary.csv").read_text().splitlines()))
     assert [row["region"] for row in rows if row["band"] == "pole_100cm"] == SIDES * 2
     assert json.loads((tmp_path / "summary.json").read_text())["rows"] == both.summary
-    assert [one.band for one in both.page.maps].count("pole_100cm") == 2
+    assert [page_map.band for page_map in both.page.maps].count("pole_100cm") == 2
     without = evaluate(RIGS[1], yard("yard"), **{**SMALL, "num_frames": 1, "test_targets": "none"})
-    assert of_bodies(without) == []
+    assert select_target_rows(without) == []
     with pytest.raises(ValueError, match="they were measured with different test targets"):
         _ = compare([both, without]).table
 
 
-def test_workers_and_checkpoints_change_no_bit(both, tmp_path):
+def test_workers_and_checkpoints_change_no_number(both, tmp_path):
     path = tmp_path / "run.npz"
     evaluate(RIGS, yard("yard"), checkpoint=Checkpoint(path, keep=True), **{**SMALL, "num_frames": 14})
     resumed = evaluate(RIGS, yard("yard"), checkpoint=Checkpoint(path), **SMALL)
-    assert of_bodies(resumed) == of_bodies(both)
-    assert of_bodies(evaluate(RIGS, yard("yard"), **{**SMALL, "num_workers": 2})) == of_bodies(both)
+    assert select_target_rows(resumed) == select_target_rows(both)
+    assert select_target_rows(evaluate(RIGS, yard("yard"), **{**SMALL, "num_workers": 2})) == select_target_rows(both)
 
 
 def test_a_mixture_is_the_weighted_mean(both):
     other = evaluate(RIGS, yard("other"), **{**SMALL, "seed": 1})
     mixed = MixedResult.from_results({"yard": both, "road_user": other}, {"yard": 0.75, "road_user": 0.25})
-    for row, first, second in zip(of_bodies(mixed), of_bodies(both), of_bodies(other), strict=True):
+    for row, first, second in zip(
+        select_target_rows(mixed), select_target_rows(both), select_target_rows(other), strict=True
+    ):
         value = 0.75 * first["target_positions_5_points"] + 0.25 * second["target_positions_5_points"]
         assert row["target_positions_5_points"] == pytest.approx(value)
         assert row["observed_cells"] == first["observed_cells"] + second["observed_cells"]
@@ -114,16 +118,16 @@ def test_a_mixture_is_the_weighted_mean(both):
         _ = MixedResult.from_results({"yard": both, "road_user": without}, {"yard": 0.75, "road_user": 0.25})
 
 
-def test_who_asks_about_other_regions_asks_for_bodies_by_name_or_has_none():
-    asked = RegionsOfInterest(regions={"ahead": {"x_m": (2.0, 22.0), "y_m": (-8.0, 8.0)}})
-    few = {**SMALL, "num_frames": 1, "regions": asked}
-    assert {row["region"] for row in of_bodies(evaluate(RIGS[0], yard("yard"), **few))} == set(SIDES)
-    assert of_bodies(evaluate(RIGS[0], yard("yard"), **{**few, "test_targets": None})) == []
+def test_own_regions_need_named_test_targets():
+    regions = RegionsOfInterest(regions={"ahead": {"x_m": (2.0, 22.0), "y_m": (-8.0, 8.0)}})
+    settings = {**SMALL, "num_frames": 1, "regions": regions}
+    assert {row["region"] for row in select_target_rows(evaluate(RIGS[0], yard("yard"), **settings))} == set(SIDES)
+    assert select_target_rows(evaluate(RIGS[0], yard("yard"), **{**settings, "test_targets": None})) == []
 
 
 @pytest.mark.parametrize(
-    ("probe", "message"), [(["none", "child"], "none, or targets"), (["child", "child_110cm"], "twice")]
+    ("test_targets", "message"), [(["none", "child"], "none, or targets"), (["child", "child_110cm"], "twice")]
 )
-def test_bodies_that_make_no_sense_are_refused(probe, message):
+def test_invalid_test_targets_are_rejected(test_targets, message):
     with pytest.raises(ValueError, match=message):
-        evaluate(RIGS[0], yard("yard"), **{**SMALL, "test_targets": probe})
+        evaluate(RIGS[0], yard("yard"), **{**SMALL, "test_targets": test_targets})

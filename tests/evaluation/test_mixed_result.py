@@ -208,7 +208,7 @@ def test_missing_packages_are_reported_before_the_run(yards, monkeypatch):
         evaluate(RIGS[0], [str(yards / "near.yaml"), "sumo_random"], **SMALL)
 
 
-def test_a_file_name_with_a_comma_is_one_scenario(yards, monkeypatch):
+def test_file_names_with_commas_are_one_scenario(yards, monkeypatch):
     monkeypatch.chdir(yards)
     (yards / "a,b=c.yaml").write_text((yards / "near.yaml").read_text())
     assert Settings(RIGS[0], "a,b=c.yaml").mixture is None
