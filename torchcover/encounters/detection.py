@@ -97,8 +97,10 @@ class MountedRig:
             sensors = []
             for sensor in self.rig.sensors:
                 # Without the durations of scans, all rays of a scan are cast at the same time.
-                has_scan = getattr(sensor, "scan", None) is not None
-                sensors.append(sensor.model_copy(update={"scan": None}) if has_scan else sensor)  # type: ignore[attr-defined]
+                if getattr(sensor, "scan", None) is None:
+                    sensors.append(sensor)
+                else:
+                    sensors.append(sensor.model_copy(update={"scan": None}))  # type: ignore[attr-defined]
             rig = self.rig.model_copy(update={"sensors": sensors, "weather": weather})
             self._sensors_by_weather[key] = mount_sensors(scene, self._scenario, self.rig.name, rig)
         return self._sensors_by_weather[key]
@@ -124,8 +126,7 @@ class MountedRig:
     @cached_property
     def beams(self) -> Sequence[SensorBeams | None]:
         """Beams of each sensor; the sensors must be mounted."""
-        mounted_sensors = next(iter(self._sensors_by_weather.values()))
-        return [SensorBeams.from_sensor(mounted_sensor) for mounted_sensor in mounted_sensors]
+        return [SensorBeams.from_sensor(sensor) for sensor in next(iter(self._sensors_by_weather.values()))]
 
 
 def detect_encounter(
@@ -159,8 +160,7 @@ def detect_encounter(
     mounted_rig.check_rates(criterion.consecutive_scans, staged)
 
     def find_first(is_detected: DetectionTest, sensor_index: int) -> Int64:
-        rate_hz = sensors[sensor_index].rate_hz
-        scan_frames = compute_scan_frames(rate_hz, num_start_offsets, staged.contact_time_s)
+        scan_frames = compute_scan_frames(sensors[sensor_index].rate_hz, num_start_offsets, staged.contact_time_s)
         return find_first_run(is_detected, scan_frames, criterion.consecutive_scans)
 
     detection_frames = find_detection_frames(
@@ -376,13 +376,12 @@ class EncounterPointCounter:
         points = np.zeros(len(poses), dtype=np.int64)
         for position, frame_index in enumerate(frame_indices.tolist()):
             frame_hits = slice(first_hits[position], first_hits[position + 1])
-            hits = TargetHits._make(column[frame_hits] for column in all_hits)
-            if len(hits.ray_indices) == 0:
+            if frame_hits.start == frame_hits.stop:
                 continue
-            num_rays = len(max_ranges_m)
-            ray_ends = self._compute_ray_ends(sensor_index, frame_index, hits, num_rays)
+            hits = TargetHits._make(column[frame_hits] for column in all_hits)
+            ray_ends = self._compute_ray_ends(sensor_index, frame_index, hits, len(max_ranges_m))
             rng = np.random.default_rng([self._seed, frame_index, sensor_index])
-            sensor_frame = SensorFrame(ray_ends, SensorNoise(rng, num_rays=num_rays))
+            sensor_frame = SensorFrame(ray_ends, SensorNoise(rng, num_rays=len(max_ranges_m)))
             measured = find_measured_hits(mounted_sensor, beams, hits, sensor_frame, bodies, max_error_m)
             points[position] = mounted_sensor.sensor.pixels_per_sample * len(measured)
         return points

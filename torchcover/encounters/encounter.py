@@ -369,7 +369,8 @@ def sample_range(
     if low >= high:
         raise ValueError(f"{format_key_path(key_path)}: from {low:g} must be below to {high:g}")
     shares = (generator.permutation(num_samples) + generator.random(num_samples)) / num_samples
-    return [float(value) for value in low + shares * (high - low)]
+    samples: list[float] = (low + shares * (high - low)).tolist()
+    return samples
 
 
 def replace_values(value: Any, values: dict[KeyPath, Any], key_path: KeyPath) -> Any:  # noqa: ANN401

@@ -85,9 +85,11 @@ class EncounterResults:
     def _build_row(self, name: str, rig: str, detections: list[EncounterDetection]) -> EncounterRow:
         """Build the row of one group of detections, which may be empty."""
         sensors = self.sensor_names[rig]
+        # A group without encounters has a row, too.
         no_detection = np.zeros((1, len(sensors), self.num_start_offsets))
         ttc_s = np.stack([item.ttc_s for item in detections] or [no_detection[0, 0]])
         sensor_ttc_s = np.mean([item.sensor_ttc_s for item in detections] or no_detection, axis=(0, 2))
+        # The worst encounter of a set counts; in traffic, the mean is more robust.
         reduce = np.mean if self.scene_durations_h else np.min
         ttc_without_s = reduce([item.ttc_without_sensor_s for item in detections] or no_detection, axis=(0, 2))
         numbers = self._compute_numbers(detections)
@@ -136,6 +138,7 @@ class EncounterResults:
             is_at_start = detection.ttc_s >= detection.censoring_ttc_s
             values = [detection.ttc_s.mean(), is_at_start.mean(), 1.0]
             sums[block] += torch.tensor(values, dtype=torch.float64, device="cpu")
+        # The first two numbers are per encounter, the last is per hour.
         weights = sums[:, [2, 2, 2]]
         durations_h = list(self.scene_durations_h.values()) or [math.nan] * num_blocks
         weights[:, 2] = torch.tensor(durations_h, device="cpu")
@@ -151,12 +154,14 @@ class EncounterResults:
         max_speeds_kmh: dict[tuple[str, str], float] = {}
         too_late = set[tuple[str, str]]()
         for row in self.rows:
+            # Rows of sampled speeds have no speed.
             if math.isnan(row.speed_kmh):
                 continue
             key = row.encounter, row.rig
             max_speeds_kmh.setdefault(key, math.nan)
             if row.in_time_share < 1:
                 too_late.add(key)
+            # Rows ascend in speed: a higher speed does not count once a lower one was too late.
             elif key not in too_late:
                 max_speeds_kmh[key] = row.speed_kmh
         return max_speeds_kmh
@@ -206,6 +211,7 @@ class EncounterResults:
         cells = []
         for (encounter, speed), group in groupby(rows, key=lambda row: (row.encounter, row.speed_label)):
             row_by_rig = {row.rig: row for row in group}
+            # The braking time does not depend on the rig.
             braking_time_s = next(iter(row_by_rig.values())).braking_time_s
             times = [format_time(row_by_rig[rig]) for rig in rigs]
             cells.append(build_text_cells(encounter, speed, f"{braking_time_s:.2f}", *times))

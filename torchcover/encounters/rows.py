@@ -91,6 +91,7 @@ def format_time(row: EncounterRow) -> str:
         text += f", mean {row.ttc_s:.2f}"
     if row.interval_high > row.interval_low:
         text += f" ({row.interval_low:.2f} to {row.interval_high:.2f})"
+    # Rows that are always in time need no remark.
     if row.in_time_share == 1:
         return text
     return text + (f", {100 * row.in_time_share:.0f} % in time" if row.in_time_share else ", too late")

@@ -198,6 +198,7 @@ def find_approaches(drive: Drive, criterion: Criterion) -> list[Approach]:
     ego_direction = ego_velocity_mps / np.where(ego_speed_mps > 0, ego_speed_mps, 1.0)[:, None]
     for track in drive.tracks:
         motion = RelativeMotion.from_track(drive, track, ego_velocity_mps, criterion.max_ttc_s)
+        # Encounters begin when the time to collision falls below the limit.
         close_frames = np.flatnonzero(motion.ttc_s <= criterion.max_ttc_s)
         if len(close_frames) == 0 or close_frames[0] < criterion.consecutive_scans - 1:
             continue
@@ -210,6 +211,7 @@ def find_approaches(drive: Drive, criterion: Criterion) -> list[Approach]:
         braking_times_s = np.zeros(len(speed_mps))
         for index in np.flatnonzero(can_brake).tolist():
             braking_times_s[index] = criterion.compute_braking_time_s(speed_mps[index], approach_mps[index])
+        # Road users from behind are a group of their own, because braking does not help.
         group = "from behind" if is_behind else get_road_user_group(track)
         vehicle_name = track.name.removeprefix(REAR_OF)
         if vehicle_name not in approaches or first_frame < approaches[vehicle_name].frame_index:

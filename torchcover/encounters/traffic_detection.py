@@ -68,18 +68,20 @@ class DriveSensors(NamedTuple):
             clouds = []
             for scan in scans:
                 points = scan.points
+                # A point with a large range error is not on the object that it hit.
                 if scan.range_error_m is not None:
                     points = points[np.abs(scan.range_error_m) <= MEASURED_WITHIN_M]
                 clouds.append(points)
             return clouds
 
         scan_periods, frame_strides = list[float | None](), []
+        min_points, pixels_per_sample = [], []
         for sensor in rig.sensors:
+            min_points.append(get_min_points(criterion, sensor))
+            pixels_per_sample.append(sensor.pixels_per_sample)
             frame_stride = max(1, round(1 / (sensor.rate_hz * simulator.frame_interval_s)))
             frame_strides.append(frame_stride)
             scan_periods.append(frame_stride if isinstance(sensor, Lidar) else None)
-        min_points = [get_min_points(criterion, sensor) for sensor in rig.sensors]
-        pixels_per_sample = [sensor.pixels_per_sample for sensor in rig.sensors]
         return cls(scan_periods, min_points, pixels_per_sample, frame_strides, read_clouds)
 
     @classmethod
@@ -145,6 +147,7 @@ class ApproachPointCounter:
         """Count the (S,) points in the upright box of the road user, with margins as in `find_points_in_boxes`."""
         time_s, trajectory = self._drive.times_s[frame_index], self._track.trajectory
         size_m = np.array(self._track.size_m)
+        # The road user is absent in this frame.
         if np.isnan(trajectory.interpolate_positions_m(np.array([time_s]))).any():
             return np.zeros(len(self._sensors.scan_periods), dtype=np.int64)
         pose = invert(self._drive.world_T_ego[frame_index]) @ trajectory.interpolate(time_s)
@@ -155,6 +158,7 @@ class ApproachPointCounter:
         for cloud_m, pixels_per_sample in zip(clouds, self._sensors.pixels_per_sample, strict=True):
             offsets_m = (cloud_m - pose[:3, 3]) @ pose[:3, :3]
             is_inside = (np.abs(offsets_m[:, :2]) <= size_m[:2] / 2 + SKIN_M).all(axis=1)
+            # Points at the bottom belong to the ground.
             is_inside &= (offsets_m[:, 2] > SKIN_M) & (offsets_m[:, 2] <= size_m[2] + SKIN_M)
             counts.append(pixels_per_sample * np.count_nonzero(is_inside))
         return np.array(counts, dtype=np.int64)

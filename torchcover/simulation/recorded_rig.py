@@ -89,6 +89,7 @@ def build_rig_document(
         "description": f"Sensors of the recording {recording.path}.{source} {' '.join(sentences)}",
         "sensors": sensors,
     }
+    # A recording may contain values that no rig can have.
     Rig.model_validate(rig)
     return rig
 
@@ -163,6 +164,7 @@ def build_lidar_document(
     num_scans = min(max_scans, len(recording.key_frames))
     positions = np.linspace(0, len(recording.key_frames) - 1, num_scans, dtype=int)
     frames = [recording.key_frames[position] for position in positions]
+    # Calibrations have priority over the extrinsics of a scan.
     vehicle_T_sensor, source = calibrations.mounts.get(name), "mount as calibrated"
     if vehicle_T_sensor is None:
         vehicle_T_sensor, source = recording.read_scan(name, frames[0]).vehicle_T_sensor, "mount as recorded"
@@ -182,6 +184,7 @@ def build_lidar_document(
             f"{recording.path}: the points of {name} do not lie in rows that can be distinguished; name its model (see "
             f"`torchcover list`): --lidar {name}=MODEL"
         )
+    # The LiDAR of a rig looks to the center of its field of view.
     rotation = convert_euler_to_rotation(scan.center_azimuth_deg, 0.0, 0.0)
     vehicle_T_sensor = vehicle_T_sensor @ build_transform(rotation, [0.0, 0.0, scan.origin_height_m])
     if scan.origin_height_m:
@@ -193,6 +196,7 @@ def build_lidar_document(
     if compensation:
         source += f"; {compensation}"
     pattern = {
+        # Adding 0.0 turns -0.0 into 0.0.
         "elevations_deg": [round(float(elevation), 3) + 0.0 for elevation in scan.elevations_deg],
         "horizontal_fov_deg": round(scan.horizontal_fov_deg, 3),
         "columns": scan.num_columns,
@@ -222,6 +226,7 @@ def build_camera_document(camera: Calibration) -> dict[str, Any]:
         "mount": build_pose_document(np.asarray(camera.vehicle_T_camera) @ invert(MOUNT_T_CAMERA)),
         **{key: getattr(camera, key) for key in ("width", "height", "fx", "fy", "cx", "cy")},
         **lens,
+        # Data sets do not tell the depth range of cameras: these are the values of the built-in rigs.
         "stride": 4,
         "min_range_m": 0.1,
         "max_range_m": 200.0,

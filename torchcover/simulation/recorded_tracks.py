@@ -170,6 +170,7 @@ def list_labeled_tracks(
         for number, piece in enumerate(split_at_gaps(track.trajectory, params.max_gap_s), 1):
             name = track.name if number == 1 else f"{track.name} #{number}"
             last_s = piece.times_s[-1]
+            # Regular rows, and the last time exactly.
             times_s = np.append(np.arange(piece.times_s[0], last_s - 1e-6, time_step_s), last_s)
             times_s = times_s[times_s <= end_s]
             poses = piece.interpolate_many(times_s)
@@ -178,194 +179,157 @@ def list_labeled_tracks(
                 yield (row[0], name, track.category, *row[1:4], *track.size_m, row[4])
 
 
-def list_detected_tracks(
-    mapped: MappedDrive,
-    ego_trajectory: Trajectory,
-    accumulation: AccumulationParams,
-    params: TrackingParams = TrackingParams(),
-) -> Iterator[TableRow]:
-    """List the rows of the tracks of objects that move according to the rays.
+class ObjectTracker:
+    """Tracker of the moving objects of a drive without labels.
 
     Args:
         mapped: The drive.
         ego_trajectory: Trajectory of the vehicle.
         accumulation: Parameters of the clusters.
         params: Parameters of the tracking.
-
-    Yields:
-        Rows as in `build_row_box`.
     """
-    scan_times_s = np.array([scan.time_s for scan in mapped.dynamic_scans])
-    num_objects = 0
-    for track in track_clusters(mapped, scan_times_s, ego_trajectory, accumulation, params):
-        displacement_m = np.linalg.norm(track[-1].center_m - track[0].center_m)
-        max_points = max(len(detection.cluster.points_m) for detection in track)
-        if len(track) < params.min_detections or displacement_m < params.min_displacement_m:
-            continue
-        if max_points < accumulation.min_cluster_points:
-            continue
-        boxes = fit_track_boxes(track, ego_trajectory, mapped.ground, accumulation, params)
-        if compute_free_share(mapped, scan_times_s, track, boxes, params) < params.min_free_share:
-            continue
-        num_objects += 1
-        category = params.find_category(*boxes[0, 3:5])
-        for detection, box in zip(track, boxes, strict=True):
-            yield (detection.time_s, f"object_{num_objects}", category, *box.tolist())
 
+    def __init__(
+        self,
+        mapped: MappedDrive,
+        ego_trajectory: Trajectory,
+        accumulation: AccumulationParams,
+        params: TrackingParams = TrackingParams(),
+    ) -> None:
+        self._mapped, self._ego_trajectory = mapped, ego_trajectory
+        self._accumulation, self._params = accumulation, params
+        self._scan_times_s = np.array([scan.time_s for scan in mapped.dynamic_scans])
 
-def track_clusters(
-    mapped: MappedDrive,
-    scan_times_s: Float64,
-    ego_trajectory: Trajectory,
-    accumulation: AccumulationParams,
-    params: TrackingParams,
-) -> list[list[TrackedCluster]]:
-    """Detect moving clusters at regular times and associate them to tracks.
+    def list_rows(self) -> Iterator[TableRow]:
+        """List the rows of all tracks.
 
-    Args:
-        mapped: The drive.
-        scan_times_s: (S,) times of its dynamic scans.
-        ego_trajectory: Trajectory of the vehicle.
-        accumulation: Parameters of the clusters.
-        params: Parameters of the tracking.
+        Yields:
+            Rows as in `build_row_box`.
+        """
+        num_objects = 0
+        for track in self._track_clusters():
+            displacement_m = np.linalg.norm(track[-1].center_m - track[0].center_m)
+            # Short tracks and small clusters are noise, such as vegetation that moves.
+            if len(track) < self._params.min_detections or displacement_m < self._params.min_displacement_m:
+                continue
+            max_points = max(len(detection.cluster.points_m) for detection in track)
+            if max_points < self._accumulation.min_cluster_points:
+                continue
+            boxes = self._fit_boxes(track)
+            if self._compute_free_share(track, boxes) < self._params.min_free_share:
+                continue
+            num_objects += 1
+            category = self._params.find_category(*boxes[0, 3:5])
+            for detection, box in zip(track, boxes, strict=True):
+                yield (detection.time_s, f"object_{num_objects}", category, *box.tolist())
 
-    Returns:
-        Detections of each object in the order of time.
-    """
-    tracks: list[list[TrackedCluster]] = []
-    last_time_s = -np.inf
-    for time_s in np.unique(scan_times_s):
-        if time_s - last_time_s < params.interval_s - 1e-6:
-            continue
-        last_time_s = time_s
-        ego_m = ego_trajectory.interpolate_positions_m(np.array([time_s]))[0]
-        compared_scans = np.flatnonzero(np.abs(scan_times_s - time_s) <= accumulation.clusters.max_compared_s)
-        scans_m = []
-        for scan in compared_scans:
-            points_m = mapped.dynamic_scans[scan].points_m
-            distance_m = np.linalg.norm(points_m[:, :2] - ego_m[:2], axis=1)
-            scans_m.append(points_m[distance_m < accumulation.clusters.max_range_m])
-        clusters = find_moving_clusters(scans_m, scan_times_s[compared_scans] - time_s)
-        extend_tracks(tracks, time_s, clusters, params)
-    return tracks
+    def _track_clusters(self) -> list[list[TrackedCluster]]:
+        """Detect moving clusters at regular times and associate them to tracks, in the order of time."""
+        tracks: list[list[TrackedCluster]] = []
+        max_range_m = self._accumulation.clusters.max_range_m
+        last_time_s = -np.inf
+        for time_s in np.unique(self._scan_times_s):
+            if time_s - last_time_s < self._params.interval_s - 1e-6:
+                continue
+            last_time_s = time_s
+            ego_m = self._ego_trajectory.interpolate_positions_m(np.array([time_s]))[0]
+            offsets_s = self._scan_times_s - time_s
+            compared_scans = np.flatnonzero(np.abs(offsets_s) <= self._accumulation.clusters.max_compared_s)
+            scans_m = []
+            for scan in compared_scans:
+                points_m = self._mapped.dynamic_scans[scan].points_m
+                distance_m = np.linalg.norm(points_m[:, :2] - ego_m[:2], axis=1)
+                scans_m.append(points_m[distance_m < max_range_m])
+            self._extend_tracks(tracks, time_s, find_moving_clusters(scans_m, offsets_s[compared_scans]))
+        return tracks
 
+    def _extend_tracks(
+        self, tracks: list[list[TrackedCluster]], time_s: float, clusters: Sequence[MovingCluster]
+    ) -> None:
+        """Append clusters to the tracks whose predictions are nearest, nearest pairs first, or begin new tracks."""
+        detections = []
+        for cluster in clusters:
+            detections.append(TrackedCluster(time_s, cluster.points_m[:, :2].mean(axis=0), cluster))
+        open_tracks = [track for track in tracks if time_s - track[-1].time_s <= self._params.max_gap_s / 2]
+        pairs = []
+        for track_index, track in enumerate(open_tracks):
+            last = track[-1]
+            predicted_m = last.center_m + (time_s - last.time_s) * last.cluster.velocity_mps
+            for detection_index, detection in enumerate(detections):
+                distance_m = float(np.linalg.norm(predicted_m - detection.center_m))
+                pairs.append((distance_m, track_index, detection_index))
+        # Greedy association: each track and each detection is used once.
+        free_tracks, free_detections = set(range(len(open_tracks))), set(range(len(detections)))
+        for distance_m, track_index, detection_index in sorted(pairs):
+            is_free = track_index in free_tracks and detection_index in free_detections
+            if distance_m <= self._params.association_radius_m and is_free:
+                open_tracks[track_index].append(detections[detection_index])
+                free_tracks.remove(track_index)
+                free_detections.remove(detection_index)
+        tracks += [[detections[index]] for index in sorted(free_detections)]
 
-def extend_tracks(
-    tracks: list[list[TrackedCluster]], time_s: float, clusters: Sequence[MovingCluster], params: TrackingParams
-) -> None:
-    """Append clusters to the tracks whose predictions are nearest, nearest pairs first, or begin new tracks.
+    def _compute_free_share(self, track: Sequence[TrackedCluster], boxes: Float64) -> float:
+        """Compute the share of the points in (K, 7) boxes of a track that rays of other scans contradict."""
+        num_inside = num_free = 0
+        for detection, box_values in zip(track, boxes, strict=True):
+            pose, box = build_row_box(("", "", "", *box_values.tolist()), self._params.margin_m)
+            for scan_index in np.flatnonzero(self._scan_times_s == detection.time_s):
+                scan = self._mapped.dynamic_scans[scan_index]
+                inside = find_points_in_box(transform_points(invert(pose), scan.points_m), box)
+                num_inside += len(inside)
+                num_free += int(scan.is_in_free_space[inside].sum())
+        return num_free / max(num_inside, 1)
 
-    Args:
-        tracks: Tracks so far; changed in place.
-        time_s: Time of the clusters.
-        clusters: Clusters at that time.
-        params: Gate, and longest gap.
-    """
-    detections = []
-    for cluster in clusters:
-        detections.append(TrackedCluster(time_s, cluster.points_m[:, :2].mean(axis=0), cluster))
-    open_tracks = [track for track in tracks if time_s - track[-1].time_s <= params.max_gap_s / 2]
-    pairs = []
-    for track_index, track in enumerate(open_tracks):
-        last = track[-1]
-        predicted_m = last.center_m + (time_s - last.time_s) * last.cluster.velocity_mps
-        for detection_index, detection in enumerate(detections):
-            distance_m = float(np.linalg.norm(predicted_m - detection.center_m))
-            pairs.append((distance_m, track_index, detection_index))
-    free_tracks, free_detections = set(range(len(open_tracks))), set(range(len(detections)))
-    for distance_m, track_index, detection_index in sorted(pairs):
-        is_free = track_index in free_tracks and detection_index in free_detections
-        if distance_m <= params.association_radius_m and is_free:
-            open_tracks[track_index].append(detections[detection_index])
-            free_tracks.remove(track_index)
-            free_detections.remove(detection_index)
-    tracks += [[detections[index]] for index in sorted(free_detections)]
+    def _fit_boxes(self, track: Sequence[TrackedCluster]) -> Float64:
+        """Fit boxes of one size to the K detections of a track.
 
+        Only the sides that face the vehicle are visible; a box ends there and extends beyond the visible points.
 
-def compute_free_share(
-    mapped: MappedDrive,
-    scan_times_s: Float64,
-    track: Sequence[TrackedCluster],
-    boxes: Float64,
-    params: TrackingParams,
-) -> float:
-    """Compute the share of the points in the boxes of a track that rays of other scans contradict.
-
-    Args:
-        mapped: The drive.
-        scan_times_s: (S,) times of its dynamic scans.
-        track: K detections.
-        boxes: (K, 7) boxes as in `fit_track_boxes`.
-        params: Margin around the boxes.
-
-    Returns:
-        Share from 0 to 1.
-    """
-    num_inside = num_free = 0
-    for detection, box_values in zip(track, boxes, strict=True):
-        pose, box = build_row_box(("", "", "", *box_values.tolist()), params.margin_m)
-        for scan_index in np.flatnonzero(scan_times_s == detection.time_s):
-            scan = mapped.dynamic_scans[scan_index]
-            inside = find_points_in_box(transform_points(invert(pose), scan.points_m), box)
-            num_inside += len(inside)
-            num_free += int(scan.is_in_free_space[inside].sum())
-    return num_free / max(num_inside, 1)
-
-
-def fit_track_boxes(
-    track: Sequence[TrackedCluster],
-    ego_trajectory: Trajectory,
-    ground: GroundHeightField,
-    accumulation: AccumulationParams,
-    params: TrackingParams,
-) -> Float64:
-    """Fit boxes of one size to the detections of a track.
-
-    Only the sides that face the vehicle are visible; a box ends there and extends beyond the visible points.
-
-    Args:
-        track: K detections.
-        ego_trajectory: Trajectory of the vehicle.
-        ground: The ground, on which the boxes stand.
-        accumulation: Speed from which an object moves.
-        params: Limits of the size.
-
-    Returns:
-        (K, 7) x, y, z of the bottom, length, width, height in meters, and yaw in degrees.
-    """
-    times_s = np.array([detection.time_s for detection in track])
-    centers_m = np.array([detection.center_m for detection in track])
-    velocities_mps = smooth_values(np.array([detection.cluster.velocity_mps for detection in track]))
-    is_moving = np.linalg.norm(velocities_mps, axis=1) > accumulation.sweeps.min_object_speed_mps
-    if not is_moving.any():
-        velocities_mps[:], is_moving[:] = centers_m[-1] - centers_m[0], True
-    # An object at rest keeps the heading of its last, or of its first, motion.
-    moving_indices = np.maximum.accumulate(np.where(is_moving, np.arange(len(track)), is_moving.argmax()))
-    velocities_mps = velocities_mps[moving_indices]
-    yaw_rad = np.arctan2(velocities_mps[:, 1], velocities_mps[:, 0])
-    forward = np.stack([np.cos(yaw_rad), np.sin(yaw_rad)], 1)
-    left = np.stack([-np.sin(yaw_rad), np.cos(yaw_rad)], 1)
-    axes = np.stack([forward, left], axis=1)
-    quantiles = (params.edge_quantile, 1 - params.edge_quantile)
-    bounds_m = np.empty((len(track), 2, 2))  # lower and upper bound along both axes
-    heights_m = np.empty((len(track), 2))
-    for index, (detection, detection_axes) in enumerate(zip(track, axes, strict=True)):
-        points_m = detection.cluster.points_m
-        bounds_m[index] = np.quantile(points_m[:, :2] @ detection_axes.T, quantiles, axis=0)
-        heights_m[index] = np.quantile(points_m[:, 2], quantiles)
-    height_field = HeightField(ground.origin_m, ground.corner_heights_m, ground.cell_m)
-    ground_m = height_field.compute_heights_m(centers_m)
-    ground_m = np.where(np.isfinite(ground_m), ground_m, heights_m[:, 0])
-    visible_sizes_m = np.column_stack([bounds_m[:, 1] - bounds_m[:, 0], heights_m[:, 1] - ground_m])
-    size_m = np.clip(np.quantile(visible_sizes_m, params.size_quantile, axis=0), params.min_size_m, params.max_size_m)
-    if size_m[1] > params.car_width_m:
-        size_m[0] = max(size_m[0], params.car_length_m)
-    ego_m = np.einsum("kij,kj->ki", axes, ego_trajectory.interpolate_positions_m(times_s)[:, :2])
-    away = np.where(ego_m < bounds_m[:, 0], 1, np.where(ego_m > bounds_m[:, 1], -1, 0))
-    nearest_m = np.where(away > 0, bounds_m[:, 0], bounds_m[:, 1])
-    box_centers_m = np.where(away == 0, bounds_m.mean(axis=1), nearest_m + away * size_m[:2] / 2)
-    positions_m = smooth_values(np.einsum("kij,ki->kj", axes, box_centers_m))
-    return np.column_stack([positions_m, ground_m, np.tile(size_m, (len(track), 1)), np.rad2deg(yaw_rad)])
+        Returns:
+            (K, 7) x, y, z of the bottom, length, width, height in meters, and yaw in degrees.
+        """
+        times_s = np.array([detection.time_s for detection in track])
+        centers_m = np.array([detection.center_m for detection in track])
+        # Velocities of single detections are noisy.
+        velocities_mps = smooth_values(np.array([detection.cluster.velocity_mps for detection in track]))
+        is_moving = np.linalg.norm(velocities_mps, axis=1) > self._accumulation.sweeps.min_object_speed_mps
+        if not is_moving.any():
+            velocities_mps[:], is_moving[:] = centers_m[-1] - centers_m[0], True
+        # An object at rest keeps the heading of its last, or of its first, motion.
+        moving_indices = np.maximum.accumulate(np.where(is_moving, np.arange(len(track)), is_moving.argmax()))
+        velocities_mps = velocities_mps[moving_indices]
+        yaw_rad = np.arctan2(velocities_mps[:, 1], velocities_mps[:, 0])
+        forward = np.stack([np.cos(yaw_rad), np.sin(yaw_rad)], 1)
+        left = np.stack([-np.sin(yaw_rad), np.cos(yaw_rad)], 1)
+        axes = np.stack([forward, left], axis=1)
+        # Single points beyond the sides may be noise.
+        quantiles = (self._params.edge_quantile, 1 - self._params.edge_quantile)
+        bounds_m = np.empty((len(track), 2, 2))  # lower and upper bound along both axes
+        heights_m = np.empty((len(track), 2))
+        for index, (detection, detection_axes) in enumerate(zip(track, axes, strict=True)):
+            points_m = detection.cluster.points_m
+            bounds_m[index] = np.quantile(points_m[:, :2] @ detection_axes.T, quantiles, axis=0)
+            heights_m[index] = np.quantile(points_m[:, 2], quantiles)
+        ground = self._mapped.ground
+        # Boxes stand on the ground, because the lower part of an object is often occluded.
+        height_field = HeightField(ground.origin_m, ground.corner_heights_m, ground.cell_m)
+        ground_m = height_field.compute_heights_m(centers_m)
+        ground_m = np.where(np.isfinite(ground_m), ground_m, heights_m[:, 0])
+        visible_sizes_m = np.column_stack([bounds_m[:, 1] - bounds_m[:, 0], heights_m[:, 1] - ground_m])
+        size_m = np.clip(
+            np.quantile(visible_sizes_m, self._params.size_quantile, axis=0),
+            self._params.min_size_m,
+            self._params.max_size_m,
+        )
+        if size_m[1] > self._params.car_width_m:
+            size_m[0] = max(size_m[0], self._params.car_length_m)
+        # Along each axis: 1 if the object is ahead of the vehicle, -1 behind, 0 if the vehicle is between its sides.
+        ego_m = np.einsum("kij,kj->ki", axes, self._ego_trajectory.interpolate_positions_m(times_s)[:, :2])
+        away = np.where(ego_m < bounds_m[:, 0], 1, np.where(ego_m > bounds_m[:, 1], -1, 0))
+        nearest_m = np.where(away > 0, bounds_m[:, 0], bounds_m[:, 1])
+        box_centers_m = np.where(away == 0, bounds_m.mean(axis=1), nearest_m + away * size_m[:2] / 2)
+        positions_m = smooth_values(np.einsum("kij,ki->kj", axes, box_centers_m))
+        return np.column_stack([positions_m, ground_m, np.tile(size_m, (len(track), 1)), np.rad2deg(yaw_rad)])
 
 
 def smooth_values(values: Float64, max_neighbors: int = 2) -> Float64:

@@ -10,13 +10,7 @@ from typing import Any
 import numpy as np
 
 from torchcover.files import AtomicOutput, format_csv, to_yaml
-from torchcover.geometry import (
-    BoundingBox,
-    HeightField,
-    convert_rotation_to_euler,
-    invert,
-    transform_points,
-)
+from torchcover.geometry import BoundingBox, HeightField, convert_rotation_to_euler, invert, transform_points
 from torchcover.geometry.arrays import Float64, Int64
 from torchcover.geometry.rigid import Matrix
 from torchcover.geometry.trajectory import Trajectory
@@ -30,9 +24,9 @@ from torchcover.simulation.height_field import GroundHeightField
 from torchcover.simulation.recorded_tracks import (
     DynamicScan,
     MappedDrive,
+    ObjectTracker,
     TableRow,
     build_row_box,
-    list_detected_tracks,
     list_labeled_tracks,
 )
 from torchcover.simulation.shapes import Mesh
@@ -101,15 +95,18 @@ def write_scenario(
         [reference.sweep_window.compute_local_T_vehicle(recording, index) for index in range(len(times_s))]
     )
     ego_box = recording.ego_box or DEFAULT_EGO_BOX
+    # Mirrors and antennas reach beyond the box; the ground below it remains.
     margin_m = np.array([params.margin_m, params.margin_m, 0.0])
     excluded_box = BoundingBox.from_points(np.array([ego_box.lower_m - margin_m, ego_box.upper_m + margin_m]))
     mapped = map_drive(recording, reference, times_s, poses, excluded_box, params)
     ego_trajectory = Trajectory.from_poses(times_s, poses)
+    # Labels are exact; tracks from points are the fallback.
     is_labeled = recording.read_boxes(recording.key_frames[0]) is not None
     if is_labeled:
         track_rows = list(list_labeled_tracks(recording, float(times_s[-1]), params.time_step_s))
     else:
-        track_rows = list(list_detected_tracks(mapped, ego_trajectory, params.accumulation))
+        track_rows = list(ObjectTracker(mapped, ego_trajectory, params.accumulation).list_rows())
+    # Static cells on the path of a vehicle are remains of it in some scans.
     occupied_boxes = [(pose, ego_box) for pose in poses]
     occupied_boxes += [build_row_box(row, params.margin_m) for row in track_rows]
     cells = find_static_cells(mapped, occupied_boxes, params)
@@ -141,6 +138,7 @@ def select_times_s(recording: Recording, num_frames: int | None, params: SceneMa
     """
     if recording.times_s is None:
         raise ValueError(f"{recording.path}: no times; a scene needs them")
+    # Frames between key frames are used, too, but the scenario ends at a key frame.
     key_frames = recording.key_frames if num_frames is None else recording.key_frames[:num_frames]
     times_s = recording.times_s[: key_frames[-1] + 1] - recording.times_s[0]
     intervals_s = np.diff(times_s)
@@ -183,6 +181,7 @@ def map_drive(
     static_points_m = np.empty((0, 3))
     dynamic_scans, range_images = [], []
     image_times_s = dict.fromkeys(recording.sensors, -np.inf)
+    # Short drives need images more often to carve free space.
     image_interval_s = min(params.max_image_interval_s, times_s[-1] / 20)
     last_frame = -1
     # Windows overlap by a tenth, so that every frame is in one.
@@ -196,6 +195,7 @@ def map_drive(
             )
         point_parts_m = [static_points_m]
         for (sensor, frame), (points_m, point_class) in sorted(reference.classify_points(recording, index).items()):
+            # Frames of the overlap with the previous window are done.
             if not last_frame < frame < len(times_s):
                 continue
             is_outside = np.ones(len(points_m), np.bool_)
@@ -207,6 +207,7 @@ def map_drive(
             if image is not None and times_s[frame] - image_times_s[sensor] > image_interval_s - 1e-6:
                 range_images.append(image)
                 image_times_s[sensor] = times_s[frame]
+        # A single point per cell bounds the memory on long drives.
         static_points_m = np.concatenate(point_parts_m)
         static_points_m = static_points_m[find_first_occurrences(compute_voxel_indices(static_points_m, CELL_M))]
         ground_map.add(recording, reference, index, poses[index])
@@ -254,6 +255,7 @@ class GroundMap:
         cell_m, margin_m = self._params.ground_cell_m, self._params.ground_margin_m
         first = np.maximum(((pose[:2, 3] - margin_m - self._lower_m) / cell_m).astype(int), 0)
         part = tuple(slice(start, start + int(2 * margin_m / cell_m)) for start in first[::-1])
+        # The part is smaller at the border of the map.
         rows, columns = self._heights_m[part].shape
         positions_m = self._lower_m + cell_m * (first + np.indices((rows, columns))[::-1].reshape(2, -1).T)
         # The ground lies below z = 0 by the height of z = 0 above it.
@@ -279,6 +281,7 @@ class GroundMap:
             ValueError: No cell has four corners.
         """
         is_observed = np.isfinite(self._heights_m)
+        # A cell needs the heights of its four corners.
         cell_mask = is_observed[1:, 1:] & is_observed[1:, :-1] & is_observed[:-1, 1:] & is_observed[:-1, :-1]
         if not cell_mask.any():
             raise ValueError(
@@ -308,6 +311,7 @@ def find_static_cells(
     order = np.lexsort(cells.T[::-1])  # by column, then upwards
     points_m, height_m, cells = points_m[order], height_m[order], cells[order]
     is_same_column = np.append(False, (cells[1:, :2] == cells[:-1, :2]).all(axis=1))
+    # Fill small holes between two cells of a column, and below its lowest cell if it is near the ground.
     num_filled = np.where(is_same_column, np.diff(cells[:, 2], prepend=0) - 1, 0)
     num_filled[num_filled > params.max_hole_m / CELL_M] = 0
     is_foot = ~is_same_column & (height_m < params.max_foot_m)
@@ -317,10 +321,12 @@ def find_static_cells(
     filled_cells = cells[upper] - steps_down[:, None] * np.array([0, 0, 1])
     cells = np.concatenate([cells, filled_cells])
     points_m = np.concatenate([points_m, (filled_cells + 0.5) * CELL_M])
+    # Filled cells are tested as well: rays may pass through the holes.
     votes = np.zeros(len(cells), np.int16)
     for image in mapped.range_images:
         image.add_votes(points_m, votes)
     cells = cells[votes < params.accumulation.min_votes]
+    # Sorted by x, the cells near a box are found by bisection.
     cells = cells[np.argsort(cells[:, 0], kind="stable")]
     is_static = np.ones(len(cells), np.bool_)
     for pose, box in occupied_boxes:
@@ -357,6 +363,7 @@ def write_scenario_files(
     Raises:
         OSError: A file cannot be written.
     """
+    # The small number keeps the last time step in spite of rounding.
     num_steps = int(ego_trajectory.times_s[-1] / params.time_step_s + 1e-6)
     times_s: Float64 = params.time_step_s * np.arange(num_steps + 1.0)
     poses = ego_trajectory.interpolate_many(times_s)

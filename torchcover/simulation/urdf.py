@@ -138,6 +138,7 @@ def read_robot(path: Path, packages: Mapping[str, str | Path] | None = None) -> 
     vertices_m = merge_meshes(pieces).vertices_m
     if not np.abs(vertices_m).max() <= FARTHEST_M:  # also refuses NaN
         raise ValueError(f"the body reaches beyond {FARTHEST_M:g} m; check the units of its sizes, origins and meshes")
+    # The origin of the vehicle frame is on the ground below the center of the body.
     box = BoundingBox.from_points(vertices_m)
     center_m = np.add(box.lower_m, box.upper_m) / 2
     vehicle_T_base = build_transform(np.eye(3), (-center_m[0], -center_m[1], -box.lower_m[2]))
@@ -177,6 +178,7 @@ def _compute_joint_positions(joints: Mapping[str, Element]) -> dict[str, float]:
     positions: dict[str, float] = {}
     for name in joints:
         followers: dict[str, Element] = {}
+        # Follow the chain of joints that mimic each other up to a known position.
         while name not in positions and (mimic := joints[name].find("mimic")) is not None:
             followers[name] = mimic
             name = mimic.get("joint", "")  # noqa: PLW2901  (along the chain of joints that mimic each other)
@@ -225,7 +227,9 @@ def _compute_link_poses(
         children[parent].append(child)
     roots = [name for name in links if name not in parent_and_joint]
     if len(roots) > 1:
-        raise ValueError(f"links {_list_names(roots)} have no parent: a tree with one root is needed")
+        raise ValueError(
+            f"links {_list_names([repr(name) for name in roots])} have no parent: a tree with one root is needed"
+        )
     poses: dict[str, Float64] = {}
     open_links = roots
     while open_links:
@@ -238,13 +242,13 @@ def _compute_link_poses(
             poses[name] = poses[parent] @ read_pose(joint.find("origin")) @ motion
         open_links += children[name]
     if unreached := [name for name in links if name not in poses]:
-        raise ValueError(f"links {_list_names(unreached)} form a ring: a tree is needed")
+        raise ValueError(f"links {_list_names([repr(name) for name in unreached])} form a ring: a tree is needed")
     return poses
 
 
 def _list_names(names: Sequence[str], max_names: int = 3) -> str:
     """List the first few names, and the number of the others."""
-    text = ", ".join(repr(name) for name in names[:max_names])
+    text = ", ".join(names[:max_names])
     return text if len(names) <= max_names else f"{text} and {len(names) - max_names} more"
 
 
@@ -262,8 +266,7 @@ def _check_joint_limits(joints: Mapping[str, Element], positions: Mapping[str, f
             outside.append(f"{name!r} at {positions[name]:g} {unit} ({lower:g} to {upper:g})")
     if not outside:
         return []
-    examples = ", ".join(outside[:3]) + (f" and {len(outside) - 3} more" if len(outside) > 3 else "")
-    return [f"Joints outside of their limits: {examples}; the body is built with these positions."]
+    return [f"Joints outside of their limits: {_list_names(outside)}; the body is built with these positions."]
 
 
 def _find_geometry(link: Element) -> list[Element]:
@@ -287,11 +290,8 @@ def _read_meshes(links: Mapping[str, Element], path: Path, packages: Mapping[str
                 else:
                     files[name] = file
     if missing:
-        names = ", ".join(missing[:3]) + (f" and {len(missing) - 3} more" if len(missing) > 3 else "")
-        raise ValueError(
-            f"{len(missing)} of {len(files) + len(missing)} meshes are missing: {names}. Name the folder of a ROS "
-            "package: --package NAME=FOLDER"
-        )
+        names = f"{len(missing)} of {len(files) + len(missing)} meshes are missing: {_list_names(missing)}"
+        raise ValueError(f"{names}. Name the folder of a ROS package: --package NAME=FOLDER")
     return {name: MeshFile(type="mesh", path=file).build_mesh() for name, file in files.items()}
 
 
@@ -299,14 +299,14 @@ def _find_mesh(name: str, path: Path, packages: Mapping[str, str | Path]) -> Pat
     """Find the file of a mesh; None if there is none."""
     scheme, _, uri_path = name.rpartition("://")
     package, _, package_path = uri_path.partition("/")
-    candidates = [path.parent / uri_path]
-    if scheme in ("package", "model"):
-        candidates = []
-        if package in packages:
-            candidates = [Path(packages[package], package_path)]
-        else:
-            for parent in path.resolve().parents:
-                candidates += [parent / uri_path, parent / package_path]
+    candidates = []
+    if scheme not in ("package", "model"):
+        candidates.append(path.parent / uri_path)
+    elif package in packages:
+        candidates.append(Path(packages[package], package_path))
+    else:  # ROS would find the package by its name: look for its folder around the file
+        for parent in path.resolve().parents:
+            candidates += [parent / uri_path, parent / package_path]
     for candidate in candidates:
         if uri_path and candidate.is_file():
             return candidate
@@ -375,6 +375,7 @@ def _exclude_housings(
     """Exclude the housings of sensors from the pieces of a body; the largest piece is never excluded."""
     if not sensors:
         return list(pieces)
+    # Only bodies near a sensor can be its housing: robots may have thousands of links.
     tree = cKDTree([sensor.vehicle_T_sensor[:3, 3] for sensor in sensors])
     lengths_m = [float(np.linalg.norm(np.ptp(piece.vertices_m, axis=0))) for piece in pieces]
     body_pieces = []

@@ -59,6 +59,7 @@ def write_recording(
     content = {"layout": layout, **hash_values(frames.content)}
     names = [format_frame_name(index) for index in range(len(frames))]
     is_incomplete = bool(manifest.get(WRITING))
+    # A complete recording has nothing to resume.
     if resume and manifest and not is_incomplete:
         check_same_recording(folder, manifest["content"], content, manifest["frames"], names)
         return
@@ -69,9 +70,11 @@ def write_recording(
         )
     if not is_incomplete and folder.exists() and (not folder.is_dir() or any(folder.glob("[!.]*"))):
         raise ValueError(f"{folder}: {'not empty' if folder.is_dir() else 'a file'}; a new or empty folder is needed")
+    # Frames that an earlier process wrote are not written again.
     records = list(manifest.get("steps", ()))
     check_same_recording(folder, manifest.get("content") or content, content, records, names[: len(records)])
     with files:
+        # The manifest marks the recording as incomplete until all frames are written.
         files.publish({WRITING: True, "content": content, "steps": records})
         for index in progress(range(len(records), len(frames))):
             records.append(recorder.write(build_frame_record(frames, index)))

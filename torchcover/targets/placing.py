@@ -11,7 +11,7 @@ from torchcover.geometry.arrays import Bools, Float64, Int64
 from torchcover.simulation.instant import SceneSnapshot
 
 SIDES = ("front", "rear", "left", "right")
-# "narrow" turns the narrower side of the target's box to the vehicle, "wide" the wider one; numbers are yaws in degrees.
+# "narrow" turns the narrower side of the target's box to the vehicle, "wide" the wider one; a number is a yaw in deg.
 Heading = Literal["narrow", "wide"] | float
 
 # Default side of a cell: less than half of the width of a person.

@@ -144,6 +144,7 @@ def measure_visibility_at_positions(
     vehicle_box, target_box = scenario.compute_ego_box(), target.solid.bounding_box
     check_memory(rig, len(positions_m), num_frames)
     poses = build_poses(positions_m, compute_yaws_rad(heading, target_box, vehicle_box, positions_m))
+    # A target cannot stand where the vehicle or one of its sensors is.
     is_occupied = find_overlaps(target_box, poses, vehicle_box.corners_m)
     for sensor in rig.sensors:
         is_occupied |= is_point_inside(target_box, poses, sensor.mount.to_matrix()[:3, 3])
@@ -171,6 +172,7 @@ def measure_visibility_at_positions(
         array[..., evaluated] = values
         return array
 
+    # Means are over the frames with room for the target; NaN without any.
     has_free_frame = sums.free_frames > 0
     free_frames = np.where(has_free_frame, sums.free_frames, np.nan)
     visible_samples = np.where(sums.visible_samples > 0, sums.visible_samples, np.nan)

@@ -129,6 +129,7 @@ class RecordedTraffic(Traffic):
             ValueError: The recording has no such ego vehicle or time span.
         """
         trajectory = self._shift_times(self._excerpt.ego_trajectory)
+        # Recordings do not contain the shape of their vehicle.
         mesh = load_bodies()["suv"] if ego_mesh is None else ego_mesh
         # Without the transient flag: the ego vehicle is always present.
         ego = Actor(EGO, "car", mesh, Trajectory(trajectory.times_s, trajectory.positions_m, trajectory.angles_deg))
@@ -141,11 +142,13 @@ class RecordedTraffic(Traffic):
         else:
             tracks = [track for track in self._excerpt.other_tracks if track.vehicle_class is not None]
             ego_positions_m = ego.trajectory.interpolate_positions_m(self._times_s)
+            # Only road users stand on the ground: other objects may hang above it.
             ground = fit_ground(
                 collect_ground_positions([track.trajectory.positions_m for track in tracks]),
                 collect_ground_positions([ego_positions_m]),
             )
             if self.built_share is not None:
+                # Recorded objects do not depend on the seed; only sampled scenery does.
                 generator = np.random.default_rng(seed)
                 sides, drivable, walkable = find_visible_sides(ego, actors, self.built_share, generator)
                 meshes = place_scenery(
@@ -207,6 +210,7 @@ class RecordedTraffic(Traffic):
                 is_present = not trajectory.is_transient or (first_s <= self._excerpt.duration_s and last_s >= 0.0)
                 ego_positions_m = ego_trajectory.interpolate_positions_m(trajectory.times_s)
                 distances_m = np.linalg.norm(trajectory.positions_m - ego_positions_m, axis=1)
+                # Objects beyond the horizon are out of the range of all sensors.
                 if is_present and distances_m.min() < HORIZON_M + max(track.size_m[:2]):
                     name = track.name if number == 1 else f"{track.name} #{number}"
                     yield Actor(name, category, mesh, trajectory)
@@ -220,6 +224,7 @@ class RecordedTraffic(Traffic):
         for actor in actors:
             box = BoundingBox.from_points(actor.mesh.vertices_m)
             distances_m = np.linalg.norm(actor.trajectory.interpolate_positions_m(times_s) - ego_m, axis=1)
+            # The exact test is slow: it is needed only where the spheres around the boxes overlap.
             near_s = times_s[distances_m < ego_radius_m + np.linalg.norm(box.corners_m, axis=1).max()]
             ego_T_actor = invert(ego.trajectory.interpolate_many(near_s)) @ actor.trajectory.interpolate_many(near_s)
             if find_overlaps(box, ego_T_actor, ego_box.corners_m).any():
