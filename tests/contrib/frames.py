@@ -1,4 +1,4 @@
-"""Frames to ask metrics of others about."""
+"""Frames for published metrics."""
 
 import torch
 
@@ -7,7 +7,7 @@ from torchcover.detection import Boxes
 
 
 def frame_of(cloud, reference=(), boxes=(), categories=(), *, index=0, weights=None, sensors=None, block_index=None):
-    """A frame of one rig called `rig`, from lists; `sensors` says how many points are of each."""
+    """Create a frame of one rig named `rig` from lists; `sensors` is the number of points of each sensor."""
     cloud, reference = (torch.tensor(points, dtype=torch.float32).view(-1, 3) for points in (cloud, reference))
     rows = torch.tensor(boxes, dtype=torch.float32).view(-1, 7)
     return Frame(
@@ -23,5 +23,5 @@ def frame_of(cloud, reference=(), boxes=(), categories=(), *, index=0, weights=N
 
 
 def values(metric):
-    """Its numbers by name."""
+    """Return the numbers of a metric by name."""
     return {number.quantity.key: number.value for number in metric.compute()}

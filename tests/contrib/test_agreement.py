@@ -1,4 +1,4 @@
-"""Ranks of metrics compared with those of judges: what is equal, what is chance, and what the best of many is worth."""
+"""Rank correlation of metrics and raters: perfect, random, and best of many."""
 
 from itertools import permutations
 

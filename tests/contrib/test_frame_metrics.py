@@ -1,4 +1,4 @@
-"""Metrics of others over frames: closed forms, slow twins, what does not matter, and bad frames."""
+"""Published metrics over frames: closed forms, slow implementations, invariances, and bad frames."""
 
 import itertools
 import math

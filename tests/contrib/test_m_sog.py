@@ -1,4 +1,4 @@
-"""M-SOG: closed forms, a slow twin, and where it is blind."""
+"""M-SOG: closed forms, a slow implementation, and its limits."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""What metrics say of placements, each number that of `evaluate`."""
+"""Placement scores equal the numbers of `evaluate`."""
 
 import numpy as np
 import pytest

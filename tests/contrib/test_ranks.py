@@ -1,4 +1,4 @@
-"""Orders of rigs, against SciPy and by hand."""
+"""Rankings of rigs against SciPy and in closed form."""
 
 import math
 from itertools import permutations

@@ -1,4 +1,4 @@
-"""S-MIG: closed forms, a slow twin, what it rewards, and what it cannot know."""
+"""S-MIG: closed forms, a slow implementation, its direction, and its limits."""
 
 import math
 from dataclasses import replace
@@ -83,7 +83,7 @@ def random_boxes(generator, count):
 
 
 def slowly(objects, grid):
-    """(X, Y, Z) whether each centre is in any box."""
+    """Compute (X, Y, Z) bool: voxels with their center in any box."""
     x, y, z = np.meshgrid(*grid.compute_centers_m(), indexing="ij")
     inside = np.zeros(grid.shape, dtype=bool)
     for row in objects.rows.double().numpy():

@@ -1,4 +1,4 @@
-"""Voxels on the way of rays: against a slow exact twin, closed forms, and what must not matter."""
+"""Voxel traversal against exact arithmetic, closed forms and invariances."""
 
 from fractions import Fraction
 from itertools import product
@@ -15,7 +15,7 @@ TINY = Fraction(1, 10**6)
 
 
 def piece(grid, place, origin, direction, end):
-    """Length in voxels, along the axis on which it is longest, of what a ray has of a voxel; in fractions."""
+    """Compute the exact length of a ray in a voxel, in voxels along its longest axis, as a fraction."""
     side, start, stop = Fraction(grid.voxel_m), Fraction(0), None if end == np.inf else Fraction(end)
     for axis in range(3):
         low = Fraction(grid.region.lower_m[axis]) + place[axis] * side
@@ -40,7 +40,7 @@ def slowly(grid, origins, directions, ends):
 
 
 def nasty_rays():
-    """Along axes, edges, faces and diagonals, through corners, from faces, from outside, past the region."""
+    """List rays along axes, edges, faces and diagonals, through corners, from faces, from outside, past the region."""
     directions = np.array([way for way in product((-1.0, 0.0, 1.0), repeat=3) if any(way)])
     origins = np.array([[0.0, 0.0, 0.0], [0.25, 0.25, 0.25], [0.5, 0.25, 0.1], [-1.0, -0.5, -0.5], [1.0, 1.0, 0.5]])
     outside = np.array([[-4.0, -3.5, -3.0], [2.0, 0.0, 0.0], [-1.0, 3.0, 0.25], [0.25, 0.3, 2.5]])

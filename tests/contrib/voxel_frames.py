@@ -1,4 +1,4 @@
-"""Rigs and frames for the metrics of rays through voxels."""
+"""Rigs and frames for metrics of rays in voxels."""
 
 import torch
 
@@ -29,7 +29,7 @@ def place3d(name):
 
 
 def beam(name="beam", *, columns=1, range_m=100.0, **mount):
-    """Level rays: one ahead, or several around."""
+    """Create a sensor with level rays: one forward, or several around."""
     return Lidar(
         name=name,
         mount=Pose(**mount),
@@ -46,7 +46,7 @@ def boxes(*rows, category="car"):
 
 
 def frame(index, objects, *, reference=None, clouds=None, place=None):
-    """A frame with these objects; `clouds` by the name of the sensor."""
+    """Create a frame with these objects; `clouds` are by sensor."""
     clouds = {"beam": torch.zeros(0, 3)} if clouds is None else clouds
     return Frame(
         {"rig": torch.cat(list(clouds.values()))},

@@ -8,7 +8,7 @@ from scipy.spatial.distance import cdist
 
 @pytest.fixture(scope="session")
 def slow_coverage():
-    """The definitions in plain float64 loops, independent of the package: (grid, steps, thresholds) -> maps."""
+    """Definitions as plain float64 loops, independent of the package: (grid, frames, thresholds) -> maps."""
     return _slow_coverage
 
 

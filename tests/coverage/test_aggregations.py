@@ -1,4 +1,4 @@
-"""Aggregations beside the mean of means, each by its definition; and one that nobody here has heard of."""
+"""Aggregations in addition to the mean of means by their definitions, and custom ones."""
 
 import math
 import re
@@ -31,7 +31,7 @@ ORIGIN = torch.zeros(1, 3)
 
 
 def points_at(*distances):
-    """Reference points in the one cell, at these distances from a sensor point in the origin."""
+    """Create reference points in one cell at these distances from a sensor point at the origin."""
     return torch.tensor([[0.0, distance, 0.0] for distance in distances]).reshape(-1, 3)
 
 
@@ -52,7 +52,7 @@ def quantile(steps, level, grid=ONE_CELL, kind=Quantiles, **options):
 
 @pytest.mark.parametrize("level", [0.0, 0.1, 0.5, 0.9, 1.0])
 def test_quantiles_are_right_within_a_bin(level):
-    """A bin is 12 % wide, or 1 cm."""
+    """Bins are 12 % or 1 cm wide."""
     grid = BevGrid(x_m=(0.0, 64.0), y_m=(0.0, 64.0), cell_m=64.0, heights={"all": (-1.0, 1.0)})
     random = np.random.default_rng(0)
     distances = np.concatenate([10 ** random.uniform(-4, 1.7, 801)])
@@ -93,7 +93,7 @@ def test_frame_quantiles_are_quantiles_of_frame_means(level):
 
 
 def test_a_bad_moment_is_no_bad_point():
-    """One point in a hundred is blind in every step: no step is bad. One step in ten is blind: it is."""
+    """One blind point in a hundred per frame makes no bad frame; one blind frame in ten does."""
     spread = [(ORIGIN, points_at(*[0.02] * 99, 0.9))] * 10
     assert quantile(spread, 0.95, kind=FrameQuantiles) < 0.04
     moment = [(ORIGIN, points_at(*[0.02] * 10))] * 9 + [(ORIGIN, points_at(*[0.9] * 10))]
@@ -111,7 +111,7 @@ def test_blind_frames_saturate_unobserved_ones_do_not_count():
 
 
 def random_steps(count, seed=0):
-    """Points around the origin, with weights, seen from a few others."""
+    """Sample weighted reference points around the origin, and a few sensor points."""
     random = np.random.default_rng(seed)
     for _ in range(count):
         points, seen = (torch.from_numpy(random.uniform(-2, 2, (n, 3)) * [1, 1, 0.2]) for n in (60, 3))
@@ -133,7 +133,7 @@ def in_regions(steps, first=0, **options):
 
 
 def radii_in(region, sensor, reference, weights, band=BANDS["all"]):
-    """Of the points of a region, with their weights."""
+    """Compute the radii of the points of a region, with their weights."""
     low, high = (torch.tensor([region.x_m[end], region.y_m[end], band[end]]) for end in (0, 1))
     inside = ((reference >= low) & (reference < high)).all(dim=1)
     return torch.cdist(reference[inside], sensor).amin(dim=1).numpy(), weights[inside].numpy()
@@ -244,7 +244,7 @@ def test_any_number_of_a_result_has_an_estimate():
 
 @dataclass(frozen=True)
 class Blind(Aggregation):
-    """The share of points that nothing is near: all that an aggregation of sums has to be."""
+    """Share of points without a near sensor point: a minimal additive aggregation."""
 
     name: ClassVar[str] = "blind"
     description: ClassVar[str] = "blind shares"
@@ -285,7 +285,7 @@ def test_custom_aggregations_appear_in_maps_numbers_and_tables():
 
 @dataclass(frozen=True)
 class Minimum(Aggregation):
-    """The smallest radius: all that an aggregation has to be."""
+    """Smallest radius: a minimal aggregation."""
 
     name: ClassVar[str] = "minimum"
     description: ClassVar[str] = "minima"

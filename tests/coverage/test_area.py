@@ -1,4 +1,4 @@
-"""The estimate by area: a ratio of sums over square metres, which neither cells nor the number of points move."""
+"""Averages over area: ratios of sums that depend neither on cells nor on the number of points."""
 
 import math
 
@@ -19,7 +19,7 @@ def grid(cell_m=1.0):
 
 
 def steps_of(count, seed=0, points=40):
-    """Sensor cloud, reference cloud and square metres, over ten decades, of some steps."""
+    """Sample sensor clouds, reference clouds and area weights over ten decades for some frames."""
     random = torch.Generator().manual_seed(seed)
     size = torch.tensor([8.0, 4.0, 2.0])
     return [
@@ -40,7 +40,7 @@ def metric_over(steps, index=None, cell_m=1.0, **options):
 
 
 def by_hand(steps, low, high):
-    """The radius and the detections over all points in a band, each weighted with its square metres."""
+    """Compute the radius and the detections over all points in a band, weighted by area."""
     sums, whole = torch.zeros(3, dtype=torch.float64), 0.0
     for sensor, reference, m2 in steps:
         radius = torch.cdist(reference.double(), sensor.double()).amin(dim=1)
@@ -116,7 +116,7 @@ def of_odd(steps, index=None, regions=ODD):
 
 
 def twin(steps, region, low, high):
-    """The same in NumPy, point by point; of a polygon by the side of its edges that a point lies on."""
+    """Test points in NumPy one by one; for polygons by the side of each edge."""
     sums, whole = np.zeros(3), 0.0
     for sensor, reference, m2 in steps:
         points = reference.double().numpy()
@@ -230,7 +230,7 @@ def test_the_ray_budget_does_not_move_it():
 
 
 def simulated(region, reference_sensor, steps):
-    """Height -> (value, error) of the radius and of the detection."""
+    """Compute (value, error) of the radius and of the detection by band."""
     metric = CoverageMetric(
         BevGrid(x_m=region.x_m, y_m=region.y_m, cell_m=0.5), max_radius_m=50.0, num_blocks=16, has_area_weights=True
     )

@@ -1,4 +1,4 @@
-"""Bands over the local ground, and over z of the vehicle: closed forms, and what is refused."""
+"""Height bands above ground and over z of the vehicle frame: closed forms and refused inputs."""
 
 import dataclasses
 import math
@@ -30,7 +30,7 @@ def measured(grid, height=None, **parameters):
 
 
 def test_on_a_ramp_bands_follow_the_ground():
-    """By height the ramp is ground and what stands on it obstacle; by z the road is an obstacle from 5 to 20 m."""
+    """Above ground, the ramp is ground and objects are obstacles; by z the ramp is an obstacle from 5 to 20 m."""
     by_ground, by_z = measured(GROUND, HEIGHT), measured(VEHICLE)
     assert (by_ground.point_counts == 1).all()
     torch.testing.assert_close(by_ground.radius[:, 0].float(), torch.tensor([[0.0] * 40, [1.0] * 40]))

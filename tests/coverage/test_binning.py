@@ -1,4 +1,4 @@
-"""The scatter mean: one value a point in, one mean a cell out."""
+"""Means over the points of each cell."""
 
 import numpy as np
 import pytest
@@ -25,7 +25,7 @@ def test_means_are_those_of_a_loop(seed, points, cells, rows):
 
 
 def test_sums_are_taken_in_float64():
-    """Trap 8: 2**24 + 1 is not a float32, and 0.1 added 300,000 times in float32 drifts by more than 1e-5."""
+    """2**24 + 1 is not a float32, and a sum of 300,000 times 0.1 in float32 drifts by more than 1e-5."""
     count = 300_000
     values = torch.full((1, count), 0.1)
     found = compute_cell_means(torch.zeros(count, dtype=torch.int64), values)

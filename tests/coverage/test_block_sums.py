@@ -1,4 +1,4 @@
-"""Sums in blocks as lists: they are the arrays that they were made from."""
+"""Sparse sums in blocks equal the dense arrays they were made from."""
 
 import math
 
@@ -12,7 +12,7 @@ SHAPE, QUANTITIES = (5, 2, 3, 4), 3
 
 
 def arrays(share, seed=0):
-    """Arrays of which a share is not empty; a block and a cell are, in any case."""
+    """Sample arrays with a share of entries; at least one block and one cell are empty."""
     random = np.random.default_rng(seed)
     base = random.uniform(0.1, 9.0, SHAPE) * (random.random(SHAPE) < share)
     base[3], base[:, 1, 2, 3] = 0, 0

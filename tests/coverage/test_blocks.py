@@ -1,4 +1,4 @@
-"""Blocks of steps and the errors made from them, against plain loops; weights of reference points."""
+"""Blocks of frames and their standard errors against plain loops; weights of reference points."""
 
 import copy
 import math
@@ -21,14 +21,14 @@ EVERYWHERE = Region("everywhere", GRID.x_m, GRID.y_m)
 
 
 def clouds_of(radii: dict[int, list[float]]) -> tuple[torch.Tensor, torch.Tensor]:
-    """Sensor and reference with these radii in these cells: a sensor point straight below each reference point."""
+    """Create clouds with these radii in these cells: a sensor point vertically below each reference point."""
     places = [(100 * cell + 10 + 20 * at, 50.0, radius) for cell, own in radii.items() for at, radius in enumerate(own)]
     x, y, radius = torch.tensor(places, dtype=torch.float32).view(-1, 3).T
     return torch.stack([x, y, -radius], dim=1), torch.stack([x, y, 0 * radius], dim=1)
 
 
 def random_steps(count: int, seed: int = 0, *, dyadic: bool = False, weighted: bool = False) -> list[dict]:
-    """Steps with one to three points in some cells: their radii, the same as clouds, and what else `update` takes."""
+    """Sample frames with one to three points in some cells: radii, clouds, and further arguments of `update`."""
     random = np.random.default_rng(seed)
     steps = []
     for index in range(count):
@@ -53,7 +53,7 @@ def metric_over(steps, *, blocks=16, **options) -> CoverageMetric:
 
 
 def slow_blocks(steps, blocks: int, *, weighted: bool = False) -> dict[str, np.ndarray]:
-    """The sums in blocks in plain loops."""
+    """Compute the sums in blocks by plain loops."""
     last = max(step["more"]["block_index"] for step in steps)
     length = 1
     while last // length >= blocks:
@@ -73,7 +73,7 @@ def slow_blocks(steps, blocks: int, *, weighted: bool = False) -> dict[str, np.n
 
 
 def slow_jackknife(left_out: list[float], whole: float, sizes: list[float]) -> float:
-    """The delete-m_j jackknife as Busing, Meijer and van der Leeden write it."""
+    """Compute the delete-m_j jackknife in the notation of Busing, Meijer and van der Leeden."""
     g, n = len(sizes), sum(sizes)
     estimate = g * whole - sum((1 - m / n) * part for m, part in zip(sizes, left_out, strict=True))
     variance = 0.0
@@ -94,7 +94,7 @@ def slow_region_error(sums: dict[str, np.ndarray], name: str) -> float:
 
 
 def assert_same_state(one: CoverageMetric, other: CoverageMetric) -> None:
-    """Bit for bit."""
+    """Check equality of all bits."""
     for name, value in one.metric_state.items():
         assert torch.equal(value, other.metric_state[name]), name
 
@@ -130,7 +130,7 @@ def test_equal_blocks_give_no_interval():
 
 @pytest.mark.parametrize(("radius", "detection_error"), [(0.25, 1.0), (1.0, 1.0), (0.0, 1.0)])
 def test_cell_errors_are_never_zero(radius, detection_error):
-    """Ten blocks that all say the same, and two more in which all is seen, or nothing: 12 values about a mean of 10."""
+    """Ten equal blocks and two pseudo-blocks with everything or nothing detected: 12 values around a mean of 10."""
     coverage = metric_over(
         [{"clouds": clouds_of({0: [radius]}), "more": {"block_index": at}} for at in range(40)]
     ).compute()
@@ -198,7 +198,7 @@ def test_without_blocks_there_are_no_errors():
 
 
 def test_difference_errors_equal_errors_of_paired_values():
-    """Half of what both rigs share is noise a hundred times the difference: it cancels out."""
+    """Shared noise of a hundred times the difference cancels out."""
     random = np.random.default_rng(0)
     shared, own = 2 * random.random(16), 0.02 * random.random(16)
     estimates = []
@@ -229,7 +229,7 @@ def test_the_order_of_the_steps_does_not_matter():
 
 @pytest.mark.parametrize("parts", [2, 3, 7])
 def test_interleaved_parts_merge_into_the_whole(parts):
-    """Parts that end early have shorter blocks; merging brings them to one length, whichever comes first."""
+    """Short parts have shorter blocks; merging in any order makes the lengths equal."""
     steps = random_steps(50, dyadic=True)
     shares = [steps[at::parts] for at in range(parts)]
     shares[0] = shares[0][:3]
@@ -420,7 +420,7 @@ def test_bad_weights_are_refused_and_nothing_is_counted(weights, message):
 
 
 def test_weights_compensate_the_density_of_points():
-    """r = x from a sensor point at x = 0: the mean over [0, 1) is 1/2, the share within 0.3 m is 0.3."""
+    """With a sensor point at x = 0, r = x: the mean over [0, 1) is 1/2, the share within 0.3 m is 0.3."""
     uniform = torch.rand(200_000, generator=torch.Generator().manual_seed(0))
     line = BevGrid(x_m=(0.0, 1.0), y_m=(0.0, 1.0), cell_m=1.0, heights={"all": (-1.0, 1.0)})
     # Density p(x) = 1/2 + x, by the inverse of its integral; the weights are 1 / p(x).
@@ -441,7 +441,7 @@ def test_weights_compensate_the_density_of_points():
 
 
 def coverage_of(radii: np.ndarray, probed: np.ndarray) -> Coverage:
-    """A coverage of (steps, cells) radii, in 16 blocks, without the detour over clouds."""
+    """Create a coverage from (frames, cells) radii in 16 blocks, without clouds."""
     radii, probed = (torch.from_numpy(values).double().view(16, -1, *GRID.shape) for values in (radii, probed))
     values = torch.stack([radii, (radii <= THRESHOLD).double()]) * probed
     frames, sums = probed.sum(dim=1).long(), values.sum(dim=2)
@@ -461,7 +461,7 @@ def coverage_of(radii: np.ndarray, probed: np.ndarray) -> Coverage:
 
 @pytest.mark.parametrize("alike", [1, 4])
 def test_reported_errors_equal_the_spread_over_runs(alike):
-    """Independent steps, and steps that are alike in fours, as many as a block has."""
+    """Independent frames, and groups of four equal frames, the length of a block."""
     random = np.random.default_rng(0)
     numbers, errors, cells, of_cells = [], [], [], []
     for _ in range(300):
@@ -481,7 +481,7 @@ def test_reported_errors_equal_the_spread_over_runs(alike):
 
 
 def test_two_errors_cover_cells_with_rare_events():
-    """In one block of ten a cell is blind: most runs of 16 blocks have seen it once or twice, and every fifth never."""
+    """A cell is blind in one block of ten: most runs of 16 blocks contain it once or twice, every fifth run never."""
     blind = torch.from_numpy(np.random.default_rng(1).random((500, 16, 1, 1, 1)) < 0.1)
     once = torch.ones((16, 1, 1, 1), dtype=torch.int64)
     for unit, seen, truth in (("share", (~blind).double(), 0.9), ("m", torch.where(blind, 1.0, 0.2).double(), 0.28)):

@@ -1,4 +1,4 @@
-"""The numbers of a region over its known cells."""
+"""Numbers of regions over observed cells."""
 
 import math
 
@@ -14,7 +14,7 @@ PART = Region("part", x_m=(1.0, 7.0), y_m=(0.0, 3.0))
 
 
 def steps_of(count, seed=0, points=12):
-    """Clouds that leave some cells unknown and probe others once or twice."""
+    """Sample clouds that observe some cells never and others once or twice."""
     random = np.random.default_rng(seed)
     return [
         (

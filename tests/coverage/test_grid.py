@@ -1,4 +1,4 @@
-"""The grid: half-open cells [lo, hi) on every axis, decided in one place."""
+"""Grid of half-open cells [lo, hi) on every axis."""
 
 import math
 from fractions import Fraction
@@ -19,7 +19,7 @@ def at(x=0.5, y=0.5, z=0.0, dtype=torch.float64):
 
 
 def index_of(grid, point):
-    """(h, y, x) of the one point's cell, or None."""
+    """Return (h, y, x) of the cell of a point, or None."""
     cell = grid.find_cells(point).item()
     return None if cell < 0 else tuple(int(i) for i in np.unravel_index(cell, grid.shape))
 
@@ -86,7 +86,7 @@ def test_cell_indices_run_over_bands_then_rows():
     ("cell", "bounds"), [(0.1, (0, 20)), (0.1, (-7, 3)), (0.3, (-3, 6)), (0.7, (0, 7)), (0.01, (0, 1))]
 )
 def test_a_border_is_the_decimal_that_one_writes(cell, bounds):
-    """Multiples of 0.1 are not representable: 3 * 0.1 > 0.3, and a point at x = 0.3 belongs to the cell from 0.3 on."""
+    """Multiples of 0.1 are not representable: 3 * 0.1 > 0.3, yet a point at x = 0.3 belongs to the cell [0.3, 0.4)."""
     grid = BevGrid(x_m=bounds, y_m=(0.0, cell), cell_m=cell, heights=ONE_BAND)
     decimal = Fraction(str(cell))
     borders = [float(bounds[0] + decimal * k) for k in range(grid.shape[2] + 1)]
@@ -142,7 +142,7 @@ def test_points_of_any_dtype_are_compared_exactly(dtype):
     ],
 )
 def test_cells_equal_a_search_among_the_edges(x, cell, monkeypatch):
-    """On every border, beside it, between, far out, and for what is no number; in one part and in several."""
+    """Test values on edges, next to them, between them, far outside and NaN, in one chunk and in several."""
     grid = BevGrid(x_m=x, y_m=(0.0, cell), cell_m=cell, heights=ONE_BAND)
     edges = grid.x_edges_m.numpy()
     between = np.random.default_rng(0).uniform(*x, 5000)

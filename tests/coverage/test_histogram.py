@@ -1,4 +1,4 @@
-"""Quantiles from a histogram whose size is fixed."""
+"""Quantiles from histograms of fixed size."""
 
 import math
 
@@ -45,7 +45,7 @@ def test_quantiles_are_linear_within_a_bin():
 @pytest.mark.parametrize("weights", [(0.1, 0.2, 0.3, 0.6), (1, 2, 3, 6), (0.7, 0.1, 0.8), (1 / 3, 1 / 3, 2 / 3)])
 @pytest.mark.parametrize("scale", [1e-9, 0.1, 0.3, 1.0, 7e9])
 def test_ties_do_not_depend_on_rounding_of_weights(weights, scale):
-    """Half of the weight lies below 1, and the other half from 10 on: the median is 1, and never 10."""
+    """With half of the weight below 1 and half from 10 on, the median is 1, never 10."""
     *below, above = weights
     edges = torch.tensor([*torch.linspace(0, 1, len(below) + 1), 10.0, 11.0], dtype=torch.float64)
     histogram = scale * torch.tensor([*below, 0.0, above], dtype=torch.float64)[:, None]

@@ -1,4 +1,4 @@
-"""What `CoverageMetric` computes: the definitions, by hand and against plain loops."""
+"""Coverage metric: definitions in closed form and against plain loops."""
 
 import math
 
@@ -24,7 +24,7 @@ def cloud(*rows, dtype=torch.float32):
 
 
 def points_at(*distances, dtype=torch.float32):
-    """Reference points in the one cell, at these distances from a sensor point in the origin."""
+    """Create reference points in one cell at these distances from a sensor point at the origin."""
     return torch.tensor([[0.0, distance, 0.0] for distance in distances], dtype=dtype).reshape(-1, 3)
 
 
@@ -39,12 +39,12 @@ def coverage(steps, grid=ONE_CELL, *args, **kwargs):
 
 
 def map_of(result, name):
-    """A map by its key, or by the name of an attribute."""
+    """Return a map by its key, or by the name of an attribute."""
     return result.layers[name].values if name in result.layers else getattr(result, name)
 
 
 def random_steps(seed, steps=3, dyadic=True, empty=True):
-    """Clouds that reach beyond the grid; `dyadic` puts points on borders and at exact distances."""
+    """Sample clouds that reach beyond the grid; `dyadic` puts points on edges and at exact distances."""
     random = np.random.default_rng(seed)
     clouds = []
     for _ in range(steps):
@@ -58,7 +58,7 @@ def random_steps(seed, steps=3, dyadic=True, empty=True):
 
 @pytest.mark.parametrize("backend", ["cdist", "kdtree"])
 def test_radius_of_one_sensor_point_above_a_plane(backend):
-    """r is the distance to that point; a grid of four points a cell, two bands of which one is empty."""
+    """r is the distance to the sensor point; four reference points per cell, and one of two bands is empty."""
     grid = BevGrid(x_m=(-4.0, 4.0), y_m=(-2.0, 2.0), cell_m=1.0)
     x, y = torch.meshgrid(torch.arange(-4, 4, 0.5) + 0.25, torch.arange(-2, 2, 0.5) + 0.25, indexing="ij")
     plane = torch.stack([x.flatten(), y.flatten(), torch.zeros(128)], dim=1)
@@ -75,7 +75,7 @@ def test_radius_of_one_sensor_point_above_a_plane(backend):
 
 
 def test_a_mean_of_means_not_a_pooled_mean():
-    """Trap 4: a step with 1 point in a cell weighs as much as a step with 1000."""
+    """A frame with 1 point in a cell weighs as much as a frame with 1000."""
     result = coverage([(ORIGIN, points_at(*[0.125] * 1000)), (ORIGIN, points_at(0.875))], aggregations=[PooledMean()])
     assert result.radius.item() == 0.5
     assert result.detection.item() == 0.5
@@ -91,7 +91,7 @@ def test_frames_count_only_in_cells_with_points():
 
 
 def test_nearest_sensor_points_may_lie_outside_the_grid():
-    """Trap 3: the sensor cloud is never cropped."""
+    """The sensor cloud is never cropped."""
     outside = cloud([-0.25, 0.5, 0], [0.5, 0.5, 5.0])
     assert coverage([(outside, cloud([0.25, 0.5, 0]))]).radius.item() == 0.5
 
@@ -197,7 +197,7 @@ def test_max_radius_saturates_every_number(max_radius):
 
 
 def test_bounded_searches_detect_exactly_the_same():
-    """Whoever wants detection only may bound the search by the largest threshold."""
+    """For detection rates alone, the search may end at the largest threshold."""
     steps = random_steps(11, steps=6)
     whole, bounded = (coverage(steps, GRID, (0.25, 0.5), max_radius_m=limit) for limit in (math.inf, 0.5))
     assert torch.equal(whole.detection.nan_to_num(-1), bounded.detection.nan_to_num(-1))
@@ -369,7 +369,7 @@ def test_errors_of_other_shapes_are_refused(given, error, message):
 
 
 def test_a_step_split_in_two_is_another_number():
-    """The unit is the step: twice half of its points is not the step."""
+    """Frames are the unit: two halves of the points of a frame are not the frame."""
     whole = coverage([(ORIGIN, points_at(0.125, 0.5, 0.875))])
     parts = coverage([(ORIGIN, points_at(0.125)), (ORIGIN, points_at(0.5, 0.875))])
     assert whole.point_counts.item() == parts.point_counts.item()

@@ -1,4 +1,4 @@
-"""Numbers of the coverage under torchmetrics' own tracker and collection."""
+"""Coverage numbers in the tracker and in collections of torchmetrics."""
 
 import math
 import pickle

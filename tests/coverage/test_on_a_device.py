@@ -1,4 +1,4 @@
-"""The sums of a metric on another device: nothing is mixed, nothing comes back. Without a GPU, by pretending one."""
+"""Sums of a metric on another device, without mixed devices and copies to the host; by default on an emulated GPU."""
 
 import numpy as np
 import pytest
@@ -24,14 +24,14 @@ MOVES = ("to", "cpu", "numpy", "tolist", "copy_")
 
 
 class OnGpu(torch.Tensor):
-    """A tensor that says that it is on a GPU."""
+    """CPU tensor that pretends to be on a GPU."""
 
     device = GPU
     __torch_function__ = torch._C._disabled_torch_function_impl
 
 
 class OnMps(OnGpu):
-    """A tensor that says that it is on Apple's GPU."""
+    """CPU tensor that pretends to be on an Apple GPU."""
 
     device = MPS
 
@@ -41,14 +41,14 @@ def is_device(leaf):
 
 
 def goal_of(name, args, kwargs):
-    """The device that is asked for, if one is."""
+    """Return the requested device, if any."""
     given = [kwargs.get("device"), *(args[1:] if name == "to" else ()), "cpu" if name == "cpu" else None]
     devices = [one.device if isinstance(one, torch.Tensor) else one for one in given]
     return next((torch.device(one) for one in devices if isinstance(one, torch.device | str)), None)
 
 
 class PretendedGpu(TorchFunctionMode):
-    """Refuses what a GPU refuses or would copy silently, and lists what is copied from it, by its size."""
+    """Mode that rejects operations that a GPU rejects or that copy silently, and lists copies to the host by size."""
 
     def __init__(self, device=GPU):
         super().__init__()
@@ -119,7 +119,7 @@ def test_the_sums_stay_on_the_device():
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
 def test_a_gpu_adds_up_what_the_cpu_does():
-    """But for the order in which float64 is added up, and the last bit of a distance."""
+    """Results are equal up to the order of float64 sums and the last bit of distances."""
     grid = BevGrid(x_m=(0.0, 20.0), y_m=(0.0, 20.0), cell_m=1.0, heights={"low": (0.0, 4.0), "high": (4.0, 20.0)})
     options = {
         "max_radius_m": 30.0,
@@ -153,7 +153,7 @@ def test_box_visibility_stays_on_the_device(monkeypatch):
 
 
 def test_devices_without_float64_get_what_the_cpu_computes():
-    """Results return to the device of the caller, in float32 where they would be float64; sums stay on the CPU."""
+    """Results return to the device of the caller, float64 as float32; sums stay on the CPU."""
     grid = BevGrid(x_m=(0.0, 20.0), y_m=(0.0, 20.0), cell_m=1.0, heights={"low": (0.0, 4.0), "high": (4.0, 20.0)})
     boxes = Boxes.from_rows(torch.tensor([[5.0, 5, 5, 8, 8, 8, 0.3], [15.0, 15, 15, 8, 8, 8, 0]]))
     camera = Camera.from_fov(4, 3, 90.0)

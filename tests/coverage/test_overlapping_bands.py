@@ -1,4 +1,4 @@
-"""Bands may overlap: each says what it would say alone."""
+"""Overlapping bands do not affect each other."""
 
 import pytest
 import torch

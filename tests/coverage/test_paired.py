@@ -1,4 +1,4 @@
-"""Differences between rigs: what is significant, by SciPy's own tests."""
+"""Differences between rigs and their significance, against SciPy."""
 
 import numpy as np
 import pytest
@@ -43,7 +43,7 @@ def test_only_paired_results_can_be_compared(other, message):
 @pytest.mark.parametrize("shift", [0.0, 0.05, 0.1, 0.3])
 @pytest.mark.parametrize("seed", range(4))
 def test_significance_equals_a_paired_t_test(shift, seed):
-    """One step a block and one cell: radii whose differences are `shift` and noise."""
+    """One frame per block and one cell: radii that differ by `shift` and noise."""
     random = np.random.default_rng(seed)
     shared = 1 + random.random(16)
     radii = {"a": shared, "b": shared + shift + 0.2 * random.standard_normal(16)}

@@ -1,4 +1,4 @@
-"""The map that `CoverageMetric.plot` draws."""
+"""Maps of `CoverageMetric.plot`."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""What a rig is without each of its sensors: what the metric of the others says."""
+"""Redundancy: a rig without a sensor equals a metric of the other sensors."""
 
 import math
 

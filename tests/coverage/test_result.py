@@ -1,4 +1,4 @@
-"""`Coverage`: region numbers, files, and the quantiles behind them."""
+"""Coverage: numbers of regions, files and quantiles."""
 
 import io
 import json
@@ -203,7 +203,7 @@ def test_a_file_gives_back_what_was_saved(tmp_path, options, as_text):
 
 
 def test_loaded_results_keep_errors_and_comparisons(tmp_path):
-    """To the last bit: what is written is the sums in blocks, not what was made of them."""
+    """Loaded results are equal in all bits, since files contain the sums in blocks."""
     random = torch.Generator().manual_seed(3)
     grid = BevGrid(x_m=(0.0, 4.0), y_m=(-2.0, 2.0), cell_m=1.0, heights={"all": (-1.0, 1.0)})
     region, found = Region("all", grid.x_m, grid.y_m), {}
@@ -264,7 +264,7 @@ def test_rubbish_is_refused(saved, content):
 
 
 def test_a_damaged_file_is_refused_or_read_right(saved):
-    """Wherever it is cut or a byte is flipped: one kind of error, or a byte that carries nothing."""
+    """A cut or a flipped byte anywhere raises the one error, unless the byte has no effect."""
     content, result = saved.read_bytes(), Coverage.load(saved)
     damaged = [content[:cut] for cut in range(0, len(content), 53)]
     damaged += [content[:at] + bytes([content[at] ^ 0xFF]) + content[at + 1 :] for at in range(0, len(content), 17)]
@@ -280,7 +280,7 @@ def test_a_damaged_file_is_refused_or_read_right(saved):
 
 
 def rewrite(path, header=None, **arrays):
-    """Save again with another header or other arrays; None leaves one out."""
+    """Save again with another header or other arrays; None removes an array."""
     with np.load(path) as file:
         content = {**dict(file), **arrays}
     if header is not None:
@@ -347,7 +347,7 @@ def test_blocks_that_do_not_fit_are_refused(saved_in_blocks, change, message):
 
 
 def test_empty_blocks_count_as_memory(saved_in_blocks, monkeypatch):
-    """A million blocks are some kB in a file, and errors are made of all known cells in all blocks."""
+    """A million blocks take kilobytes in a file, yet errors need all observed cells in all blocks."""
     many = np.zeros(1_000_000, np.int64)
     rewrite(
         saved_in_blocks,
@@ -376,7 +376,7 @@ def test_another_format_is_refused_by_its_number(saved, number, then):
 
 
 def test_torch_loads_results_with_weights_only():
-    """As Lightning does with the hyperparameters of a checkpoint."""
+    """Load as Lightning does for hyperparameters in checkpoints."""
     grid, region = BevGrid(x_m=(0.0, 1.0), y_m=(0.0, 1.0)), Region("a", x_m=(0.0, 1.0), y_m=(0.0, 1.0))
     options = {
         "num_blocks": 8,

@@ -1,4 +1,4 @@
-"""The sums of `CoverageMetric`, beyond what the contract of all metrics says (`tests/metrics`)."""
+"""Sums of `CoverageMetric`, in addition to the contract of all metrics in `tests/metrics`."""
 
 import copy
 
@@ -15,7 +15,7 @@ STEP = (torch.tensor([[1.0, 0.0, 0.0]]), torch.zeros(1, 3))
 
 
 def test_sums_over_very_many_steps_do_not_drift():
-    """Trap 8: in float32, 2**25 + 1 is 2**25, and from there on no step would count."""
+    """In float32, 2**25 + 1 is 2**25, so that no further frame would count."""
     metric = CoverageMetric(ONE_CELL, (2.0,))
     metric.update(*STEP)
     metric.persistent(True)
@@ -41,7 +41,7 @@ def test_state_size_depends_on_touched_cells_only(cell):
 
 
 def test_time_of_summation_changes_no_bit():
-    """Reading the state adds up what waits: after every step, or once."""
+    """Reading the state adds pending rows: after every frame, or once."""
     grid = BevGrid(x_m=(0.0, 1.0), y_m=(0.0, 1.0), cell_m=0.1, heights={"all": (-1.0, 1.0)})
     every = [CoverageMetric(grid, num_blocks=8, aggregations=[Maximum(), PooledMean()]) for _ in range(3)]
     for at in range(40):

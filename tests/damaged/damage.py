@@ -1,4 +1,4 @@
-"""Ways to damage a file."""
+"""Methods to damage a file."""
 
 import io
 import re
@@ -48,7 +48,7 @@ def _damaged(data, others, random):
 
 
 def _place(data, random):
-    """Somewhere, with a preference for headers."""
+    """Choose a position, preferably in the header."""
     return random.randrange(min(len(data), random.choice((16, 200, 10**6))) + 1)
 
 
@@ -101,7 +101,7 @@ def _lines(data, random):
 
 
 def _field(data, random):
-    """A row with a column more or less, a name that is another."""
+    """Damage a row by an additional or missing column, or another name."""
     words = re.split(rb"([ ,]+)", data[:4000])
     at = random.randrange(len(words))
     words[at : at + 1] = random.choice(([], [words[at]] * 3, [random.choice(words)]))
@@ -128,7 +128,7 @@ def _spliced(data, others, random):
 
 
 def _inside_archive(data, others, random):
-    """An archive whose checksums are right and whose files are not."""
+    """Damage the files of an archive and keep its checksums valid."""
     with zipfile.ZipFile(io.BytesIO(data)) as file:
         members = {name: file.read(name) for name in file.namelist()}
     name = random.choice(list(members))
@@ -137,7 +137,7 @@ def _inside_archive(data, others, random):
 
 
 def _inside_png(data, others, random):
-    """An image whose checksums are right and whose content is not."""
+    """Damage the content of an image and keep its checksums valid."""
     chunks, at = [], 8
     while at < len(data):
         (length,) = struct.unpack(">I", data[at : at + 4])

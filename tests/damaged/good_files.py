@@ -1,4 +1,4 @@
-"""A good file of every format that is read."""
+"""Valid files of all formats that are read."""
 
 import io
 import struct
@@ -65,14 +65,14 @@ class Kind:
 
 
 def stored(write):
-    """The bytes that a function writes into a file."""
+    """Return the bytes that a function writes to a file."""
     stream = io.BytesIO()
     write(stream)
     return stream.getvalue()
 
 
 def archive(members, compression=zipfile.ZIP_DEFLATED):
-    """A ZIP archive of these files."""
+    """Create a ZIP archive of files."""
 
     def write(stream):
         with zipfile.ZipFile(stream, "w", compression) as file:
@@ -83,7 +83,7 @@ def archive(members, compression=zipfile.ZIP_DEFLATED):
 
 
 def rows(points, separator):
-    """Points as text."""
+    """Create points as text."""
     return "".join(separator.join(f"{value:.4f}" for value in point) + "\n" for point in points.tolist()).encode()
 
 
@@ -198,14 +198,14 @@ BOXES = b"t,id,category,x,y,z,length,width,height,yaw\n" + b"".join(
 
 
 def mesh(path):
-    """Read a mesh; that a damaged one is not closed is no news."""
+    """Read a mesh without the warning that it is not closed."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", ".*the mesh is not closed")
         return MeshFile(type="mesh", path=path).build_mesh()
 
 
 def scene_files():
-    """What scenes are made from: trajectories, boxes, meshes and documents."""
+    """List files of scenes: trajectories, boxes, meshes and documents."""
     poses = {"times_s": np.arange(5.0), "world_T_body": np.stack([np.eye(4)] * 5)}
     ball = trimesh.creation.icosphere(subdivisions=1)
     yield Kind("trajectory.csv", TRAJECTORY, read_trajectory)
@@ -221,7 +221,7 @@ def scene_files():
 
 
 def track_files(folder):
-    """Recorded tracks, and files of SUMO."""
+    """List files of recorded tracks and of SUMO."""
     log = write_argoverse2(Path(folder) / "log", OTHERS[:3])
     tables = write_nuscenes(Path(folder) / "tables", OTHERS[:3])
     table = write_csv(Path(folder) / "table", OTHERS[:2])
@@ -248,7 +248,7 @@ ROUTES = b"""<routes><vType id="taxi" vClass="taxi" length="4.6"/><vType id="bik
 
 
 def recording_files(folder):
-    """What recordings are made of beside clouds, as a drive leaves it."""
+    """List files of recordings other than clouds."""
     drive, places = Drive(steps=3), {}
     for layout, write in LAYOUTS.items():
         (Path(folder) / layout).mkdir()
@@ -276,7 +276,7 @@ def recording_files(folder):
 
 
 def bag(path):
-    """Read all of a bag."""
+    """Read a whole bag."""
     recording = RosBag(path)
     for index in recording.key_frames:
         for sensor in recording.sensors:
@@ -287,7 +287,7 @@ KITTI_LABEL = b"Car 0.00 0 1.5 100 100 200 200 1.5 1.6 3.9 1.0 1.6 20.0 1.5\n" *
 
 
 def checkpoint(folder):
-    """A checkpoint of one observer."""
+    """Create a checkpoint of one observer."""
     path = Path(folder) / "checkpoint.npz"
     run = {"num_frames": 3, "counts": {"sensor_rays": 9}, "skipped_frames": [], "duration_s": 1.5}
     state = {"dense": torch.arange(1, 40), "sparse": torch.eye(20, dtype=torch.float64), "looks": [1, None, "two"]}

@@ -1,4 +1,4 @@
-"""Read damaged files with every reader: the outcome, the time and the memory that it takes."""
+"""Read damaged files with every reader, and measure outcome, time and memory."""
 
 import contextlib
 import os
@@ -21,11 +21,11 @@ STOP_SECONDS = 30
 
 
 class Endless(BaseException):
-    """A reader was stopped; nothing that catches errors catches this."""
+    """Timeout of a reader, not caught by handlers of errors."""
 
 
 def mutated(every, number, seed=0):
-    """The bytes of the mutated file of this number and seed: always the same."""
+    """Return the bytes of the mutated file of a number and seed, always the same."""
     kind, draw = every[number % len(every)], random.Random(f"mutated file {number}" + f" of {seed}" * (seed > 0))
     return damaged(kind.data, [other.data for other in every], draw)
 
@@ -79,7 +79,7 @@ def attempt_pipe(kind, folder):
 
 
 def bombs(every):
-    """Small files that claim, or really become, gigabytes."""
+    """Create small files that claim or decompress to gigabytes."""
     clouds = {kind.name: kind for kind in every}
 
     def of(name, data):
@@ -117,7 +117,7 @@ def bombs(every):
 
 
 def _deflated_zeros(megabytes):
-    """A raw deflate stream of zeros; its blocks are all alike, so one is made."""
+    """Create a raw deflate stream of zeros from copies of one block."""
 
     def part(mode):
         packer = zlib.compressobj(9, zlib.DEFLATED, -15)
@@ -170,7 +170,7 @@ def _stop(*_):
 
 @contextlib.contextmanager
 def silence_libraries():
-    """OpenEXR prints what it finds."""
+    """Suppress messages of OpenEXR."""
     kept, nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, 2)
     try:

@@ -1,4 +1,4 @@
-"""Estimates: what numbers and differences say of sums in blocks, by hand and by SciPy."""
+"""Estimates, numbers and differences from sums in blocks, in closed form and against SciPy."""
 
 import math
 from dataclasses import replace
@@ -16,7 +16,7 @@ BOTH = (RADIUS, make_detection_quantity(0.4))
 
 
 def sums(blocks, seed=0):
-    """Square metres in each block, and radius and detection times them."""
+    """Sample the area of each block, and area times radius and detection."""
     random = np.random.default_rng(seed)
     m2 = 1.0 + random.random(blocks)
     return m2, m2[:, None] * random.random((blocks, 2))
@@ -124,7 +124,7 @@ def test_truncated_estimates_use_the_first_blocks_only():
 
 
 def drawn(blocks, mean, spread, seed, size=2.0):
-    """Ratios of blocks of a world, with an error that is known from what was drawn."""
+    """Sample ratios of blocks with a known error."""
     ratios = mean + spread * torch.randn(blocks, 1, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
     m2 = torch.full((blocks,), size, dtype=torch.float64)
     return Estimate.from_ratios((RADIUS,), m2, m2[:, None] * ratios, torch.ones(blocks, dtype=torch.int64))

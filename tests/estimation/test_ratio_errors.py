@@ -1,4 +1,4 @@
-"""Standard errors of ratios of sums, cell by cell: over steps, and over square metres."""
+"""Standard errors of ratios of sums in cells, over frames and over area."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from torchcover.estimation import compute_jackknife_error, estimate_ratio_errors
 
 
 def blocks_of(cells: int, blocks: int = 16, seed: int = 0):
-    """Square metres and detected ones, which go together."""
+    """Sample areas and detected areas, which are correlated."""
     random = torch.Generator().manual_seed(seed)
     m2 = 0.5 + torch.rand(blocks, cells, generator=random, dtype=torch.float64)
     return m2, m2 * (0.4 * m2 + 0.2 * torch.rand(blocks, cells, generator=random, dtype=torch.float64)).clamp(max=1)
@@ -46,7 +46,7 @@ def test_ratio_errors_are_independent_of_area_units():
 
 
 def test_two_errors_cover_a_share_near_one():
-    """Blocks of six draws of which 95 % are seen: with the plain spread, 14 of 100 intervals would miss."""
+    """Blocks of six samples with 95 % detected: with the plain spread, 14 of 100 intervals would miss."""
     random = np.random.default_rng(3)
     for blocks in (11, 16):
         sums = torch.from_numpy(random.binomial(6, 0.95, (blocks, 4000)).astype(float))

@@ -1,4 +1,4 @@
-"""Student's t, by SciPy's, and the 95 % interval of a number: its range, its symmetries, and whether it covers."""
+"""Student's t against SciPy, and range, symmetry and coverage of 95 % confidence intervals."""
 
 import math
 
@@ -35,7 +35,7 @@ def test_the_probability_of_t_is_students(freedom):
 
 
 def twin(value, error, freedom, quantity, is_difference):
-    """The ends, in SciPy's words."""
+    """Compute the ends of the interval with SciPy."""
     t = error * stats.t.ppf(0.975, freedom) * np.array([-1.0, 1.0])
     if quantity.unit == "m":
         t[int(value > 0) if is_difference else int(quantity.lower_is_better)] *= BLIND_SIDE_FACTOR
@@ -85,7 +85,7 @@ def test_absurd_errors_leave_no_range(value, error):
 
 @pytest.mark.parametrize(("quantity", "sigma"), [(RADIUS, 0.7), (SHARE, 0.7)])
 def test_means_of_skewed_blocks_are_covered(quantity, sigma):
-    """Eleven blocks of a lognormal radius, and of the share of them that is near."""
+    """Sample eleven blocks of a lognormal radius and of the share within a threshold."""
     radii = np.exp(sigma * np.random.default_rng(0).standard_normal((2000, 11)))
     each = radii if quantity is RADIUS else np.clip(2.0 - radii, 0.01, 0.99)
     truth, errors = each.mean(), each.std(axis=1, ddof=1) / math.sqrt(11)

@@ -1,4 +1,4 @@
-"""Readers whose libraries misbehave, for a process of their own."""
+"""Isolated readers whose libraries misbehave."""
 
 import ctypes
 import os

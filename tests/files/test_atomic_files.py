@@ -33,7 +33,7 @@ with lock_folder(Path(sys.argv[1])):
 
 
 def publish(folder, *contents):
-    """Publish files, those of each content after those of the one before."""
+    """Publish the files of each content, one content after another."""
     with AtomicOutput(folder) as files:
         for content in contents:
             for name, text in content.items():
@@ -48,7 +48,7 @@ def read(path):
 
 
 def read_folder(folder):
-    """Return what a reader finds under each name, and the names in the manifest; BadFileError: it is incomplete."""
+    """Read each file and the names in the manifest; BadFileError for incomplete results."""
     texts = {}
     for name in {**EARLIER, **NUMBERS, **MAPS, **MINE}:
         if (folder / name).exists():
@@ -61,7 +61,7 @@ def list_files(folder):
 
 
 def write_earlier(folder):
-    """Write the earlier files; returns what a reader finds then, and after the first and the second publication."""
+    """Write the earlier files; return what readers find then, and after the first and the second publication."""
     (folder / "maps").mkdir(parents=True)
     for name, text in MINE.items():
         (folder / name).write_text(text)
@@ -71,7 +71,7 @@ def write_earlier(folder):
 
 @pytest.fixture
 def other(tmp_path):
-    """Another process that has locked the folder."""
+    """Start another process that locks the folder."""
     with subprocess.Popen(
         [sys.executable, "-c", LOCK, tmp_path / "out"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as process:
@@ -253,7 +253,7 @@ def test_a_manifest_that_lists_others_deletes_nothing(tmp_path, name):
 
 
 def special(path, kind, target):
-    """Make a path a link to a target, or another thing that is no regular file."""
+    """Create a link to a target, or another special file."""
     path.unlink(missing_ok=True)
     if kind == "link":
         path.symlink_to(target)
@@ -335,7 +335,7 @@ def test_special_files_as_manifests_do_not_block_readers(tmp_path, kind):
 
 
 def limited(act):
-    """Do it where a file has room for 2,000 bytes; returns what the error says."""
+    """Run an action with a file size limit of 2,000 bytes; return the error message."""
     there, here = os.pipe()
 
     def write():

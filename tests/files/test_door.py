@@ -1,4 +1,4 @@
-"""What the readers of every room share."""
+"""Checks that all readers share."""
 
 import re
 import time

@@ -1,4 +1,4 @@
-"""Whatever a library does with a file, the run goes on, and the file is named."""
+"""Isolated readers: the run continues and the file is named, whatever a library does."""
 
 import json
 import os

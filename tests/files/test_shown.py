@@ -1,4 +1,4 @@
-"""What others named is shown, and nothing more."""
+"""Foreign names are displayed without side effects."""
 
 import csv
 import io

@@ -1,4 +1,4 @@
-"""YAML: every key once, numbers only where numbers stand, and an end to it."""
+"""YAML: unique keys, numbers of YAML 1.2, and limits of size."""
 
 import math
 import time

@@ -1,4 +1,4 @@
-"""When two outlines that move straight on touch."""
+"""Contact time of two outlines in straight motion."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from torchcover.targets.placing import build_poses
 
 
 def by_differences(a_m, b_m, velocity_mps):
-    """The slow way: where the way of b enters the hull of all differences of corners."""
+    """Compute the contact slowly: where the path of b enters the hull of all corner differences."""
     hull = shapely.MultiPoint((a_m[:, None] - b_m[None]).reshape(-1, 2)).convex_hull
     way = shapely.LineString([(0.0, 0.0), 1e4 * velocity_mps])
     inside = way.intersection(hull)

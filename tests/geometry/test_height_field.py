@@ -1,4 +1,4 @@
-"""Heights over a raster, against slow twins and closed forms."""
+"""Height fields against slow implementations and closed forms."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ RANDOM = np.random.default_rng(5)
 
 
 def height_of(field, place_m):
-    """At one place: the plane through the three corners of its triangle."""
+    """Interpolate at one position: the plane through the corners of its triangle."""
     rows, columns = field.corner_heights_m.shape
     x, y = np.clip((np.asarray(place_m) - field.origin_m) / field.cell_m, 0.0, [columns - 1, rows - 1])
     column, row = min(int(x), columns - 2), min(int(y), rows - 2)

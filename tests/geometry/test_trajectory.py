@@ -1,4 +1,4 @@
-"""Where a body is at and between the times of its poses."""
+"""Trajectories at and between the times of their poses."""
 
 import re
 
@@ -74,7 +74,7 @@ def test_steep_poses_are_interpolated_about_one_axis(pitch_deg, others_deg):
 
 
 def test_first_pose_out_of_order_is_named():
-    """Of steps of any length: what counts is that they are later."""
+    """Times need only ascend; their steps may have any length."""
     for step_s in (1e-9, 0.25, 1e6):
         times_s = step_s * np.arange(4)
         Trajectory.from_arrays(times_s, np.zeros((4, 3)), np.zeros((4, 3)))

@@ -1,4 +1,4 @@
-"""What a stability case is: something extreme, what is right there, our error, and that of the way one writes first."""
+"""Stability cases: an extreme input, its correct result, our error, and the error of a naive implementation."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -73,20 +73,20 @@ CUDA_SEARCHES = tuple(
 
 
 def longdouble_distance(reference, sensor):
-    """(N,) distances to the nearest point, brute force, in the widest type that NumPy has."""
+    """Compute (N,) distances to the nearest point by brute force in the widest type of NumPy."""
     reference, sensor = (np.asarray(cloud).astype(np.longdouble) for cloud in (reference, sensor))
     chunks = np.array_split(reference, max(1, len(reference) * len(sensor) // 1_000_000))
     return np.concatenate([np.sqrt(((q[:, None] - sensor) ** 2).sum(axis=2)).min(axis=1) for q in chunks])
 
 
 def most(error):
-    """Largest absolute entry; infinite if one of them is not a number."""
+    """Return the largest absolute entry; infinite if any is NaN."""
     error = np.asarray(error)
     return float(np.where(np.isnan(error), np.inf, np.abs(error)).max())
 
 
 def ulps(found, expected):
-    """Largest error in steps of the type of `found`: a half is rounding to the nearest."""
+    """Return the largest error in units in the last place of `found`; 0.5 is correct rounding."""
     step = np.spacing(np.abs(expected).astype(found.dtype)).astype(np.longdouble)
     with np.errstate(invalid="ignore"):
         return most((found.astype(np.longdouble) - expected) / step)

@@ -17,7 +17,7 @@ FAR_M = np.array([4_194_304.0, -8_388_608.0, 1024.0])  # squares of all scales b
 
 @lru_cache
 def street():
-    """Points of a hilly street, and some above it."""
+    """Sample points of a hilly street, and some above it."""
     generator = np.random.default_rng(3)
     x, y = generator.uniform(-30, 30, (2, 8000))
     road_m = np.stack([x, y, np.sin(x / 20) + generator.normal(0.0, 0.03, 8000)], axis=1)

@@ -1,4 +1,4 @@
-"""Lenses at their folds, and beyond 90 degrees."""
+"""Lenses at their folds and beyond 90 degrees."""
 
 from functools import lru_cache, partial
 
@@ -21,7 +21,7 @@ def folding(model):
 
 
 def fold_px(model):
-    """Where r + k r^3 turns round: r^2 = -1 / 3k, at two thirds of r."""
+    """Return the fold of r + k r^3: r^2 = -1 / 3k, at two thirds of r."""
     return FOCAL_PX * 2 / 3 * np.sqrt(-1 / (3 * FOLDING[model][0]))
 
 
@@ -110,7 +110,7 @@ def fisheye_angles_kornia():
 
 
 def folds(name, model, naive_way, naive_fails):
-    """The cases of one lens with a fold."""
+    """Create the cases of one lens with a fold."""
     return [
         Case(f"{name}, 1 to 1e-9 px inside its fold", "longdouble", "px", 1e-9, partial(inside_fold, model, our_rays),
              naive_way, partial(inside_fold, model, kornia_rays)),

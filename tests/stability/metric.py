@@ -26,7 +26,7 @@ def row_of_cells(count, cell=1.0, x=0.0):
 
 
 def merged(metric, times):
-    """The sums of `times` metrics with the same steps."""
+    """Create the sums of `times` metrics with equal frames."""
     total = metric.clone()
     total.reset()
     for _ in range(times):
@@ -39,7 +39,7 @@ def merged(metric, times):
 
 @lru_cache
 def drawn_radii():
-    """A radius a step, float32, as distances along z, which float32 holds exactly."""
+    """Create one float32 radius per frame, as exact distances along z."""
     return np.random.default_rng(0).uniform(0.0, 1.0, STEPS).astype(np.float32)
 
 
@@ -57,7 +57,7 @@ def many_steps_in_float32():
 
 
 def seen_once(search):
-    """One of 4096 = 1 + 45 * 91 steps has a point in the second cell, at 0.75 m; all have one in the first."""
+    """One of 4096 = 1 + 45 * 91 frames has a point in the second cell at 0.75 m; all have one in the first."""
     metric, once = search.metric(row_of_cells(2)), search.metric(row_of_cells(2))
     sensor = search.cloud([[0.5, 0.5, 0.0], [1.5, 0.5, 0.0]])
     for _ in range(91):
@@ -114,7 +114,7 @@ def on_borders(dtype, search):
 
 
 def wrong(points, cells):
-    """How many points are counted in another cell than their own, at least."""
+    """Count points in wrong cells, at least."""
     expected = Counter(cells)
     return sum(abs(count - expected[cell]) for cell, count in enumerate(points))
 
@@ -189,7 +189,7 @@ def region_cells(search):
 
 
 def region_cells_by_steps():
-    """Centres summed up from the first one."""
+    """Compute centers as running sums."""
     centres, wrong_cells = np.cumsum([0.05] + [0.1] * (CELLS - 1)), 0
     for first in range(CELLS - 2):
         low, high = (2 * first + 1) / 20, (2 * first + 5) / 20
@@ -201,7 +201,7 @@ JUST_INSIDE_M = np.arange(CELLS) * 0.25 + 0.24
 
 
 def far_grid(origin_m, search):
-    """A grid in world coordinates: float64 points keep their cells."""
+    """Count wrong cells of a grid in world coordinates."""
     metric = search.metric(row_of_cells(CELLS, cell=0.25, x=origin_m))
     reference = np.stack([origin_m + JUST_INSIDE_M, np.full(CELLS, 0.1), np.zeros(CELLS)], axis=1)
     metric.update(
@@ -225,7 +225,7 @@ THRESHOLDS_M = tuple(step / 20 for step in range(1, CELLS + 1))
 
 @lru_cache
 def at_thresholds():
-    """In each cell one point at the distance of its threshold and one just beyond, each above a sensor point."""
+    """Create in each cell a point at the threshold and one just beyond it, each above a sensor point."""
     at = np.array(THRESHOLDS_M, dtype=np.float32)
     x = np.arange(CELLS, dtype=np.float32) * 16 + 4
     points = [np.stack([x + side, np.full_like(x, 8), distance], axis=1)

@@ -1,4 +1,4 @@
-"""What is drawn along by its front, and encounters, from very slow to very fast."""
+"""Trailers and encounters from very slow to very fast motion."""
 
 from functools import lru_cache, partial
 
@@ -25,12 +25,12 @@ FASTEST_KMH = 300.0
 
 
 def drawn_along(way_m, yaw):
-    """(T,) headings of one rod along a (T, 2) way."""
+    """Compute (T,) headings of a rod along a (T, 2) path."""
     return compute_tractrix_yaw_rad(np.asarray(way_m)[:, None], np.array([ROD_M]), np.array([yaw]))[:, 0]
 
 
 def by_steps(way_m, yaw):
-    """The first way one writes: yaw rate times the step, of the angle before it."""
+    """Integrate naively: yaw rate at the previous angle times the step."""
     found = [yaw]
     for x_m, y_m in np.diff(way_m, axis=0):
         found.append(found[-1] + (y_m * np.cos(found[-1]) - x_m * np.sin(found[-1])) / ROD_M)

@@ -1,4 +1,4 @@
-"""Poses and points where angles, lengths and types run out."""
+"""Poses and points at the limits of angles, lengths and types."""
 
 from functools import lru_cache, partial
 from itertools import product
@@ -21,7 +21,7 @@ from .case import Case, most
 
 
 def as_angle(rotation, other):
-    """Angle between rotations in radians, as the size of their difference."""
+    """Compute the angle between rotations in radians from their difference."""
     return float(np.abs(rotation - other).max())
 
 
@@ -46,7 +46,7 @@ def steep(euler):
 
 
 def euler_by_the_book(r):
-    """Each angle on its own."""
+    """Interpolate each angle separately."""
     angles = np.arctan2(r[1, 0], r[0, 0]), np.arcsin(np.clip(-r[2, 0], -1, 1)), np.arctan2(r[2, 1], r[2, 2])
     return np.rad2deg(angles)
 
@@ -55,7 +55,7 @@ PITCHES = ((85.0, 95.0), (60.5, 120.0), (-90.0, -70.0), (89.999, 90.001), (90.0,
 
 
 def between_steep(between):
-    """A body that pitches through the vertical, on the way from one pose to another."""
+    """Create a body that pitches through the vertical between two poses."""
     worst = 0.0
     for (first, last), (yaw, roll) in product(PITCHES, ((0.0, 0.0), (170.0, -30.0), (-90.0, 179.0))):
         ends = [convert_euler_to_rotation(yaw, pitch, roll) for pitch in (first, last)]

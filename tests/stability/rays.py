@@ -37,7 +37,7 @@ def at(*position_m):
 
 @lru_cache
 def directions(count, seed=0):
-    """(3, N) float32 unit vectors all around."""
+    """Sample (3, N) float32 unit vectors in all directions."""
     rows = np.random.default_rng(seed).normal(size=(3, count))
     return (rows / np.linalg.norm(rows, axis=0)).astype(np.float32)
 
@@ -48,7 +48,7 @@ def cast(bodies, origin_m, towards, device=None):
 
 
 def bare_embree(bodies, origin_m, towards, robust=True):
-    """(N,) distances from Embree as it comes; a miss is infinite."""
+    """Compute (N,) distances with plain Embree; a miss is infinite."""
     scene = EmbreeScene(robust=robust)
     for body in bodies:
         TriangleMesh(scene, body.vertices_m.astype(np.float32), body.faces.astype(np.int32))
@@ -58,7 +58,7 @@ def bare_embree(bodies, origin_m, towards, robust=True):
 
 
 def moeller_trumbore(mesh, origin_m, towards, least_determinant=1e-6):
-    """(N,) distances by the formula, in float32, with the customary epsilon; a miss is infinite."""
+    """Compute (N,) distances by the textbook formula in float32 with the usual epsilon; a miss is infinite."""
     a, b, c = (mesh.vertices_m[mesh.faces[:, k]].astype(np.float32) for k in range(3))
     d, s = towards.T[:, None], np.asarray(origin_m, dtype=np.float32) - a
     with np.errstate(all="ignore"):
@@ -111,7 +111,7 @@ def offset_in_float32(offset_m):
 
 
 def scaled(scale, caster):
-    """The room in other units; the sensor in its middle."""
+    """Test the room in other units, with the sensor in its center."""
     room = box(*ROOM_M).transform(at(0.0, 0.0, -ROOM_M[2] / 2))
     mesh = Mesh(room.vertices_m * scale, room.faces)
     return relative(caster(mesh), to_walls(directions(5000), -ROOM_M / 2, ROOM_M / 2) * scale)
@@ -152,7 +152,7 @@ def tilted_floor_and_ceiling():
 
 
 def from_a_surface(caster):
-    """Rays that do not reach the ceiling where it is."""
+    """Count rays that miss the ceiling."""
     bodies, places, towards, expected = tilted_floor_and_ceiling()
     found = [caster(bodies, place, towards) for place in places]
     return sum(int((~(np.abs(range_m - expected) < 1e-3 * expected)).sum()) for range_m in found)
@@ -175,7 +175,7 @@ def along_a_surface(caster):
 
 
 def coincident(caster):
-    """Two boxes with a wall in one plane, one inside the outline of the other."""
+    """Create two boxes with coplanar walls, one inside the outline of the other."""
     boxes = box(1.0, 1.0, 1.0).transform(at(5.0, 0.0, -0.5)), box(1.0, 3.0, 3.0).transform(at(5.0, 0.0, -1.5))
     y, z = np.random.default_rng(4).uniform(-0.49, 0.49, size=(2, 5000))
     ends = np.stack([np.full(5000, 4.5), y, z])
@@ -207,7 +207,7 @@ def by_its_faces(caster, place_m):
 
 
 def by_a_ray(caster, place_m):
-    """Whether a ray first meets the middle one."""
+    """Return whether a ray first hits the middle slab."""
     towards = np.array([[0.6], [0.0], [0.8]], dtype=np.float32)
     return caster.cast(place_m, towards, np.array([np.inf], dtype=np.float32)).body_indices[0] == 1
 
@@ -345,7 +345,7 @@ CASES = [
 
 
 def of_warp(device, words):
-    """The same where Warp casts, on one of its devices."""
+    """Cast with Warp on one of its devices."""
     cast_there = partial(ours, device=device)
     return [
         Case(f"a room of 1e-9 m, {words}", "closed form", "relative", 1e-6, partial(ours_scaled, 1e-10, device),

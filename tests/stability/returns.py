@@ -1,4 +1,4 @@
-"""Returns from the brightest and nearest to the darkest, farthest and most grazing, in clear air and in fog."""
+"""Returns at the limits of reflectivity, range and incidence angle, in clear air and in fog."""
 
 from functools import lru_cache
 
@@ -14,7 +14,7 @@ FOG_PER_M, SPREAD = 0.06, 0.2
 
 @lru_cache
 def extremes():
-    """(N,) ranges, cosines, reflectivities, exponents: each with each."""
+    """Create all combinations of (N,) ranges, cosines, reflectivities and exponents."""
     columns = np.meshgrid([1e-3, 1.0, 20.0, 30.0, 80.0, 1e4], [1.0, 0.02, 1e-4], [1e-9, 0.1, 1.0], [0.0, 0.2, 30.0])
     return tuple(column.reshape(-1) for column in columns)
 
@@ -63,7 +63,7 @@ def probability_error():
 
 
 def logistic_error():
-    """What is at hand where there is no error function, of the same slope in the middle."""
+    """Approximate the error function by a logistic function of equal slope."""
     slope = 4 / np.sqrt(2 * np.pi) / (2 * SPREAD)
     with np.errstate(over="ignore"):
         return most(MAX_RETURN_PROBABILITY / (1 + np.exp(-slope * our_excess())) - exact_probability())

@@ -1,4 +1,4 @@
-"""Nearest neighbours at the extremes, for every backend."""
+"""Nearest neighbors at the limits, for every backend."""
 
 import contextlib
 from functools import lru_cache, partial
@@ -14,13 +14,13 @@ THRESHOLDS_M = [step / 20 for step in range(1, 41)]
 
 
 def matrix_product(reference, sensor):
-    """What torch.cdist does with more than 25 points."""
+    """Compute distances as torch.cdist for more than 25 points."""
     clouds = (torch.as_tensor(cloud) for cloud in (reference, sensor))
     return torch.cdist(*clouds, compute_mode="use_mm_for_euclid_dist").amin(dim=1).numpy()
 
 
 def differences(reference, sensor):
-    """Differences, squares, sum and root in the type of the clouds."""
+    """Compute distances naively in the type of the clouds."""
     with np.errstate(over="ignore", under="ignore"):
         return np.sqrt(((reference[:, None] - sensor) ** 2).sum(axis=2)).min(axis=1)
 
@@ -102,7 +102,7 @@ def naive_in_ulps(name, way):
 
 
 def in_own_type(reference, sensor):
-    """All of it in half precision."""
+    """Compute distances in half precision."""
     with np.errstate(over="ignore"):
         return (reference[:, None] - sensor).square().sum(dim=2).sqrt().amin(dim=1).float().numpy()
 

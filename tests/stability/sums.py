@@ -1,4 +1,4 @@
-"""Sums of touched cells and mixtures of worlds, at the extremes."""
+"""Sums of touched cells and mixtures of scenes at the limits."""
 
 from functools import lru_cache, partial
 from math import fsum

@@ -1,4 +1,4 @@
-"""Every case of docs/measured/stability.md stays within its bound, with every backend of the search."""
+"""All cases of docs/measured/stability.md stay within their bounds, with every search backend."""
 
 import numpy as np
 import pytest
@@ -56,13 +56,13 @@ def test_without_a_search(case):
 
 @each([case for case in cases_of(search, metric, *BY_THEMSELVES) if case.naive_fails])
 def test_the_naive_way_is_found_out(case):
-    """So that a case whose bound is too wide, or that measures nothing, is noticed."""
+    """Naive implementations exceed the bounds, so that no bound is too wide."""
     assert case.naive() > case.bound
 
 
 @pytest.mark.parametrize("coordinate_m", [1e10, 1e300, np.nan])
 def test_a_mesh_that_float32_cannot_hold_is_refused(coordinate_m):
-    """Embree would leave its faces out."""
+    """Embree omits degenerate faces."""
     corners = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, coordinate_m, 0.0]])
     with pytest.raises(ValueError, match=r"within 1e.09 m of the origin"):
         RayCaster([Mesh(np.eye(3), np.array([[0, 1, 2]])), Mesh(corners, np.array([[0, 1, 2]]))])

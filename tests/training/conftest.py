@@ -6,7 +6,7 @@ from torchcover.training import figures
 
 @pytest.fixture
 def blank_maps(monkeypatch):
-    """Maps with nothing on them, where it matters who gets them and when: drawing one takes half a second."""
+    """Replace maps by empty figures where only their logging matters; plotting one takes half a second."""
     monkeypatch.setattr(
         figures, "plot_band_maps", lambda coverage: [("radius", Figure((1, 1))), ("blank", Figure((1, 1)))]
     )

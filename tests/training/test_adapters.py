@@ -1,4 +1,4 @@
-"""Frames out of other frameworks' batches, and the metric of MMEngine beside its real classes."""
+"""Frames from batches of other frameworks, and the metric for MMEngine with its real classes."""
 
 import math
 import subprocess
@@ -47,7 +47,7 @@ def truth_of(pairs):
 
 
 def in_one_array(clouds):
-    """As OpenPCDet's `collate_batch`: the number of the sample in front of each point."""
+    """Collate clouds as `collate_batch` of OpenPCDet, with the sample index in the first column."""
     padded = [np.pad(cloud.numpy(), ((0, 0), (1, 0)), constant_values=k) for k, cloud in enumerate(clouds)]
     return np.concatenate(padded, axis=0)
 
@@ -98,7 +98,7 @@ def test_wrong_batch_dicts_are_refused(change, complaint):
 
 
 def data_batch(numbers):
-    """What MMEngine hands to a metric of MMDetection3D: the inputs, and the samples as dicts."""
+    """Create the inputs and samples that MMEngine passes to metrics of MMDetection3D."""
     samples = [{"sample_idx": k, "reference_points": cloud(40, 100 + k).numpy()} for k in numbers]
     return {"inputs": {"points": [cloud(20 + k, k) for k in numbers]}}, samples
 
@@ -121,7 +121,7 @@ def test_a_data_batch_of_mmdetection3d():
 
 @TRANSFORMS.register_module()
 class PackAsMMDetection3D:
-    """Of `Pack3DDetInputs` what matters here: the points as inputs, of all else only some keys, beside the sample."""
+    """Minimal `Pack3DDetInputs`: points as inputs, and some keys in the data sample."""
 
     def __init__(self, keys, meta_keys=("box_type_3d", "sample_idx")):
         self.keys, self.meta_keys = keys, meta_keys
@@ -168,7 +168,7 @@ def test_mmengine_requires_area_weights_of_the_metric():
 
 
 def test_mmengine_evaluates_it_as_any_of_its_metrics():
-    """Built from a config by the registry, run by the real `Evaluator`, twice."""
+    """The registry builds the metric from a config, and the real `Evaluator` runs it twice."""
     config = {
         "type": "MMEngineCoverage",
         "metric": {"grid": GRID, "thresholds_m": (0.4,), "max_radius_m": 9.0},
@@ -193,7 +193,7 @@ def test_mmengine_evaluates_it_as_any_of_its_metrics():
 
 @pytest.mark.parametrize(("samples", "processes"), [(5, 1), (5, 2), (7, 4), (1, 3)])
 def test_mmengine_padding_is_excluded_by_dataset_size(monkeypatch, samples, processes):
-    """What MMEngine's `DefaultSampler` gives each process: rounds that start with the first samples again."""
+    """Return the samples of a process as `DefaultSampler` of MMEngine: the last round repeats the first samples."""
     rounds = math.ceil(samples / processes)
     dealt = (list(range(samples)) * processes)[: rounds * processes]
     total = make_metric()
@@ -212,7 +212,7 @@ def test_mmengine_padding_is_excluded_by_dataset_size(monkeypatch, samples, proc
 
 
 def test_mmengine_adds_up_where_its_processes_exchange_tensors(monkeypatch):
-    """NCCL refuses tensors of the CPU. Without a GPU: where the sums were sent before they were computed."""
+    """NCCL refuses CPU tensors; without a GPU, check the device of the sums before they are reduced."""
     calls = []
 
     class Spy(CoverageMetric):

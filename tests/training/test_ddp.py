@@ -1,4 +1,4 @@
-"""Two processes give the numbers of one, whatever the sampler fills up its last round with."""
+"""Two processes give the numbers of one, whatever padding the sampler adds."""
 
 import os
 import signal
@@ -27,7 +27,7 @@ def clouds(seed):
 
 
 def test_two_processes_give_the_numbers_of_one(tmp_path):
-    """Seven frames for two processes: the eighth that the sampler deals out is the first one again."""
+    """Seven frames for two processes: the eighth sample repeats the first."""
     frames = [clouds(seed) for seed in range(7)]
     torch.save({"grid": GRID, "frames": frames}, tmp_path / "frames.pt")
     environment = {**os.environ, "GLOO_SOCKET_IFNAME": "lo0" if sys.platform == "darwin" else "lo"}
@@ -70,7 +70,7 @@ def assert_same(coverage, other):
 
 
 class Clouds:
-    """Frames with an index and hardly any points."""
+    """Create frames with an index and few points."""
 
     def __init__(self, frames):
         self.frames = frames
@@ -114,7 +114,7 @@ def test_late_numbers_of_samples_give_equal_results(samples, processes, batch_si
 
 
 def test_frames_without_index_and_name_are_new():
-    """Batches of OpenPCDet without `frame_id`, of clouds that were sampled to one number of points."""
+    """Create batches of OpenPCDet without `frame_id`, of clouds with equal numbers of points."""
     points = torch.zeros(64, 5)
     batch = convert_batch_dict({"points": points, "reference_points": points, "batch_size": 1})
     once = FrameDeduplicator()
@@ -130,7 +130,7 @@ def test_a_batch_sampler_is_looked_through():
 
 
 def test_equal_indices_of_two_datasets_are_different_frames():
-    """Datasets side by side count from 0 each; their frames differ in name, or by seed in the numbers of points."""
+    """Concatenated datasets each count from 0; their frames differ in name, or in numbers of points."""
     first = Frame({"rig": torch.zeros(5, 3)}, torch.zeros(9, 3), index=0, name="a")
     others = [
         Frame({"rig": torch.zeros(5, 3)}, torch.zeros(9, 3), index=0, name="b"),

@@ -1,4 +1,4 @@
-"""The mean radius as a loss on points."""
+"""Mean radius as a loss function of points."""
 
 import runpy
 import sys
@@ -20,7 +20,7 @@ def test_gradients_pull_points_to_their_reference_points():
 
 
 def test_optimized_points_converge_to_the_median():
-    """On a line, the point of least mean distance to 0, 1 and 5 is 1, not the mean 2."""
+    """On a line, the point with the smallest mean distance to 0, 1 and 5 is the median 1, not the mean 2."""
     reference = torch.tensor([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [5.0, 0.0, 0.0]])
     point = torch.tensor([[4.0, 0.3, 0.0]], requires_grad=True)
     descent = torch.optim.SGD([point])

@@ -1,4 +1,4 @@
-"""Coverage in Lightning runs: what is measured, what is logged where, and what a checkpoint holds."""
+"""Coverage in Lightning runs: measured frames, logged numbers and maps, and checkpoints."""
 
 import gc
 import math
@@ -27,7 +27,7 @@ CORNER = torch.tensor([0.0, -2.0, -0.2])
 
 
 class RandomFrames(Dataset):
-    """Frames of random points; frame k is the same whenever it is asked for."""
+    """Frames of random points; frame k is always the same."""
 
     def __init__(self, frames, reference_points=40):
         self.frames = frames
@@ -46,7 +46,7 @@ class RandomFrames(Dataset):
 
 
 class Model(pl.LightningModule):
-    """One number to train, whatever the frames."""
+    """Model with one parameter that ignores the frames."""
 
     def __init__(self):
         super().__init__()
@@ -60,14 +60,14 @@ class Model(pl.LightningModule):
 
 
 class Validated(Model):
-    """The same with a validation."""
+    """Model with a validation step."""
 
     def validation_step(self, batch, batch_idx, dataloader_idx=0):
         pass
 
 
 class BothSides(Model):
-    """The same with two batches at a time."""
+    """Model with two batches per step."""
 
     def training_step(self, batch, batch_idx):
         return self.weight**2
@@ -153,7 +153,7 @@ def test_epochs_reset_and_skipped_ones_cost_nothing(tmp_path):
 
 
 def measured_frames(trainer, metric):
-    """Of each epoch, how many frames were given to a metric, as a list that fills up."""
+    """Record the number of frames per epoch that a metric gets."""
     seen, update = [], metric.update
 
     def spy(sensor, *arguments, **options):
@@ -225,7 +225,7 @@ def test_frames_of_loaders_within_loaders_are_measured(tmp_path):
 
 
 def test_combined_training_loaders_have_no_padding(tmp_path):
-    """Seven frames for two processes are four for each, and the positions in a batch of both loaders go up to eight."""
+    """Seven frames for two processes are four each; positions in combined batches reach eight."""
     sides = {
         side: loader(
             [replace(frame, name=side) for frame in RandomFrames(7)], sampler=DistributedSampler(range(7), 2, 0)
@@ -309,7 +309,7 @@ def test_another_rig_other_batches_and_frames(tmp_path):
 
 
 class TakesImages(Logger):
-    """A logger with `log_image`, as that of Weights & Biases."""
+    """Logger with `log_image`, as in Weights & Biases."""
 
     name, version = "images", 0
 
@@ -360,7 +360,7 @@ def test_a_logger_that_takes_images_gets_pixels(tmp_path):
 
 
 class TakesFigures(TakesImages):
-    """A logger whose experiment takes figures, with the signature of somebody's `log_figure`."""
+    """Logger whose experiment has a `log_figure` with a given signature."""
 
     log_image = None
 
@@ -431,7 +431,7 @@ def test_frames_without_reference_points_cause_one_warning(tmp_path):
 
 
 class Save(pl.Callback):
-    """Takes a checkpoint after a number of steps, as `ModelCheckpoint` does."""
+    """Callback that saves a checkpoint after a number of steps, as `ModelCheckpoint`."""
 
     def __init__(self, path, step):
         self.path, self.step = path, step
@@ -442,7 +442,7 @@ class Save(pl.Callback):
 
 
 class Resumable(DataLoader):
-    """A loader that goes on where a checkpoint was taken; Lightning looks for these two methods."""
+    """Loader that resumes at a checkpoint with the two methods that Lightning calls."""
 
     start = 0
 
@@ -462,7 +462,7 @@ class Resumable(DataLoader):
 
 
 class SevenAnEpoch:
-    """A sampler that gives other frames in every epoch, as Lightning tells it which one it is."""
+    """Sampler with other frames in every epoch, set by Lightning."""
 
     epoch = 0
 
@@ -478,7 +478,7 @@ class SevenAnEpoch:
 
 @pytest.mark.parametrize("at", [1, 2, 3, 4, 6, 7])
 def test_resumed_epochs_give_equal_numbers(tmp_path, at):
-    """Two epochs of four batches; the checkpoint is taken after one of them."""
+    """Train two epochs of four batches, with a checkpoint after one of the batches."""
     path = tmp_path / "within.ckpt"
 
     def run(*callbacks, ckpt_path=None):
@@ -571,7 +571,7 @@ def test_batches_without_frames_and_unknown_rigs_are_refused(tmp_path):
 
 
 class LogsOwn(Validated):
-    """Logs a number of its own, and hands clouds to a layer of the precision that was asked for."""
+    """Model that logs a number, and passes clouds to a layer in the requested precision."""
 
     def validation_step(self, batch, batch_idx, dataloader_idx=0):
         assert {cloud.dtype for frame in batch.frames for cloud in (frame.sensor, frame.reference)} == {torch.float32}

@@ -1,4 +1,4 @@
-"""Rows and pictures of results, handed to the loggers that there are."""
+"""Tables and figures of results in different loggers."""
 
 import importlib.machinery
 import sys
@@ -15,7 +15,7 @@ from torchcover.training import log_result
 
 
 class Result:
-    """Two rows, one with a name that is markup, and a picture."""
+    """Result with two rows, one with markup in its name, and a figure."""
 
     def to_dataframe(self):
         return build_dataframe([{"rig": "<b>|", "radius_m": 0.123456}, {"rig": "b", "radius_m": float("nan")}])

@@ -1,4 +1,4 @@
-"""The example that trains a detector on random placements: what is drawn, what a kill leaves, and a reduced run."""
+"""Example that trains a detector on random placements: sampled placements, results after a kill, and a reduced run."""
 
 import json
 import sys

@@ -1,4 +1,4 @@
-"""The parts of the example that trains a detector: closed forms, and a run on frames of random points."""
+"""Parts of the example that trains a detector: closed forms, and a run on frames of random points."""
 
 import importlib.util
 import math
@@ -27,7 +27,7 @@ def example():
 
 
 def cars(count, seed):
-    """(N, 7) cars within the region, 6 m and more apart."""
+    """Sample (N, 7) cars in the region, at least 6 m apart."""
     generator = torch.Generator().manual_seed(seed)
     place = torch.randperm(64, generator=generator)[:count]
     rows = torch.rand(count, 7, generator=generator) * torch.tensor([0.4, 0.4, 1.0, 3.0, 1.0, 1.0, 6.0])
@@ -36,7 +36,7 @@ def cars(count, seed):
 
 
 def answer_to(example, rows, scores):
-    """What a network that knows everything answers: heat and boxes of one frame."""
+    """Create the output of a perfect network: heat map and boxes of one frame."""
     _, _, row, column, wanted = example.encode(rows)
     heat, boxes = torch.full((64, 64), -20.0), torch.zeros(8, 64, 64)
     heat[row, column] = scores.logit()
@@ -147,7 +147,7 @@ def test_what_does_not_vary_has_no_rank_correlation(example):
 
 
 def objects_of(found):
-    """100 cars in 10 drives: drive, x, y, visibility, score."""
+    """Sample 100 cars in 10 drives: drive, x, y, visibility, score."""
     generator = np.random.default_rng(3)
     x, y, visibility = generator.uniform(0, 50, 100), generator.uniform(-25, 25, 100), generator.uniform(size=100)
     return np.column_stack([np.arange(100) // 10, x, y, visibility, found(visibility)])
@@ -174,7 +174,7 @@ def test_correlation_over_cells_compares_means_and_recalls(example):
 
 
 def random_frames(steps, seed, reference, name, keep_clouds):
-    """In place of a simulation: cars of random points, one rig with more of them than the other."""
+    """Replace the simulation by cars of random points, with more points for one of two rigs."""
     frames = []
     for index in range(steps):
         generator = torch.Generator().manual_seed(1000 * seed + index)

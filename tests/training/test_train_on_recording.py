@@ -1,4 +1,4 @@
-"""The example that trains on a recording, on a drive in KITTI's raw layout."""
+"""Example that trains on a recording, with a drive in the raw layout of KITTI."""
 
 import importlib
 import math
@@ -18,7 +18,7 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
 class Straight(Drive):
-    """Along the wall, with a car ahead that keeps its distance and of which one row of points is seen at a time."""
+    """Write a drive along a wall behind a car at constant distance, with one visible row of points per scan."""
 
     def get_world_T_vehicle(self, index):
         return build_transform(torch.eye(3).numpy(), [1.5 * index, 0.0, 0.0])

@@ -1,4 +1,4 @@
-"""A Lightning run in two processes: `python two_ranks.py FOLDER`, on the frames in FOLDER/frames.pt."""
+"""Lightning run in two processes on the frames in FOLDER/frames.pt: `python two_ranks.py FOLDER`."""
 
 import os
 import socket
@@ -52,7 +52,7 @@ class TakesImages(pl.loggers.CSVLogger):
 
 
 class Resumable(DataLoader):
-    """A loader that goes on after the batches of a checkpoint; Lightning looks for these two methods."""
+    """Loader that resumes after the batches of a checkpoint with the two methods that Lightning calls."""
 
     start = 0
 

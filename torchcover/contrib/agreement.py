@@ -115,6 +115,7 @@ def read_results(path: Path) -> Mapping[tuple[str, str], PlacementRatings]:
 
 
 def _build_ratings(name: str, values: Mapping[tuple[str, str], float]) -> PlacementRatings:
+    """Build ratings from values by (rater, placement); ValueError for missing values."""
     raters, placements = (tuple(dict.fromkeys(names)) for names in zip(*values, strict=True))
     array = np.full((len(raters), len(placements)), math.nan)
     missing = []
@@ -320,6 +321,7 @@ def _get_sampled_scores(ranking: Ranking, sampled_means: Float64, columns: Int64
 def _correlate_ranking(
     ranking: Ranking, mean_ratings: Float64, sampled_means: Float64, columns: Int64
 ) -> MetricCorrelation:
+    """Correlate one ranking with the mean of the raters, with bootstrap intervals."""
     sampled_scores = _get_sampled_scores(ranking, sampled_means, columns)
     correlations = []
     for compute_correlation in (compute_spearman, compute_kendall_tau_b):

@@ -160,6 +160,7 @@ def compute_tau(first: Ranking, second: Ranking) -> KendallTau:
 
 
 def _format_row(ranking: Ranking) -> list[str]:
+    """Format the cells of a table for one ranking."""
     better = "less" if ranking.quantity.lower_is_better else "more"
     ranks = ranking.ranks.tolist() if len(ranking.numbers) > 1 else [math.nan]
     cells = [_format_ranked_number(number, rank) for number, rank in zip(ranking.numbers, ranks, strict=True)]
@@ -167,6 +168,7 @@ def _format_row(ranking: Ranking) -> list[str]:
 
 
 def _format_ranked_number(number: Number, rank: float) -> str:
+    """Format a number with its rank in brackets."""
     if not number.has_value:
         return "–"
     return format_number(number) if math.isnan(rank) else f"{format_number(number)} ({rank:g})"
@@ -185,6 +187,7 @@ def _build_tau_tables(comparison: MetricComparison) -> list[PageTable]:
 
 
 def _format_tau(tau: KendallTau) -> str:
+    """Format a correlation with its interval."""
     if math.isnan(tau.tau):
         return "–"
     interval = "" if math.isnan(tau.low) else f" [{tau.low:+.2f}, {tau.high:+.2f}]"

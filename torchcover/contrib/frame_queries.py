@@ -280,6 +280,7 @@ def count_points_in_boxes(cloud: Tensor, boxes: Boxes) -> Tensor:
 
 
 def _find_distances_m(frame: Frame, cloud: Tensor, max_distance_m: float, backend: str = "auto") -> Tensor:
+    """Find (M,) distances from reference points to a cloud, infinite beyond the maximum distance."""
     check_cloud(frame.reference, "reference")
     check_cloud(cloud, "sensor")
     return nearest(frame.reference, cloud, max_distance=max_distance_m, backend=backend).distance

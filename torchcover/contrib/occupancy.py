@@ -232,6 +232,7 @@ def find_voxels_in_box(centers_m: Sequence[Float64], box_row: Float64) -> Int64:
 
 
 def _is_in_extent(offset_m: Float64, extent_m: float) -> Bools:
+    """Return whether offsets from a center lie in a half-open extent."""
     offset_m = offset_m + ROUNDING_M
     return np.asarray((offset_m >= -extent_m / 2) & (offset_m < extent_m / 2))
 

@@ -275,6 +275,7 @@ def check_best_correlation(first: ArrayLike, second: ArrayLike, seed: int = 0) -
 
 
 def _mask_unknown(first: ArrayLike, second: ArrayLike) -> tuple[Float64, Float64]:
+    """Broadcast two series and set values that are unknown in either to NaN."""
     first_known, second_known = np.broadcast_arrays(
         np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
     )
@@ -283,5 +284,6 @@ def _mask_unknown(first: ArrayLike, second: ArrayLike) -> tuple[Float64, Float64
 
 
 def _divide(above: Float64, below: Float64, values: Float64) -> Float64:
+    """Divide where a correlation is defined: enough known values and a positive denominator."""
     is_defined = ((~np.isnan(values)).sum(axis=-1) >= LEAST) & (below > 0)
     return np.where(is_defined, above / np.where(below > 0, below, 1.0), math.nan)

@@ -208,6 +208,7 @@ class PerceptionEntropy(SceneRatios):
         return count, (values @ membership.T).flatten(), count.long()
 
     def _compute_sigma(self, frame: Frame, rig: str) -> Tensor:
+        """Compute the standard deviation of the measurements of each object."""
         if not self.pixels_per_sample:
             return compute_standard_deviation(self.query_cache.count_points_in_boxes(frame, rig), "lidar")
         boxes, measurements = self.query_cache.get_boxes(frame), dict[str, Tensor]()

@@ -73,6 +73,7 @@ class PublishedMetric:
 
 
 def _build_point_density(setup: MetricSetup) -> PointDensity:
+    """Build the metric on cells of 1 m, or on the cells of the run for smaller regions."""
     # Regions smaller than a cell of 1 m need the cells of the run.
     coarse = build_coarse_grid(setup.grid, UNIFORMITY_CELL_M)
     covers_regions = all(region.mask_cells(coarse).any() for region in setup.regions)
@@ -226,6 +227,7 @@ def build_metrics(task: Task[FrameSource], settings: Settings) -> RunMetrics:
 
 
 def _find_missing_needs(task: Task[FrameSource]) -> frozenset[Need]:
+    """Find the data that a run does not provide for all of its rigs."""
     available: dict[Need, bool] = {
         "sensors": all(task.sensors.get(rig) for rig in task.rigs),
         "boxes": task.frames.has_boxes(),
@@ -262,6 +264,7 @@ def compare_metrics(
 
 
 def _rank_by_coverage(coverages: Sequence[Coverage], region: Region, band: str, seed: int) -> list[Ranking]:
+    """Rank rigs by the coverage numbers of a region and band."""
     numbers = []
     for coverage in coverages:
         (row,) = (row for row in coverage.summary([region]) if row.band == band)

@@ -256,11 +256,13 @@ def _mark_crossed_planes(rays: _ClippedRays, axis: int, crossed: Bools) -> None:
 
 
 def _compute_axis_centers_m(low_m: float, high_m: float, count: int) -> Float64:
+    """Compute (count,) centers of voxels along one axis."""
     odd = 2 * np.arange(count, dtype=np.float64) + 1
     return (low_m * (2 * count - odd) + high_m * odd) / (2 * count)
 
 
 def _check_rays(origins_m: Float64, directions: Float64, ray_ends: Float64) -> None:
+    """Check shapes and values of rays."""
     if directions.ndim != 2 or directions.shape[1] != 3:
         raise ValueError(f"directions: shape (N, 3) is needed; got {directions.shape}")
     count = len(directions)

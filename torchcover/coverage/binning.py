@@ -47,6 +47,7 @@ def compute_cell_means(cell_indices: Tensor, values: Tensor, weights: Tensor | N
 
 
 def _sum_per_cell(cells: Tensor, values: Tensor, num_cells: int) -> Tensor:
+    """Sum (N,) values over the points of each of K cells."""
     # Without any points, torch returns int64 counts even with weights.
     return torch.bincount(cells, weights=values, minlength=num_cells).double()
 

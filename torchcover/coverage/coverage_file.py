@@ -145,6 +145,7 @@ def read_coverage(path: Path) -> dict[str, Any]:
 
 
 def _parse_arguments(header: dict[str, Any], arrays: Arrays) -> dict[str, Any]:
+    """Parse the keyword arguments of `Coverage` from a header and the arrays of a file."""
     grid = BevGrid(**header["grid"])
     observed_cells = _parse_observed_cells(grid, arrays)
     _check_memory_of_maps(grid, observed_cells, arrays)
@@ -175,6 +176,7 @@ def _check_memory_of_maps(grid: BevGrid, observed_cells: ObservedCells, arrays: 
 
 
 def _parse_target_sums(record: dict[str, Any], arrays: Arrays) -> TargetSums:
+    """Parse the sums of test targets and check their shapes."""
     grid = BevGrid(**record.pop("grid"))
     names = tuple(record.pop("target_names"))
     regions = tuple(_parse_region(region) for region in record.pop("regions"))
@@ -195,6 +197,7 @@ def _parse_target_sums(record: dict[str, Any], arrays: Arrays) -> TargetSums:
 
 
 def _parse_aggregated(header: dict[str, Any], grid: BevGrid, arrays: Arrays) -> AggregatedNumbers:
+    """Parse the numbers of other aggregations and check their shapes."""
     quantities = tuple(Quantity(**record) for record in header["aggregated_quantities"])
     values, jackknife_values = (torch.from_numpy(arrays[name]) for name in AGGREGATED_ARRAYS)
     num_blocks = 0 if header["num_blocks"] == 1 else header["num_blocks"]
@@ -205,6 +208,7 @@ def _parse_aggregated(header: dict[str, Any], grid: BevGrid, arrays: Arrays) -> 
 
 
 def _parse_redundancy(header: dict[str, Any], observed_cells: ObservedCells, arrays: Arrays) -> Redundancy:
+    """Parse the layers of redundancy and check their quantities."""
     layers = _parse_layers(header["redundancy_layers"], arrays)
     sensor_names = tuple(header["sensor_names"])
     expected_quantities = list_redundancy_quantities(sensor_names, header["thresholds_m"])
@@ -214,6 +218,7 @@ def _parse_redundancy(header: dict[str, Any], observed_cells: ObservedCells, arr
 
 
 def _parse_region_sums(header: dict[str, Any], grid: BevGrid, arrays: Arrays) -> RegionSums:
+    """Parse the sums over regions and check their shapes."""
     region_sums = RegionSums(*(torch.from_numpy(arrays[name]) for name in REGION_ARRAYS))
     num_blocks = header["num_blocks"] * (FINE_BLOCKS_PER_BLOCK if header["num_blocks"] > 1 else 1)
     num_region_bands = len(header["regions"]) * len(grid.heights)
@@ -241,6 +246,7 @@ def _parse_region(record: Mapping[str, Any]) -> Region:
 
 
 def _parse_block_sums(names: Sequence[str], header: dict[str, Any], grid: BevGrid, arrays: Arrays) -> BlockSums:
+    """Parse the sums in blocks and check shapes and cells."""
     frame_counts, _, denominators, sums = (arrays[name] for name in names)
     if frame_counts.shape != (header["num_blocks"],):
         raise ValueError(f"the frame counts of {header['num_blocks']} blocks have shape {frame_counts.shape}")
@@ -255,6 +261,7 @@ def _parse_block_sums(names: Sequence[str], header: dict[str, Any], grid: BevGri
 
 
 def _convert_block_sums(block_sums: BlockSums, names: Sequence[str]) -> Arrays:
+    """Convert sums in blocks to arrays by name."""
     tensors = (block_sums.frame_counts, block_sums.cell_indices, block_sums.denominators, block_sums.sums)
     arrays = {name: tensor.cpu().numpy() for name, tensor in zip(names, tensors, strict=True)}
     arrays[names[1]] = _shrink_indices(arrays[names[1]], math.prod(block_sums.shape))
@@ -262,6 +269,7 @@ def _convert_block_sums(block_sums: BlockSums, names: Sequence[str]) -> Arrays:
 
 
 def _get_cell_array(name: str, arrays: Arrays) -> Tensor:
+    """Return an array with one entry per observed cell."""
     if arrays[name].shape != arrays["cell"].shape:
         raise ValueError(f"{name} has shape {arrays[name].shape}, the cells {arrays['cell'].shape}")
     return torch.from_numpy(arrays[name])

@@ -289,6 +289,7 @@ def _parse_block_indices(block_index: Any) -> list[int]:  # noqa: ANN401
 
 
 def _check_heights(heights_m: Tensor | None, points: Tensor, grid: BevGrid, name: str) -> None:
+    """Check that each frame has heights above ground if and only if the bands need them."""
     if heights_m is not None:
         check_tensor(heights_m, name)
     grid.check_heights(points, heights_m, name)

@@ -298,6 +298,7 @@ class BevGrid:
 
 
 def _check_bounds(name: str, bounds: tuple[float, float]) -> None:
+    """Check that bounds are two finite ascending numbers."""
     if len(bounds) != 2 or not all(math.isfinite(bound) for bound in bounds):
         raise ValueError(f"{name}: two finite bounds in meters are needed; got {bounds}")
     if not bounds[0] < bounds[1]:
@@ -305,6 +306,7 @@ def _check_bounds(name: str, bounds: tuple[float, float]) -> None:
 
 
 def _check_multiple(name: str, bounds: tuple[float, float], cell_m: float) -> None:
+    """Check that an extent is a multiple of the cell, up to rounding of decimals."""
     extent_m = bounds[1] - bounds[0]
     cell_count = extent_m / cell_m
     if not cell_count <= MAX_CELLS:
@@ -336,6 +338,7 @@ def _compute_centers(bounds: tuple[float, float], cell_m: float) -> Tensor:
 
 
 def _interpolate(bounds: tuple[float, float], numerators: Tensor, denominator: int) -> Tensor:
+    """Interpolate between bounds at fractions `numerators / denominator`."""
     # (lo (n - i) + hi i) / n rounds once if lo and hi are integers: the edge at 0.3 is 0.3, not 3 * 0.1.
     return (bounds[0] * (denominator - numerators) + bounds[1] * numerators) / denominator
 

@@ -43,6 +43,7 @@ class CoverageMixture:
             self.target_sums = TargetMixture(target_sums, region_targets)
 
     def _mix(self, estimate: Callable[[Coverage], Estimate]) -> Estimate:
+        """Combine the estimates of all scenarios."""
         return Estimate.from_strata([(weight, estimate(coverage)) for weight, coverage in self.weighted_coverages])
 
     def estimate(self, region: Region, band: str, average: Average | None = None) -> Estimate:

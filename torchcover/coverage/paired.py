@@ -43,6 +43,7 @@ def check_paired(coverages: Mapping[str, Coverage]) -> None:
 
 
 def _has_same_points(a: Coverage, b: Coverage) -> bool:
+    """Return whether two results have equal frames and reference points in every cell and block."""
     has_same_cells = torch.equal(a.observed_cells.cell_indices, b.observed_cells.cell_indices)
     has_same_counts = torch.equal(a.observed_cells.point_counts, b.observed_cells.point_counts)
     if not (has_same_cells and has_same_counts and a.counts["num_frames"] == b.counts["num_frames"]):
@@ -55,6 +56,7 @@ def _has_same_points(a: Coverage, b: Coverage) -> bool:
 def _list_estimates(
     coverage: Coverage | CoverageMixture, region: Region, band_or_target: str, is_target: bool
 ) -> list[Estimate]:
+    """List the estimates of a region in a band, or of a test target in a region."""
     if is_target:
         assert coverage.target_sums is not None
         return [coverage.target_sums.estimate(region, band_or_target)]

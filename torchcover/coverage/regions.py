@@ -78,6 +78,7 @@ class Region:
         return cls(name, (min(x), max(x)), (min(y), max(y)), corners)
 
     def _check_polygon(self) -> None:
+        """Check that edges do not cross, and that the corners have the bounds of the region."""
         import shapely
 
         polygon = shapely.Polygon(self.corners_m)

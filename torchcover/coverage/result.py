@@ -311,6 +311,7 @@ class Coverage:
 
     @property
     def _estimators(self) -> dict[tuple[Quantity, ...], Callable[[Region, str], Estimate]]:
+        """Estimators by the quantities that they estimate."""
         estimators: dict[tuple[Quantity, ...], Callable[[Region, str], Estimate]] = {self.quantities: self.estimate}
         if self.aggregated_numbers is not None:
             estimators[self.aggregated_numbers.quantities] = self.estimate_aggregated

@@ -172,6 +172,7 @@ class BlockSums:
         return self._expand_entries(block_counts[positions] >= min_blocks)
 
     def _expand_entries(self, selection: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Expand selected entries to dense arrays over blocks and their distinct cells."""
         cells, positions = torch.unique(self.cell_indices[selection] % self._cells, return_inverse=True)
         entries = self.cell_indices[selection] // self._cells, positions
         denominators = self.denominators.new_zeros((self.shape[0], len(cells)))

@@ -212,6 +212,7 @@ class CoverageSums(BlockedSums):
 
     @torch.no_grad()  # the sums would keep the graph of each frame alive
     def _compute_frame_sums(self, frame: FrameInput) -> FrameSums:
+        """Compute the sums that one frame adds to cells and regions."""
         _, _, reference, weights, heights_m, block_index = frame
         point_indices, point_positions, cell_indices = self.grid.assign_cells(reference, heights_m)
         # Only the reference may be cropped: the nearest sensor point may lie outside the grid.

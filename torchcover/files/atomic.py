@@ -125,6 +125,7 @@ def read_manifest(path: Path) -> dict[str, Any] | None:
 
 @lru_cache(maxsize=4)
 def _parse_manifest(path: Path, *_: int) -> dict[str, Any] | None:
+    """Parse a manifest; the status of the file is a part of the cache key."""
     try:
         with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW), "rb") as file:
             record = json.loads(file.read(MAX_MANIFEST_BYTES))

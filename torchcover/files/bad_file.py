@@ -125,6 +125,7 @@ def find_link_roots(recording: Path) -> list[Path]:
 
 
 def _check_links(path: Path) -> None:
+    """Check that a link does not lead out of its recording."""
     for recording, roots in _link_roots.items():
         target = path.resolve()
         if path.absolute().is_relative_to(recording) and not any(target.is_relative_to(root) for root in roots):

@@ -62,6 +62,7 @@ def _load_all(text: str, loader: type["_Loader"]) -> list[Any]:
 
 
 def _load_text(text: str, load: Callable[[str, type["_Loader"]], Any]) -> Any:  # noqa: ANN401
+    """Load a text of limited size and describe errors of the parser."""
     max_characters = 1_000_000  # far above hand-written files, and parsed in seconds
     if len(text) > max_characters:
         raise ValueError(f"not a YAML file of {max_characters:,} characters at most; it has {len(text):,}")
@@ -203,6 +204,7 @@ _Loader.add_constructor(None, _Loader.reject_tag)
 
 
 def _quote(value: Any) -> str:  # noqa: ANN401
+    """Quote at most 60 characters of a value for a message."""
     text = str(value)
     return repr(text if len(text) <= 60 else f"{text[:60]}...")
 

@@ -114,6 +114,7 @@ class _ReaderProcess:
 
 
 def _receive(connection: Connection, timeout_s: float) -> tuple[list[str] | None, Arrays]:
+    """Receive an error description and the arrays of an answer."""
     if not connection.poll(timeout_s):
         raise TimeoutError
     error, headers = json.loads(connection.recv_bytes())

@@ -125,6 +125,7 @@ def _lower_limit(limit: int, value: int) -> None:
 
 
 def _set_up_child(parent_pid: int, memory_gb: float, cpu_s: float, can_write: bool, *_: object) -> None:
+    """Limit resources, and let the kernel kill this process when its parent ends."""
     assert _prctl is not None  # checked by `end_with_parent`
     if cpu_s < math.inf:
         _lower_limit(resource.RLIMIT_CPU, math.ceil(cpu_s))

@@ -68,6 +68,7 @@ def unescape_cell(text: str) -> str:
 
 
 def _is_formula(text: str) -> bool:
+    """Return whether a spreadsheet would read a text as a formula."""
     is_number = re.fullmatch(r"[+-]?(\d+(\.\d*)?(e[+-]?\d+)?|inf)", text, re.IGNORECASE) is not None
     return re.match(r"[=+\-@\t\r]", text.lstrip("'")) is not None and not is_number
 
@@ -150,6 +151,7 @@ def _iterate_rows(text: str) -> Iterator[tuple[int, list[str]]]:
 
 
 def _check_names(names: Sequence[str], required: Sequence[str], optional: Sequence[str] | None) -> None:
+    """Check that a header has all required columns, and no unknown or repeated ones."""
     if optional is None:
         names, optional = [name for name in names if name in required], ()
     missing = [name for name in required if name not in names]
@@ -163,19 +165,17 @@ def _check_names(names: Sequence[str], required: Sequence[str], optional: Sequen
 
 
 def _parse_numbers(name: str, texts: Sequence[str], lines: Sequence[int]) -> NDArray[np.float64]:
+    """Parse finite numbers; the error names the first other value."""
     with suppress(ValueError):
         values = np.array(texts, dtype=np.float64)
         if np.isfinite(values).all():
             return values
-    line, text = next((line, text) for line, text in zip(lines, texts, strict=True) if not _is_finite(text))
+    for line, text in zip(lines, texts, strict=True):
+        with suppress(ValueError):
+            if math.isfinite(float(text)):
+                continue
+        break
     raise ValueError(f"line {line}: {name}: a finite number is needed; got {text[:80]!r}")
-
-
-def _is_finite(text: str) -> bool:
-    try:
-        return bool(np.isfinite(float(text)))
-    except ValueError:
-        return False
 
 
 class JsonTable(NamedTuple):
@@ -238,12 +238,7 @@ def read_json_table(path: Path) -> JsonTable:
 
 
 class NpyHeader(NamedTuple):
-    """Header of a `.npy` file.
-
-    Args:
-        shape: Shape of the array.
-        dtype: Type of its elements; arrays of Python objects are refused.
-    """
+    """Shape of the array in a `.npy` file, and the type of its elements, which are never Python objects."""
 
     shape: tuple[int, ...]
     dtype: np.dtype[Any]
@@ -367,6 +362,7 @@ def _check_growth(member: zipfile.ZipInfo) -> None:
 def _load_array(
     open_stream: Callable[[], IO[bytes]], size_bytes: int, check: Callable[[NpyHeader], None]
 ) -> NDArray[Any]:
+    """Load an array after its header, size and memory were checked."""
     with open_stream() as stream:
         header = _read_npy_header(stream)
         data_bytes = size_bytes - stream.tell()
@@ -385,6 +381,7 @@ def _load_array(
 
 
 def _read_npy_header(stream: IO[bytes]) -> NpyHeader:
+    """Read the header of a `.npy` stream."""
     readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     # The header is a Python literal: NumPy, the parser and the tokenizer each have exceptions of their own.
     try:

@@ -54,6 +54,7 @@ def build_frame(sensor: Tensor, reference: Tensor, name: object, vehicle_T_lidar
 
 
 def _transform_to_vehicle_frame(points: Tensor, vehicle_T_lidar: Tensor | None) -> Tensor:
+    """Transform points from the LiDAR frame to the vehicle frame."""
     if points.ndim != 2 or points.shape[1] < 3:
         raise ValueError(f"points of shape (N, 3 + ...) are needed; got {tuple(points.shape)}")
     if vehicle_T_lidar is None:

@@ -98,6 +98,7 @@ def _format_markdown(table: Any) -> str:  # noqa: ANN401  (a DataFrame)
 
 
 def _find_figure_logger(logger: Any) -> FigureLogger | None:  # noqa: ANN401  (any logger)
+    """Find the function with which a logger logs figures; None without one."""
     experiment = getattr(logger, "experiment", None)
     if callable(getattr(logger, "log_image", None)):
         return partial(_log_with_wandb, logger)

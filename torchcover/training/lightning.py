@@ -108,6 +108,7 @@ class CoverageCallback(Callback):
         self._logged_scalars = {}
 
     def _start_epoch(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Decide whether the epoch is measured, and reset the metric."""
         self.metric.to(pl_module.device)  # processes exchange the sums on this device
         if self._measured_epoch == trainer.current_epoch:
             return
@@ -123,6 +124,7 @@ class CoverageCallback(Callback):
             self.metric.reset()
 
     def _add_batch(self, trainer: Trainer, pl_module: LightningModule, batch: object, loader_index: int) -> None:
+        """Add the new frames of a batch to the metric."""
         # After a checkpoint at the last batch of an epoch, Lightning does not call the hook for the epoch start.
         self._start_epoch(trainer, pl_module)
         if self._measured_epoch is None:
@@ -144,6 +146,7 @@ class CoverageCallback(Callback):
         )
 
     def _find_shard(self, trainer: Trainer, loader_index: int) -> Shard | None:
+        """Find the shard of a loader of the current stage."""
         evaluation_loaders = trainer.test_dataloaders if trainer.testing else trainer.val_dataloaders
         loaders: Any = trainer.train_dataloader if self.stage == "train" else evaluation_loaders
         flat_loaders = CombinedLoader(loaders, "sequential").flattened
@@ -156,6 +159,7 @@ class CoverageCallback(Callback):
         return shard
 
     def _finish_epoch(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Log the numbers of a measured epoch."""
         if self._measured_epoch is None:
             return
         self._measured_epoch = None
@@ -183,6 +187,7 @@ class CoverageCallback(Callback):
         return {f"{self._prefix}/{name}": value for name, value in scalars.items()}
 
     def _log_maps(self, trainer: Trainer, coverage: Coverage) -> None:
+        """Log maps from rank zero."""
         if not (self.should_log_maps and trainer.is_global_zero and trainer.loggers):
             return
         from torchcover.training.figures import log_maps  # imports matplotlib

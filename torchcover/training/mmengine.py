@@ -113,6 +113,7 @@ class MMEngineCoverage(BaseMetric):  # type: ignore[misc]  # MMEngine has no typ
         self._add_frames(extract_frames(self.get_frames(data_batch, data_samples)), num_samples=None)
 
     def _add_frames(self, frames: Sequence[Frame], num_samples: int | None) -> None:
+        """Add the frames that no other process counts."""
         rank, num_processes = get_dist_info()
         for frame in self._deduplicator.select_new(frames, Shard(rank, num_processes, num_samples)):
             block_index = None if frame.index == UNKNOWN_INDEX else frame.block_index

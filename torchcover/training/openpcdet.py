@@ -54,6 +54,7 @@ def convert_batch_dict(
 
 
 def _split_samples(points: object, batch_size: int, name: str) -> list[Tensor]:
+    """Split collated points by the sample index in their first column."""
     array = points if isinstance(points, Tensor) else torch.as_tensor(points, device="cpu")
     if array.ndim != 2 or array.shape[1] < 4:
         raise ValueError(
