@@ -87,7 +87,7 @@ def test_sampled_streets_have_no_dead_ends(network, tmp_path):
 
 def test_sampled_traffic_has_bodies_of_all_sizes(tmp_path):
     generator, streets = np.random.default_rng(0), RandomStreets(layout="grid", buses_per_km=5.0)
-    town, routes = read_network(streets.build_network(tmp_path, generator)), tmp_path / "drawn.rou.xml"
+    town, routes = read_network(streets.build_network(tmp_path, generator)), tmp_path / "sampled.rou.xml"
     fleet = Fleet(load_bodies(), None, generator)
     write_routes(routes, town, streets, fleet, 20.0, generator)
     told = parse_xml(routes)

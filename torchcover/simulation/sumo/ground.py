@@ -27,7 +27,7 @@ from torchcover.simulation.traffic.alignment import Polyline
 from torchcover.simulation.traffic.assemble import compute_attitude_deg
 from torchcover.simulation.traffic.city import CITY, PARKED_KINDS
 from torchcover.simulation.traffic.fleet import CATEGORIES, EGO, REAR_OF, Fleet, get_part_kinds
-from torchcover.simulation.traffic.scenery import PAVEMENT_M, build_sidewalk
+from torchcover.simulation.traffic.scenery import CURB_HEIGHT_M, build_sidewalk
 from torchcover.simulation.world import Actor
 
 
@@ -268,7 +268,7 @@ class BodyPlacer:
         angles_deg = np.column_stack([yaw_deg, np.zeros((len(yaw_deg), 2))])
         if track.is_pedestrian:
             is_raised = self._sidewalks.is_inside(centers_m) & ~is_on_bridge
-            steps_m = np.where(is_raised, PAVEMENT_M, 0.0)[:, None]
+            steps_m = np.where(is_raised, CURB_HEIGHT_M, 0.0)[:, None]
             heights_m = heights_m + smooth_positions(steps_m, curb_step_poses)[:, 0]
         elif not isinstance(self._ground, FlatGround):
             angles_deg[:, 1:] = compute_tilts_deg(self._ground, centers_m, yaw_deg, size_m)

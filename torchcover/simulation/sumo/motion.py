@@ -30,14 +30,10 @@ class MotionParams:
     Args:
         time_step_s: Time between two poses.
         smoothing_s: Time before and after a position over which it is smoothed, at least.
-        corner_m: Distance before and after a corner of a path over which it is rounded.
         axle_share: Distance of the axles from the center, as a share of the length.
         pedestrian_pivot_m: Distance behind a pedestrian of the point about which the body turns.
         max_walking_mps: Largest speed of people; SUMO lets people jump where paths meet.
         jump_extra_mps: Additional speed with which people walk the distance of a jump.
-        max_edge_mps: Largest speed with which people go along an edge instead of crossing a carriageway.
-        edge_distance_m: Distance of these people from the edge.
-        max_edge_offset_m: Largest distance from the edge before and after.
         check_spacing_m: Distance along the path between two checks for overlaps with obstacles.
         max_swings: Number of corrections of a path.
         swing_m: Distance before and after an overlap over which the path is shifted.
@@ -49,14 +45,10 @@ class MotionParams:
 
     time_step_s: float = 0.1
     smoothing_s: float = 1.0
-    corner_m: float = 3.0
     axle_share: float = 0.3
     pedestrian_pivot_m: float = 0.4
     max_walking_mps: float = 4.0
     jump_extra_mps: float = 0.8
-    max_edge_mps: float = 3.5
-    edge_distance_m: float = 0.25
-    max_edge_offset_m: float = 2.0
     check_spacing_m: float = 1.0
     max_swings: int = 4
     swing_m: float = 8.0
@@ -192,9 +184,7 @@ def compute_lead_path(
         path_m = spread_jumps(track.times_s, path_m, PARAMS.max_walking_mps, PARAMS.jump_extra_mps)
     even_m = interpolate_path(times_s, track.times_s, path_m - origin_m)
     if track.is_pedestrian and walkable_area is not None and not walkable_area.is_empty:
-        even_m = follow_edges(
-            even_m, time_step_s, walkable_area, PARAMS.edge_distance_m, PARAMS.max_edge_offset_m, PARAMS.max_edge_mps
-        )
+        even_m = follow_edges(even_m, time_step_s, walkable_area)
     # Between two positions of the track there may be several poses.
     half_window_s = max(PARAMS.smoothing_s, float(np.median(np.diff(track.times_s))))
     smooth_m = smooth_positions(even_m, int(np.ceil(half_window_s / time_step_s)))
@@ -203,7 +193,7 @@ def compute_lead_path(
         # The simulation knows the front and the length of the vehicle with its trailer.
         center_offset_m = HITCHES[user.kind].center_offset_m if user.kind in HITCHES else 0.0
         distance_m = max(user.length_m / 2 - (user.lead_offset_m + center_offset_m), 0.0)
-    return shift_path_back(smooth_m, distance_m, np.deg2rad(track.yaw_deg[0]), PARAMS.corner_m)
+    return shift_path_back(smooth_m, distance_m, np.deg2rad(track.yaw_deg[0]))
 
 
 def compute_poses(users: Sequence[RoadUser], paths_m: Sequence[Float64]) -> list[Float64]:

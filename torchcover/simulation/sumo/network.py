@@ -22,7 +22,7 @@ class NetworkLane(NamedTuple):
 
     Args:
         edge_id: Name of the edge.
-        use: "road" and "turn" (on a junction) for vehicles, "bay" for parking, "shoulder" for nobody; "sidewalk",
+        use: "road" and "turn" (on a junction) for vehicles, "bay" for parking, "shoulder" for no one; "sidewalk",
             "crossing" and "corner", which joins these two, for pedestrians.
         width_m: Width.
         line_m: (K, 3) centerline in the direction of travel, K >= 2; for a corner its outline, K >= 3.

@@ -52,7 +52,7 @@ def smooth_positions(positions_m: Float64, half_window: int) -> Float64:
 
 
 def shift_path_back(
-    path_m: Float64, distance_m: float, initial_yaw_rad: float, corner_m: float, spacing_m: float = 0.5
+    path_m: Float64, distance_m: float, initial_yaw_rad: float, corner_m: float = 3.0, spacing_m: float = 0.5
 ) -> Float64:
     """Compute the path of a point that follows another one at a distance, with rounded corners.
 
@@ -105,9 +105,9 @@ def follow_edges(
     path_m: Float64,
     time_step_s: float,
     walkable_area: shapely.Geometry,
-    edge_distance_m: float,
-    max_distance_m: float,
-    max_speed_mps: float,
+    edge_distance_m: float = 0.25,
+    max_distance_m: float = 2.0,
+    max_speed_mps: float = 3.5,
 ) -> Float64:
     """Move a pedestrian who leaves the walkable area back along its edge.
 

@@ -108,7 +108,7 @@ class RandomStreets(Document):
             nodes_m[node.get("id", "")] = (float(node.get("x", "")), float(node.get("y", "")))
         edges = list(parse_xml(prefix.with_suffix(".edg.xml")).iter("edge"))
         hills = Hills(self.hill_height_std_m, generator)
-        node_file, edge_file, network_file = folder / "nodes.xml", folder / "edges.xml", folder / "drawn.net.xml"
+        node_file, edge_file, network_file = folder / "nodes.xml", folder / "edges.xml", folder / "sampled.net.xml"
         edge_file.write_text(self._format_edges(nodes_m, edges, hills, generator), encoding="utf-8")
         node_file.write_text(_format_nodes(nodes_m, hills), encoding="utf-8")
         run_program(

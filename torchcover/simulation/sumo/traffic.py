@@ -156,7 +156,7 @@ class SumoTraffic(ProceduralTraffic):
             network = read_network(network_file)
             routes = self.routes
             if self.random is not None:
-                routes = (Path(folder) / "drawn.rou.xml",)
+                routes = (Path(folder) / "sampled.rou.xml",)
                 write_routes(*routes, network, self.random, fleet, WARM_UP_S + duration_s, generator)
             vehicle_types = {}
             for path in routes:

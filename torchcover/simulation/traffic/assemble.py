@@ -12,7 +12,7 @@ from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.traffic.fleet import CATEGORIES, EGO, HITCHES, REAR_OF, Fleet, compute_trailer_poses
 from torchcover.simulation.traffic.flow import Agent, Lane, TrafficHistory
 from torchcover.simulation.traffic.hills import Hills
-from torchcover.simulation.traffic.scenery import PAVEMENT_M
+from torchcover.simulation.traffic.scenery import CURB_HEIGHT_M
 from torchcover.simulation.world import Actor
 
 # Largest range of a sensor: road users that never come this close to the ego vehicle are omitted from the scene.
@@ -126,8 +126,8 @@ def compute_step_height_m(beyond_curb_m: Float64, body_radius_m: float | Float64
     Returns:
         (...) heights above the carriageway in meters.
     """
-    step_fractions = (beyond_curb_m - body_radius_m) / PAVEMENT_M
-    return PAVEMENT_M * (1.0 - np.clip(step_fractions, 0.0, 1.0))
+    step_fractions = (beyond_curb_m - body_radius_m) / CURB_HEIGHT_M
+    return CURB_HEIGHT_M * (1.0 - np.clip(step_fractions, 0.0, 1.0))
 
 
 def is_free_for(blocked: Bools, duration_s: float, step_s: float) -> Bools:

@@ -279,13 +279,9 @@ class Fleet:
         """
         # Written out because `uniform` takes three times as long, and a scene has thousands of drivers.
         factor = 1 - speed_spread + (1 + speed_spread - (1 - speed_spread)) * self._generator.random()
-        return Driver(
-            float(typical_driver.desired_speed_mps * factor),
-            typical_driver.headway_s,
-            typical_driver.standstill_gap_m,
-            typical_driver.acceleration_mps2,
-            typical_driver.deceleration_mps2,
-        )
+        driver, desired_mps = typical_driver, float(typical_driver.desired_speed_mps * factor)
+        gaps = (driver.headway_s, driver.standstill_gap_m)
+        return Driver(desired_mps, *gaps, driver.acceleration_mps2, driver.deceleration_mps2)
 
     def create_agent(self, kind: str, lane_index: int, lane_position_m: float, driver: Driver) -> Agent:
         """Create an agent with the length of its body.

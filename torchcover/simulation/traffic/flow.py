@@ -264,7 +264,7 @@ class LaneSimulation:
         has_red_by_step = iter(self._find_red_passages(step_times_s))
         for frame_index, count in enumerate(step_counts):
             for _ in range(count):
-                self._advance(next(has_red_by_step), durations_s[frame_index] / count)
+                self._simulate_step(next(has_red_by_step), durations_s[frame_index] / count)
             positions_m[frame_index], speeds_mps[frame_index] = self.lane_positions_m, self.speeds_mps
             is_occupied[frame_index] = self._is_occupied.reshape(-1, 2)
         return TrafficHistory(positions_m, speeds_mps, is_occupied)
@@ -274,7 +274,7 @@ class LaneSimulation:
         remaining_s = self._signals.compute_remaining_green_s(times_s).reshape(len(times_s), -1)
         return ~(remaining_s[:, self._passages.phase_indices] > self._passages.min_green_s)
 
-    def _advance(self, has_red: Bools, step_s: float) -> None:
+    def _simulate_step(self, has_red: Bools, step_s: float) -> None:
         """Simulate one step with the given red passages (K,)."""
         driver, speed_mps = self._driver, self.speeds_mps
         leader_m, leader_mps = self._compute_leader_positions_m(), speed_mps.take(self._leader)

@@ -13,7 +13,7 @@ from pydantic import AfterValidator
 
 from torchcover.geometry.arrays import Bools, Float64, Int64
 from torchcover.simulation.shapes import Mesh
-from torchcover.simulation.traffic.scenery import PAVEMENT_M, TRUNK_SHARE, build_unit_shape, copy_shape
+from torchcover.simulation.traffic.scenery import CURB_HEIGHT_M, TRUNK_SHARE, build_unit_shape, copy_shape
 
 Bounds = tuple[float, float]
 # Curb before the sidewalk, or ground behind the sidewalk of a side with houses ("built") or without ("open").
@@ -362,7 +362,7 @@ def find_free_pieces(
     for later_piece, earlier_piece in zip(later[order].tolist(), earlier[order].tolist(), strict=True):
         if is_free[earlier_piece]:
             is_free[later_piece] = False
-    return is_free, PAVEMENT_M * is_on_sidewalk
+    return is_free, CURB_HEIGHT_M * is_on_sidewalk
 
 
 def find_overlapping_pairs(outlines_m: Float64, groups: Int64) -> Int64:

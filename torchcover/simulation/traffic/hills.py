@@ -10,7 +10,7 @@ from torchcover.geometry.arrays import Float32, Float64
 from torchcover.simulation.bodies import merge_meshes
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.traffic.alignment import Alignment, StreetCorridor, compute_squared_distances_m2
-from torchcover.simulation.traffic.scenery import PAVEMENT_M, build_slab
+from torchcover.simulation.traffic.scenery import CURB_HEIGHT_M, build_slab
 
 NUM_WAVES = 3
 
@@ -127,14 +127,14 @@ class BlockParams:
     Args:
         segment_m: Length of the straight segments that approximate a bend.
         row_m: Distance of the vertices across a block on hills.
-        survey_spacing_m: Distance of the stations at which the depth of a block is determined.
+        depth_spacing_m: Distance of the stations at which the depth of a block is determined.
         clearance_m: Gap to the corridor of another stretch of street.
         min_depth_m: Depth of a block where the corridor leaves no room.
     """
 
     segment_m: float = 6.0
     row_m: float = 12.0
-    survey_spacing_m: float = 8.0
+    depth_spacing_m: float = 8.0
     clearance_m: float = 4.0
     min_depth_m: float = 0.5
 
@@ -208,11 +208,11 @@ class BuildingSite:
         offsets_m = curb_offset_m + np.linspace(0.0, 1.0, num_rows) * depths_m[:, None]
         grid_m = self.street.compute_poses(*np.broadcast_arrays(stations_m[:, None], side * offsets_m))[..., :2]
         outline = shapely.make_valid(shapely.Polygon(np.concatenate([grid_m[:, 0], grid_m[::-1, -1]])))
-        mesh = build_slab(grid_m if side == 1 else grid_m[:, ::-1], (0.0, PAVEMENT_M))
+        mesh = build_slab(grid_m if side == 1 else grid_m[:, ::-1], (0.0, CURB_HEIGHT_M))
         if not is_flat:
             bottom, top = mesh.vertices_m.reshape(2, -1, 3)
             ground_m = self._hills.compute_heights_m(top[:, :2])
-            bottom[:, 2], top[:, 2] = ground_m - FOUNDATION_M, ground_m + PAVEMENT_M
+            bottom[:, 2], top[:, 2] = ground_m - FOUNDATION_M, ground_m + CURB_HEIGHT_M
         return mesh.assign_material("pavement"), outline
 
     def compute_depths_m(
@@ -233,7 +233,7 @@ class BuildingSite:
             return np.full(len(query_stations_m), max_depth_m)
         params = self._params
         if side not in self._half_widths_m:
-            stations_m = self._corridor.sample_stations_m(params.survey_spacing_m)
+            stations_m = self._corridor.sample_stations_m(params.depth_spacing_m)
             half_widths_m = self._corridor.find_half_widths_m(stations_m, side, curb_offset_m, self._max_depth_m)
             self._half_widths_m[side] = (stations_m, half_widths_m)
         half_widths_m = np.interp(query_stations_m, *self._half_widths_m[side])

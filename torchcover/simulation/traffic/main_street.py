@@ -77,7 +77,7 @@ def sample_main_street(
         street = _sample_street(
             junction_stations_m, junction_half_lengths_m, max_bend_rad, turn_share, turn_radius_m, generator, params
         )
-        if street.alignment.is_straight or _keeps_clear_of_itself(street.alignment, half_length_m, params):
+        if street.alignment.is_straight or _is_clear_of_itself(street.alignment, half_length_m, params):
             return street
     no_turns = np.zeros(len(junction_stations_m), dtype=np.int64)
     return MainStreet(Alignment([0.0], [0.0]), no_turns, junction_half_lengths_m)
@@ -103,14 +103,14 @@ def _sample_street(
             quarter_turns, last_turn = quarter_turns + int(turns[index]), index
             angle_rad = np.deg2rad(generator.uniform(*params.turn_deg))
             half_lengths_m[index] = (angle_rad * turn_radius_m + params.turn_transition_m) / 2
-    curve = _CurvatureProfile()
+    curves: list[tuple[float, float, float, float]] = []  # start, length, length of both transitions, curvature
     deviation_rad = 0.0
     starts_m = junction_stations_m + half_lengths_m + params.straight_m
     ends_m = junction_stations_m[1:] - half_lengths_m[1:] - params.straight_m
     for index, station_m in enumerate(junction_stations_m.tolist()):
         if turns[index]:
             half_m = float(half_lengths_m[index])
-            curve.append(station_m - half_m, 2 * half_m, params.turn_transition_m, turns[index] / turn_radius_m)
+            curves.append((station_m - half_m, 2 * half_m, params.turn_transition_m, turns[index] / turn_radius_m))
         angle_rad = generator.uniform(-max_bend_rad, max_bend_rad)
         length_m = float(ends_m[index] - starts_m[index]) if index < len(ends_m) else 0.0
         if length_m > params.min_bend_m and angle_rad:
@@ -119,32 +119,22 @@ def _sample_street(
             if abs(deviation_rad + angle_rad) > max_bend_rad:
                 angle_rad = -angle_rad
             angle_rad = float(np.clip(angle_rad, -max_angle_rad, max_angle_rad))
-            curve.append(float(starts_m[index]), length_m, length_m / 4, angle_rad / (0.75 * length_m))
+            curves.append((float(starts_m[index]), length_m, length_m / 4, angle_rad / (0.75 * length_m)))
             deviation_rad += angle_rad
-    if not curve.stations_m:
+    if not curves:
         return MainStreet(Alignment([0.0], [0.0]), turns, half_lengths_m)
+    start_m, length_m, transition_m, curvature_per_m = np.array(curves).T
+    end_m, zeros = start_m + length_m, np.zeros(len(curves))
+    stations_m = np.stack([start_m, start_m + transition_m, end_m - transition_m, end_m], axis=1).ravel()
+    curvatures_per_m = np.stack([zeros, curvature_per_m, curvature_per_m, zeros], axis=1).ravel()
     # The street is moved so that station 0 is at the origin and along x.
-    x, y, yaw_deg = Alignment(curve.stations_m, curve.curvatures_per_m).compute_poses(0.0, 0.0)
+    x, y, yaw_deg = Alignment(stations_m, curvatures_per_m).compute_poses(0.0, 0.0)
     yaw = np.deg2rad(yaw_deg)
     start = (-x * np.cos(yaw) - y * np.sin(yaw), x * np.sin(yaw) - y * np.cos(yaw), -yaw)
-    return MainStreet(Alignment(curve.stations_m, curve.curvatures_per_m, start), turns, half_lengths_m)
+    return MainStreet(Alignment(stations_m, curvatures_per_m, start), turns, half_lengths_m)
 
 
-class _CurvatureProfile:
-    """Stations and curvatures of successive curves."""
-
-    def __init__(self) -> None:
-        self.stations_m: list[float] = []
-        self.curvatures_per_m: list[float] = []
-
-    def append(self, start_m: float, length_m: float, transition_m: float, curvature_per_m: float) -> None:
-        """Append a curve with equal transitions at both ends."""
-        end_m = start_m + length_m
-        self.stations_m += [start_m, start_m + transition_m, end_m - transition_m, end_m]
-        self.curvatures_per_m += [0.0, curvature_per_m, curvature_per_m, 0.0]
-
-
-def _keeps_clear_of_itself(street: Alignment, half_length_m: float, params: MainStreetParams) -> bool:
+def _is_clear_of_itself(street: Alignment, half_length_m: float, params: MainStreetParams) -> bool:
     """Test whether stretches of a street that are not neighbors keep their distance."""
     stations_m = np.arange(-half_length_m, half_length_m, 20.0)
     positions_m = street.compute_poses(stations_m, 0.0)[:, :2]

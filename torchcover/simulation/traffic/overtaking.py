@@ -159,11 +159,11 @@ class LaneChangeSimulation:
         for frame_index, duration_s in enumerate(durations_s):
             num_steps = int(np.ceil(duration_s / MAX_STEP_S - 1e-9))
             for _ in range(num_steps):
-                self._advance(duration_s / num_steps)
+                self._simulate_step(duration_s / num_steps)
             positions_m[frame_index], speeds_mps[frame_index] = self.lane_positions_m, self.speeds_mps
         return TrafficHistory(positions_m, speeds_mps, np.zeros((len(times_s), 0, 2), dtype=bool))
 
-    def _advance(self, step_s: float) -> None:
+    def _simulate_step(self, step_s: float) -> None:
         """Simulate one step."""
         num_agents, speed_mps = len(self.lane_positions_m), self.speeds_mps
         gap_m, member_speed_mps = self._compute_gaps_m(), speed_mps.take(self._members)
@@ -255,9 +255,9 @@ class LaneChangeSimulation:
         agents = agents[self.lane_positions_m[agents] >= self._next_change_m[agents]]
         to_left, to_right = agents[self._has_lane(agents, -1)], agents[self._has_lane(agents, 1)]
         agents, sides = np.append(to_left, to_right), np.repeat([-1, 1], [len(to_left), len(to_right)])
-        gains_mps2 = self._compute_gains_mps2(agents, sides)
+        incentives_mps2 = self._compute_incentives_mps2(agents, sides)
         new_changes: list[LaneChange] = []
-        for candidate in np.argsort(-gains_mps2)[: np.count_nonzero(gains_mps2 > 0.0)].tolist():
+        for candidate in np.argsort(-incentives_mps2)[: np.count_nonzero(incentives_mps2 > 0.0)].tolist():
             agent = int(agents[candidate])
             start_m, old_lane = float(self.lane_positions_m[agent]), int(self.lane_indices[agent])
             distances_m = [abs(start_m - change.start_m) for change in new_changes]
@@ -275,14 +275,14 @@ class LaneChangeSimulation:
         lane, is_exiting = self.lane_indices[agents] % LANES, self._is_exiting[agents]
         positions_m = self.lane_positions_m[agents]
         begin_m, end_m = self._auxiliary_spans_m[self.lane_indices[agents] // LANES].T
-        is_beside = (positions_m > begin_m) & (positions_m < end_m - self._params.min_exit_distance_m)
+        is_alongside = (positions_m > begin_m) & (positions_m < end_m - self._params.min_exit_distance_m)
         if side < 0:
-            may_use_median_lane = (lane == 1) & ~self._is_heavy[agents]
-            return np.asarray(~is_exiting & (may_use_median_lane | (lane == 2) | (is_beside & (lane == SIDE_LANE))))
-        return np.asarray((lane < SIDE_LANE - 1) | (is_beside & is_exiting & (lane == SIDE_LANE - 1)))
+            has_left_lane = (lane == 2) | ((lane == 1) & ~self._is_heavy[agents])
+            return np.asarray(~is_exiting & (has_left_lane | (is_alongside & (lane == SIDE_LANE))))
+        return np.asarray((lane < SIDE_LANE - 1) | (is_alongside & is_exiting & (lane == SIDE_LANE - 1)))
 
-    def _compute_gains_mps2(self, agents: Int64, sides: Int64) -> Float64:
-        """Compute the gains (K,) in m/s² of changes to the left (-1) or right (1); negative where they are not safe."""
+    def _compute_incentives_mps2(self, agents: Int64, sides: Int64) -> Float64:
+        """Compute the incentives (K,) in m/s² of changes to the left (-1) or right (1); negative if unsafe."""
         params = self._params
         lane, speed_mps = self.lane_indices[agents], self.speeds_mps
         lane_stride_m = 1e7  # beyond any position along a lane

@@ -29,7 +29,7 @@ from torchcover.simulation.traffic.frontage import RoadsideDensity, find_street_
 from torchcover.simulation.traffic.idm import Driver
 from torchcover.simulation.traffic.kind import ProceduralTraffic, SceneParts
 from torchcover.simulation.traffic.scenery import (
-    PAVEMENT_M,
+    CURB_HEIGHT_M,
     Scenery,
     build_box,
     build_box_from_bounds,
@@ -193,9 +193,9 @@ class ParkingLotBuilder:
             x0_m, x1_m = sorted((side * start_m, side * (start_m + LOT.island_length_m)))
             for half in (1, -1):
                 y0_m, y1_m = sorted((half * LOT.middle_walkway_m / 2, half * (LOT.inner_edge_m - 0.5)))
-                island = build_box_from_bounds((x0_m, x1_m), (y0_m, y1_m), (0.0, PAVEMENT_M))
+                island = build_box_from_bounds((x0_m, x1_m), (y0_m, y1_m), (0.0, CURB_HEIGHT_M))
                 islands.append(island.assign_material("pavement"))
-                trees += build_tree(((x0_m + x1_m) / 2, (y0_m + y1_m) / 2), PAVEMENT_M, 2.3, 5.5, 1.3)
+                trees += build_tree(((x0_m + x1_m) / 2, (y0_m + y1_m) / 2), CURB_HEIGHT_M, 2.3, 5.5, 1.3)
         return islands, trees
 
     def _build_bollards(self) -> list[Mesh]:

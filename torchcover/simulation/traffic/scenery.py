@@ -14,7 +14,7 @@ from torchcover.simulation.bodies import merge_meshes
 from torchcover.simulation.patches import find_outward_faces
 from torchcover.simulation.shapes import Mesh, build_band_faces, build_prism_faces, compute_circle_points
 
-PAVEMENT_M = 0.15  # height of curbs and sidewalks above the road
+CURB_HEIGHT_M = 0.15  # height of curbs and sidewalks above the road
 # Depth to which curbs continue below the ground, since it may rise between two of their vertices.
 SUNK_M = 0.3
 TRUNK_SHARE = 0.1  # width of the trunk of a roadside tree, as a share of the width of the tree
@@ -118,7 +118,7 @@ def build_sidewalk(outlines: ArrayLike, compute_heights_m: Callable[[Float64], F
     # Edges of the outline belong to a single triangle.
     key, back = edges[:, 0] * count + edges[:, 1], edges[:, 1] * count + edges[:, 0]
     here, following = edges[~np.isin(key, back)].T
-    vertices_m = [np.column_stack([places_m, above_m + up_m]) for up_m in (PAVEMENT_M, -SUNK_M)]
+    vertices_m = [np.column_stack([places_m, above_m + up_m]) for up_m in (CURB_HEIGHT_M, -SUNK_M)]
     faces = np.concatenate([faces, faces[:, ::-1] + count, build_band_faces(here + count, following + count, -count)])
     mesh = Mesh(np.concatenate(vertices_m), faces).assign_material("pavement")
     # The mesh may be open where vertices were merged.
@@ -164,11 +164,11 @@ def build_tree(
         height_m: Height of the tree, above the bottom.
         crown_radius_m: Largest radius of the crown.
     """
-    shape, centre = compute_circle_points(6), np.asarray(center_m)
-    outlines = [centre + share * crown_radius_m * shape for share in (0.45, 1.0, 0.9, 0.3)]
+    shape, center = compute_circle_points(6), np.asarray(center_m)
+    outlines = [center + share * crown_radius_m * shape for share in (0.45, 1.0, 0.9, 0.3)]
     levels = bottom_m + trunk_height_m + np.array([0.0, 0.3, 0.65, 1.0]) * (height_m - trunk_height_m)
     crown = build_prism(outlines, levels.tolist()).assign_material("vegetation")
-    return [build_post(centre, 0.15, bottom_m, trunk_height_m).assign_material("wood"), crown]
+    return [build_post(center, 0.15, bottom_m, trunk_height_m).assign_material("wood"), crown]
 
 
 def merge_by_kind(*kinds: Sequence[Mesh]) -> tuple[Mesh, ...]:
@@ -193,12 +193,10 @@ def copy_shape(shape: Mesh, outlines_m: Float64, bottom_m: Float64, base_m: Floa
     positions_m = np.einsum("vc,ncd->nvd", weights, outlines_m)
     z_m = np.where(z == 0.0, bottom_m[:, None], base_m[:, None] + heights_m[:, None] * z)
     faces = shape.faces + len(x) * np.arange(num_copies)[:, None, None]
-    return Mesh(
-        np.concatenate([positions_m, z_m[..., None]], axis=2).reshape(-1, 3),
-        faces.reshape(-1, 3),
-        np.tile(shape.filled_material_indices, num_copies),
-        np.ones(num_copies * len(shape.faces), dtype=bool),
-    )
+    vertices_m = np.concatenate([positions_m, z_m[..., None]], axis=2).reshape(-1, 3)
+    material_indices = np.tile(shape.filled_material_indices, num_copies)
+    is_outward = np.ones(num_copies * len(shape.faces), dtype=bool)
+    return Mesh(vertices_m, faces.reshape(-1, 3), material_indices, is_outward)
 
 
 @cache
@@ -227,14 +225,9 @@ def build_unit_shape(name: str) -> Mesh:
     if name == "sign":
         post = build_box_from_bounds((0.0, 1.0), (0.45, 0.55), (0.0, 0.75)).assign_material("metal")
         return merge_meshes([post, build_box_from_bounds((0.2, 0.8), (0.0, 1.0), (0.755, 1.0)).assign_material("sign")])
-    return merge_meshes(
-        [
-            build_wheel(0.0),
-            build_wheel(0.6),
-            build_box_from_bounds((0.42, 0.58), (0.44, 0.56), (0.25, 0.88)),
-            build_box_from_bounds((0.66, 0.7), (0.0, 1.0), (0.94, 1.0)),
-        ]
-    )
+    frame = build_box_from_bounds((0.42, 0.58), (0.44, 0.56), (0.25, 0.88))
+    handlebar = build_box_from_bounds((0.66, 0.7), (0.0, 1.0), (0.94, 1.0))
+    return merge_meshes([build_wheel(0.0), build_wheel(0.6), frame, handlebar])
 
 
 def build_round_shape(levels: Sequence[float], diameters: Sequence[float]) -> Mesh:

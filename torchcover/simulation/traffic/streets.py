@@ -12,7 +12,7 @@ from torchcover.simulation.traffic.main_street import MainStreet, sample_main_st
 
 
 @dataclass(frozen=True)
-class StreetParams:
+class CityStreetParams:
     """Dimensions of streets, junctions and sidewalks of a city.
 
     Args:
@@ -55,7 +55,7 @@ class StreetParams:
     bus_width_m: float = 2.65
 
 
-STREETS = StreetParams()
+STREETS = CityStreetParams()
 
 
 @dataclass(frozen=True)
@@ -274,13 +274,9 @@ def sample_street_plan(
     max_error_s = STREETS.green_wave_error_s
     errors_s = generator.uniform(-max_error_s, max_error_s, size=len(stations_m))
     signals = TrafficSignals(errors_s - stations_m / STREETS.green_wave_mps + generator.uniform(0.0, 60.0))
+    half_lengths_m = np.asarray(cross_lanes * cross_section.lane_width_m + STREETS.gutter_m)
+    radius_m = cross_section.min_turn_radius_m
     main_street = sample_main_street(
-        stations_m,
-        np.asarray(cross_lanes * cross_section.lane_width_m + STREETS.gutter_m),
-        max_bend_deg,
-        turn_share,
-        cross_section.min_turn_radius_m,
-        half_length_m,
-        layout_generator,
+        stations_m, half_lengths_m, max_bend_deg, turn_share, radius_m, half_length_m, layout_generator
     )
     return StreetPlan(cross_section, stations_m, cross_lanes, signals, half_length_m, main_street)

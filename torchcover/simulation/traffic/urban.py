@@ -157,17 +157,8 @@ class UrbanTraffic(ProceduralTraffic):
         remove_bodies_off_streets(bodies, lanes, agents, lane_positions_m, streets, built_span_m)
         ego = build_ego_actor(times_s, bodies, flow, 0, fleet.meshes[EGO], generator, hills)
         pedestrians = simulate_crossing_pedestrians(streets, flow, times_s, visible_span_m, fleet, generator)
-        city = CityBuilder(
-            streets,
-            StreetCorridor(streets.main_alignment, built_span_m),
-            hills,
-            fleet,
-            self.parked_share,
-            self.built_share,
-            self.roadside_density,
-            generator,
-            layout_generator,
-        )
+        corridor = StreetCorridor(streets.main_alignment, built_span_m)
+        city = CityBuilder(streets, corridor, hills, fleet, self, generator, layout_generator)
         scenery = city.build_static_scenery(visible_span_m)
         return scenery, ego, build_nearby_actors(times_s, [bodies, pedestrians], ego, fleet, hills)
 
@@ -201,13 +192,9 @@ class UrbanTraffic(ProceduralTraffic):
         check_traffic_memory(num_agents, self.num_time_steps)
         agents = self._create_ego_and_leader(streets, fleet, generator)
         for index, (lane_end_m, density_per_km, lane_drivers) in enumerate(lane_traffic):
+            span_m, passages = (0.0, lane_end_m), lanes[index].passages
             agents += fleet.fill_lane(
-                index,
-                (0.0, lane_end_m),
-                density_per_km,
-                lane_drivers,
-                passages=lanes[index].passages,
-                existing_agents=agents[:2],
+                index, span_m, density_per_km, lane_drivers, passages=passages, existing_agents=agents[:2]
             )
         simulated_s = self.duration_s + self.time_step_s + PARAMS.warm_up_s
         return lanes, select_relevant_agents(lanes, agents, simulated_s)
