@@ -342,6 +342,7 @@ class CommonFrames:
             yield from self._compute(rig, positions[start : start + batch_size])
 
     def _apply_sensor_model(self, rig: Rig) -> Rig:
+        """Replace the sensors of a rig by ideal ones if the search uses the ideal model."""
         self._check_vehicle(rig)
         return rig.apply_sensor_model("ideal") if self.sensor_model == "ideal" else rig
 
@@ -371,7 +372,7 @@ class CommonFrames:
         return frames
 
     def _check_vehicle(self, rig: Rig) -> None:
-        """Raise ValueError if the vehicle of a rig decides the ego vehicle and differs from that of these frames."""
+        """Raise ValueError if the vehicle of a rig decides the ego vehicle and these frames have another one."""
         if rig.vehicle in self._accepted_vehicles or self._vehicle is not None:
             return
         for scenario, host_scenario in zip(self.scenarios, self._host_scenarios, strict=True):

@@ -48,6 +48,7 @@ class Constraints(Document):
         )
 
     def _find_close_pairs(self, rig: Rig, free_sensors: Collection[str]) -> Iterator[str]:
+        """Yield a sentence for each free sensor that is too close to another sensor."""
         for first, second in combinations(rig.sensors, 2):
             if first.name not in free_sensors and second.name not in free_sensors:
                 continue
@@ -60,6 +61,7 @@ class Constraints(Document):
                 )
 
     def _find_asymmetric_sensors(self, rig: Rig) -> Iterator[str]:
+        """Yield a sentence for each sensor without a mirror image at the plane y = 0."""
         if not self.symmetric:
             return
         mirror = np.diag([1.0, -1.0, 1.0, 1.0])
@@ -71,6 +73,7 @@ class Constraints(Document):
                 yield f"{sensor.name} has no mirror image on the other side of the vehicle; symmetric is true"
 
     def _check_cost(self, cost_eur: float | None) -> Iterator[str]:
+        """Yield a sentence if the cost exceeds its maximum."""
         if self.max_cost_eur is not None and cost_eur is not None and cost_eur > self.max_cost_eur:
             yield f"it costs {cost_eur:g} EUR; max_cost_eur is {self.max_cost_eur:g}"
 

@@ -191,6 +191,7 @@ class FreeSensor(Document):
 
     @model_validator(mode="after")
     def _check_keys(self) -> Self:
+        """Check that the keys of a free sensor agree with each other."""
         keys = list(self._get_given_values())
         if self.mirror_of is not None and keys != ["mirror_of"]:
             raise ValueError(f"mirror_of: a mirror image has no other keys; remove {', '.join(keys[:-1])}")
@@ -269,6 +270,7 @@ class FreeSensor(Document):
         return start_sensor.model_copy(update={"mount": mount})
 
     def _build_mount(self, start: Pose, values: Mapping[str, Any], host: HostVehicle) -> Pose:
+        """Build the mount from values, on a mount region or in the vehicle frame."""
         if self.region is None:
             mount = update_pose(start, {key: values[key] for key in (*POSITION_KEYS, *ANGLE_KEYS) if key in values})
             if "z_above_body_m" in values:

@@ -22,6 +22,7 @@ REQUIRED = "required: "  # prefix of the name of a number that a requirement bou
 
 
 def _check_vehicle_name(name: str) -> str:
+    """Check that a name with a suffix is a YAML file; return it."""
     if Path(name).suffix and not is_file_name(name):
         raise ValueError(f"got {name!r}; give the name of a vehicle or the path of its YAML file")
     return name

@@ -83,6 +83,7 @@ class Objective(Document):
 
     @model_validator(mode="after")
     def _check_keys(self) -> Self:
+        """Check that an objective has either a requirement or a valid number of regions."""
         if self.requirement is not None:
             return self._check_requirement()
         if self.number is not None and self.threshold_m is not None:
@@ -92,6 +93,7 @@ class Objective(Document):
         return self
 
     def _check_requirement(self) -> Self:
+        """Check that a requirement can be scored by the share of positions or encounters that meet it."""
         requirement = self.requirement
         if unused := sorted(self.model_fields_set - {"requirement"}):
             raise ValueError(f"requirement: it needs no other keys; remove {', '.join(unused)}")

@@ -108,7 +108,7 @@ class SearchPlan:
 
     @property
     def test_seed(self) -> int:
-        """Seed of the held-out scenes, which differs from that of the search."""
+        """Seed of the held-out scenes, which differs from the seed of the search."""
         return self.seed + 1
 
     def collect_settings(self, space: SearchSpace) -> dict[str, Any]:

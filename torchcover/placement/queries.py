@@ -61,7 +61,7 @@ class Queries(NamedTuple):
         named_regions = {region.name: region for region in RegionsOfInterest().build_query_plan(ego_outline_m).regions}
         names = tuple(objectives)
         region_objectives = {name: objectives[name] for name in names if not objectives[name].requirement}
-        # Requirements alone still need frames, whose number is that of some region.
+        # Requirements alone still need frames, and their number follows from some region.
         region_objectives = region_objectives or {"": Objective(region="20m", band="ground")}
         regions: dict[str, Region] = {}
         heights: dict[str, tuple[float, float]] = {}
@@ -229,6 +229,7 @@ class Queries(NamedTuple):
                 return coverage.estimate_number(key, self.regions[region], band)
 
         def estimate_part(key: str, region: str, band: str) -> Estimate:
+            """Estimate a number in one region and band; the failure of any sensor is the worst of all failures."""
             failure = FAILURE_KEY.match(key)
             number, sensor = failure.groups() if failure else (key, "")
             if sensor == ANY:
@@ -265,6 +266,7 @@ def _select_worst(estimates: Sequence[Estimate]) -> Estimate:
 
 
 def _to_document(region: Region) -> RegionOfInterest:
+    """Convert a region to the document of a configuration."""
     if region.corners_m:
         return RegionOfInterest(polygon_m=region.corners_m)
     return RegionOfInterest(x_m=region.x_m, y_m=region.y_m)
@@ -274,6 +276,7 @@ def _crop_grid(grid: BevGrid, regions: Collection[Region]) -> BevGrid:
     """Crop a grid to the smallest range of its cells that contains the regions."""
 
     def find_range(edges: Tensor, bounds: Sequence[tuple[float, float]]) -> tuple[float, float]:
+        """Find the smallest range of cell edges that contains all bounds."""
         low, high = min(low for low, _ in bounds), max(high for _, high in bounds)
         return float(edges[edges <= low].max()), float(edges[edges >= high].min())
 

@@ -89,6 +89,7 @@ class PlacementReport:
         return output.paths
 
     def _add_numbers(self, output: AtomicOutput) -> None:
+        """Add the rigs, the CSV tables and search.json."""
         for name, rig in self.rigs.items():
             output.add(name, rig.save)
         for name, rows in self.csv_tables.items():
@@ -100,6 +101,7 @@ class PlacementReport:
         output.add_text("search.json", f"{record}\n")
 
     def _build_page(self, pictures: Sequence[PagePicture]) -> Page:
+        """Build the page with all tables, rigs and plots."""
         record = replace_nan(self.record)
         rigs = []
         for role, rig in self.page_rigs.items():

@@ -54,7 +54,7 @@ class Finalist:
 
     @property
     def is_start(self) -> bool:
-        """Whether the rig is the start, since no candidate is better."""
+        """True if the rig is the start, since no candidate is better."""
         return self.evaluation.strategy == START
 
 
@@ -110,6 +110,7 @@ class SearchResult(ReportMixin):
         return " ".join(self._build_sentences())
 
     def _build_sentences(self) -> Iterator[str]:
+        """Yield the sentences of the summary, the result first."""
         search, best = self.search, self.best
         candidates = search.evaluations[1:]
         reasons = [candidate.infeasible_reason for candidate in candidates if candidate.infeasible_reason]
@@ -165,6 +166,7 @@ class SearchResult(ReportMixin):
         return f"Control, the best of {count} random candidates: {self._describe_improvements(finalist)}."
 
     def _describe_improvements(self, finalist: Finalist, *, optimism: bool = False) -> str:
+        """Describe the improvement in each objective on held-out scenes."""
         texts = []
         for improvement in finalist.improvements[: len(self.search.space.objectives)]:
             texts.append(f"{improvement.objective}: {describe_improvement(improvement, optimism=optimism)}")
@@ -217,6 +219,7 @@ class SearchResult(ReportMixin):
         return f"SearchResult in {self.search.space.name}: {self.summary}"
 
     def _record_finalist(self, finalist: Finalist) -> dict[str, Any]:
+        """Build the record of a finalist for search.json."""
         improvements: dict[str, dict[str, Any]] = {}
         for improvement in finalist.improvements:
             improvements.setdefault(improvement.objective, {})[improvement.average] = improvement.record
@@ -247,6 +250,7 @@ class SearchResult(ReportMixin):
         return rows
 
     def _build_tested_row(self, role: str, improvement: HeldOutImprovement) -> tuple[TextCell, ...]:
+        """Build the row of one improvement on held-out scenes."""
         difference, unit = improvement.difference, improvement.difference.quantity.unit
         cells = (
             role,
@@ -265,6 +269,7 @@ class SearchResult(ReportMixin):
         return tuple(row)
 
     def _build_values_table(self) -> PageTable:
+        """Build the table of all variables of the start and the finalists."""
         columns: dict[str, Mapping[str, object]] = {"start": self.search.space.get_start_values()}
         columns |= {finalist.role: finalist.evaluation.values for finalist in self.finalists}
         rows = []
@@ -319,6 +324,7 @@ class SearchResult(ReportMixin):
             yield [number, evaluation.strategy, *self.improvements[number].tolist(), cost_eur, *values]
 
     def _compute_cost_eur(self, evaluation: Evaluation) -> float | None:
+        """Compute the cost of a candidate; None without prices or for an infeasible candidate."""
         space = self.search.space
         if not space.prices_eur or evaluation.infeasible_reason:
             return None
@@ -349,6 +355,7 @@ class SearchResult(ReportMixin):
 
 
 def _format_value(value: object) -> str:
+    """Format a value of a variable; "-" if the rig has none."""
     if value is None:
         return "-"
     return f"{value:.3f}" if isinstance(value, float) else str(value)

@@ -63,6 +63,7 @@ def run_search(
 
 
 def _run(search: PlacementSearch, out_dir: Path | None, resume: bool, progress: bool, clock: Clock) -> SearchResult:
+    """Run a search: build the frames, evaluate candidates within the budget, and validate the finalists."""
     start_s = clock()
     num_frames = len(search.frames)  # builds the frames
     frame_duration_s = (clock() - start_s) / num_frames
@@ -133,6 +134,7 @@ class _Budget:
 def _evaluate_candidates(
     search: PlacementSearch, budget: _Budget, journal: "SearchJournal | None", advance: Callable[[int, str], Any]
 ) -> None:
+    """Evaluate candidates until the budget is used up, and write each to the journal."""
     search.deadline_s = budget.deadline_s
     if journal is not None:
         journal.write()
@@ -146,6 +148,7 @@ def _evaluate_candidates(
 
 
 def _describe_best(search: PlacementSearch) -> str:
+    """Describe the improvement of the best rig so far for the progress bar."""
     best = search.select_compromise(search.find_best())
     start = search.evaluations[0].estimate
     if best is None or start is None:
@@ -250,6 +253,7 @@ class SearchJournal:
                 self._num_written += 1
 
     def _create_study(self) -> Any:  # noqa: ANN401  (a study of Optuna)
+        """Create the study with a direction for each objective and the settings of the search."""
         optuna = import_optuna()
         directions = ["maximize"] * len(self._search.space.objectives)
         storage = _open_storage(self.path)
@@ -258,6 +262,7 @@ class SearchJournal:
         return study
 
     def _create_trial(self, evaluation: Evaluation) -> "FrozenTrial":
+        """Convert an evaluation to a trial of Optuna; unknown improvements make it a failed trial."""
         optuna, distributions = import_optuna(), build_distributions(self._search.space)
         improvements = self._search.improvements[evaluation.number].tolist()
         state = optuna.trial.TrialState.COMPLETE
@@ -274,7 +279,7 @@ class SearchJournal:
 
 
 class _FolderLock:
-    """Lock without effect, since the folder is locked already; that of Optuna waits for processes that were killed."""
+    """Lock without effect, since the folder is locked already; the lock of Optuna waits for killed processes."""
 
     def acquire(self) -> bool:
         return True
@@ -284,6 +289,7 @@ class _FolderLock:
 
 
 def _open_storage(path: Path) -> Any:  # noqa: ANN401  (a storage of Optuna)
+    """Open a journal as a storage of Optuna, with a lock that does not wait for dead processes."""
     storages = import_optuna().storages
     return storages.JournalStorage(storages.journal.JournalFileBackend(str(path), lock_obj=_FolderLock()))
 

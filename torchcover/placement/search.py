@@ -54,7 +54,7 @@ class Evaluation:
 
     @property
     def is_valid(self) -> bool:
-        """Whether the rig is possible and was scored."""
+        """True if the rig is possible and was scored."""
         return self.estimate is not None and not self.infeasible_reason
 
     def to_record(self) -> dict[str, Any]:
@@ -253,7 +253,8 @@ class PlacementSearch:
             Name of a bounded number or requirement -> shortfall, only where there is one.
         """
         shortfalls = self._compute_shortfalls(evaluation)
-        return {name: shortfalls[name] for name in shortfalls if shortfalls[name] > ROUNDING} | evaluation.shortfalls
+        large = {name: shortfalls[name] for name in shortfalls if shortfalls[name] > ROUNDING}
+        return {**large, **evaluation.shortfalls}
 
     def find_best(self, strategies: tuple[str, ...] = (START, OPTIMIZER, RANDOM)) -> list[int]:
         """Find the candidates that no other dominates, among those with the smallest total shortfall.
@@ -352,7 +353,7 @@ class PlacementSearch:
         return strategy, remaining[seed % len(remaining)] if remaining else None
 
     def _sample_values(self, seed: int, number: int) -> dict[str, VariableValue]:
-        """Sample uniform values; those of the startup form a Latin hypercube, which contains all options."""
+        """Sample uniform values; the startup values form a Latin hypercube, which contains all options."""
         variables, startup_count = self.space.variables, self.plan.optimizer_params.num_startup_candidates
         fractions = np.random.default_rng(seed).random(len(variables))
         if number <= startup_count:
@@ -392,6 +393,7 @@ class PlacementSearch:
         return observations
 
     def _get_constraints(self, evaluation: Evaluation) -> dict[str, float]:
+        """Return the shortfalls that the sampler models; empty for an infeasible candidate."""
         if not evaluation.is_valid:
             return {}
         constraints = self._compute_shortfalls(evaluation)
@@ -400,17 +402,20 @@ class PlacementSearch:
         return constraints
 
     def _is_budget_left(self) -> bool:
+        """Return whether another candidate may be evaluated."""
         if self._is_exhausted or time.monotonic() > self.deadline_s:
             return False
         return self.plan.num_evaluations is None or len(self.evaluations) <= self.plan.num_evaluations
 
     def _check_turn(self, candidate: Evaluation) -> None:
+        """Raise ValueError if a candidate is not the last of `ask`."""
         if candidate.number != len(self.evaluations):
             raise ValueError(
                 f"candidate: got number {candidate.number}; give the last of `ask`, {len(self.evaluations)}"
             )
 
     def _check_start(self, estimate: Estimate) -> None:
+        """Raise ValueError if an objective is unknown for the start."""
         for name, value in zip(self.space.scored_objectives, estimate.value.tolist(), strict=True):
             if not math.isnan(value):
                 continue

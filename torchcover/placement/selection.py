@@ -125,6 +125,7 @@ class SelectionResult(ReportMixin):
         return f"{sensors}. Compared with {baseline}: {'; '.join(texts)}. {self.test.summary}. {model}"
 
     def _describe_optimality(self) -> str:
+        """Describe how far the selection may be from the optimum, and its shortfalls."""
         is_single = len(self.selections) == 1
         if self.best.shortfall:
             shortfalls = (np.array(self.limits.min_values) - self.best.values).tolist()
@@ -166,6 +167,7 @@ class SelectionResult(ReportMixin):
 
     @property
     def _record(self) -> dict[str, Any]:
+        """Build the content of search.json."""
         improvements = {f"{item.objective}, {item.average}": item.record for item in self.improvements}
         sampled_values = [selection.values[0] for selection in self.sampled_selections]
         return {
@@ -193,6 +195,7 @@ class SelectionResult(ReportMixin):
         }
 
     def _record_selection(self, selection: SensorSelection) -> dict[str, Any]:
+        """Build the record of one selection for search.json."""
         return {
             "sensors": self.get_sensor_names(selection.selected),
             "values": dict(zip(self.space.scored_objectives, selection.values, strict=True)),
@@ -242,6 +245,7 @@ class SelectionResult(ReportMixin):
         return sizes
 
     def _render_plots(self) -> Iterator[tuple[str, str, Figure]]:
+        """Yield the plot of the objective against the number of sensors."""
         sampled_values = [selection.values[0] for selection in self.sampled_selections]
         num_sensors, value = len(self.best.selected), self.best.values[0]
         figure = plot_selection_sizes(self._sizes, sampled_values, num_sensors, value, title=self.space.name)
@@ -429,6 +433,7 @@ def _observe_candidates(
 
 
 def _validate_result(result: SelectionResult, frames: CommonFrames, test_seed: int, num_scenes: int) -> SelectionResult:
+    """Compare the selection with the baseline on held-out scenes."""
     if set(result.best.selected) == set(result.baseline):
         return replace(result, no_test_reason="it equals the baseline")
     baseline = result.build_rig(result.baseline, f"{result.space.name}_baseline")

@@ -108,7 +108,7 @@ class SensorSelection(NamedTuple):
 
     @property
     def is_proven(self) -> bool:
-        """Whether no selection is better."""
+        """True if no selection is better."""
         return self.gap <= SolverParams.tolerance
 
 
@@ -218,6 +218,7 @@ def _solve(
     bounded = np.flatnonzero(np.isfinite(minimum))
 
     def build_row(candidates: ArrayLike, covered: ArrayLike = 0.0, shortfalls: ArrayLike = 0.0) -> Float64:
+        """Build a row of the constraint matrix from coefficients of candidates, groups and shortfalls."""
         parts = (candidates, count), (covered, group_count), (shortfalls, len(bounded))
         return np.concatenate([np.broadcast_to(np.asarray(part, dtype=np.float64), size) for part, size in parts])
 

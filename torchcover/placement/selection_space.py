@@ -104,6 +104,7 @@ class CandidateGroup(Document):
 
     @model_validator(mode="after")
     def _check_mounts(self) -> Self:
+        """Check that a group has mounts or a grid of mounts."""
         if not self.mounts and self.grid is None:
             raise ValueError("mounts, grid: got neither; give at least one of the two")
         return self
@@ -143,6 +144,7 @@ class SelectionConstraints(Document):
 
     @model_validator(mode="after")
     def _check_limits(self) -> Self:
+        """Check that the number of sensors or their cost is limited."""
         if self.max_sensors is None and self.max_cost_eur is None:
             raise ValueError("max_sensors, max_cost_eur: got neither, which selects all candidates; give one")
         return self
@@ -191,6 +193,7 @@ class SelectionSpace(PlacementSpace):
 
     @model_validator(mode="after")
     def _check_candidates(self) -> Self:
+        """Check the names and the number of candidates, and the baseline."""
         try:
             names = [sensor.name for sensor in self.sensors]
         except FileNotFoundError as error:
@@ -213,6 +216,7 @@ class SelectionSpace(PlacementSpace):
 
     @model_validator(mode="after")
     def _check_objectives(self) -> Self:
+        """Check that all objectives and requirements can be computed for points."""
         if self.non_region_requirements is not None:
             raise ValueError(
                 "requirements: a selection supports only requirements of regions; check the selected rig for targets "
@@ -231,6 +235,7 @@ class SelectionSpace(PlacementSpace):
         return self
 
     def _check_prices(self) -> None:
+        """Check that each price has a group and that a cost limit can be met."""
         if unknown := [key for key in self.prices_eur if key not in {MOUNT, *self.candidates}]:
             raise ValueError(f"prices_eur: {', '.join(unknown)} is no group of candidates, and not {MOUNT!r}")
         if self.constraints.max_cost_eur is None:

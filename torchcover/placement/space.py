@@ -63,6 +63,7 @@ class SearchSpace(PlacementSpace):
 
     @model_validator(mode="after")
     def _check_sensors(self) -> Self:
+        """Check that each free sensor exists and has free variables."""
         sensors = {sensor.name: sensor for sensor in self.start.sensors}
         for name, free in self.free.items():
             if name not in sensors:
@@ -84,6 +85,7 @@ class SearchSpace(PlacementSpace):
 
     @model_validator(mode="after")
     def _check_candidates(self) -> Self:
+        """Check by samples that the space contains a possible candidate, and that results have its numbers."""
         try:
             host = self.host
         except FileNotFoundError as error:
@@ -211,6 +213,7 @@ class SearchSpace(PlacementSpace):
         return {name: values[name] for name in values if variables[name].is_allowed(values[name])}
 
     def _get_all_start_values(self) -> dict[str, VariableValue]:
+        """Return the values of the start that are known, also those outside their bounds."""
         values: dict[str, VariableValue] = {}
         for sensor in self.start.sensors:
             if sensor.name in self.free:

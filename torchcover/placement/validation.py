@@ -68,7 +68,7 @@ class HeldOutImprovement(NamedTuple):
 
     @property
     def record(self) -> dict[str, Any]:
-        """All numbers, for JSON."""
+        """Numbers for JSON."""
         difference, quantity = self.difference, self.difference.quantity
         return {
             "unit": quantity.unit,
@@ -103,12 +103,12 @@ class SideEffect(NamedTuple):
 
     @property
     def is_significant(self) -> bool:
-        """Whether the change is significant at 5 %."""
+        """True if the change is significant at 5 %."""
         return self.p_value <= 0.05
 
     @property
     def is_worse(self) -> bool:
-        """Whether the number became significantly worse."""
+        """True if the number became significantly worse."""
         return self.is_significant and self.difference.improvement < 0
 
     @property
@@ -246,6 +246,7 @@ def _build_side_effects(
     ]
 
     def get_rank(side_effect: SideEffect) -> tuple[bool, bool, float, float]:
+        """Return the sort key: significant deteriorations first, then by p value; unknown p values last."""
         p_value = side_effect.p_value
         return not side_effect.is_worse, math.isnan(p_value), p_value, side_effect.difference.improvement
 
@@ -255,7 +256,7 @@ def _build_side_effects(
 def _compute_differences(
     estimate: Estimate, baseline: Estimate, objectives: Mapping[str, Objective]
 ) -> dict[str, Difference]:
-    """Compute the differences of two rigs; those of requirements do not depend on scenes and have no error."""
+    """Compute the differences of two rigs; differences of requirements do not depend on scenes and have no error."""
     differences = estimate.compute_differences(baseline)
     for name, objective in objectives.items():
         if objective.requirement:

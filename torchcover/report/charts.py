@@ -165,6 +165,7 @@ def plot_selection_sizes(
 
 
 def _create_charts(rows: int, columns: int, title: str) -> tuple[Figure, list[list[Axes]]]:
+    """Create charts of the usual size in rows under a title."""
     return create_charts(rows, columns, (max(4.2 * columns, 6.4), 3.6 * rows + 0.9), title)
 
 
@@ -192,6 +193,7 @@ def plot_work_precision(panels: Mapping[str, Lines], *, title: str, legend_title
 
 
 def _plot_panel(axes: Axes, label: str, lines: Lines) -> None:
+    """Plot one panel: a line per setting with a marker of its own."""
     for index, (name, points) in enumerate(lines.items()):
         color = colormaps["viridis"](0.85 * index / max(len(lines) - 1, 1))  # lighter colors are hard to see
         marker = MARKERS[index % len(MARKERS)]

@@ -199,6 +199,7 @@ def plot_color_bar(sheet: Sheet, image: AxesImage, array: NDArray[np.float64], s
 
 
 def _plot_image(axes: Axes, array: NDArray[Any], **options: Any) -> AxesImage:  # noqa: ANN401  (options of imshow)
+    """Plot an array over the limits of the axes; only cells below pixel size are averaged."""
     # A cell is a whole number of pixels, or smaller than a pixel: then they are averaged.
     is_larger_than_pixel = axes.get_window_extent().width > 0.99 * array.shape[1]
     return axes.imshow(

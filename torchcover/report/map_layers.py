@@ -131,11 +131,13 @@ def downsample_coverage(coverage: Coverage, params: MapParams = MapParams()) -> 
     )
 
     def find_square(cell: Tensor) -> Tensor:
+        """Return the index of the coarse cell that contains each fine cell."""
         y, x = cell // grid.shape[2], cell % grid.shape[2]
         square: Tensor = (y // grid.shape[1] * rows + y % grid.shape[1] // side) * columns + x // side
         return square
 
     def merge(sums: BlockSums | None) -> BlockSums | None:
+        """Add up the sums of the fine cells of each coarse cell."""
         return None if sums is None else sums.remap_cells(find_square, coarse.num_cells, coarse.shape)
 
     area_sums = merge(coverage.area_sums)
@@ -276,24 +278,27 @@ def crop_grid(grid: BevGrid, x: Bounds, y: Bounds) -> Window:
 
 
 def _find_cells(bounds: Bounds, grid_bounds: Bounds, cell_m: float, count: int) -> tuple[slice, Bounds]:
+    """Find the cells of an axis that contain the bounds, and the bounds of these cells."""
     first = min(max(math.floor((bounds[0] - grid_bounds[0]) / cell_m + 1e-6), 0), count - 1)
     last = min(max(math.ceil((bounds[1] - grid_bounds[0]) / cell_m - 1e-6), first + 1), count)
     return slice(first, last), (grid_bounds[0] + first * cell_m, grid_bounds[0] + last * cell_m)
 
 
 def _find_bounds(is_observed: Tensor, edges_m: Tensor, grid_bounds: Bounds) -> Bounds:
+    """Find the outer edges of observed rows or columns; the bounds of the grid if there are none."""
     indices = is_observed.nonzero().flatten()
     return (float(edges_m[indices[0]]), float(edges_m[indices[-1] + 1])) if len(indices) else grid_bounds
 
 
 def _intersect(first: Bounds, second: Bounds) -> Bounds | None:
+    """Intersect two intervals; None if they do not overlap."""
     low, high = max(first[0], second[0]), min(first[1], second[1])
     return (low, high) if low < high else None
 
 
 @dataclass(frozen=True)
 class MapLayer:
-    """One quantity of all rigs on the grid, with one color scale for all bands.
+    """Quantity of all rigs on the grid, with one color scale for all bands.
 
     Args:
         quantity: The quantity.
@@ -313,7 +318,7 @@ class MapLayer:
 
 
 def build_map_layers(coverages: Mapping[str, Coverage]) -> Iterator[MapLayer]:
-    """Yield a layer for each quantity: those of the average of the coverages first, then those of other aggregations.
+    """Yield a layer for each quantity: the average of the coverages first, then other aggregations.
 
     Args:
         coverages: Name of the rig -> its coverage; several must be paired.
@@ -360,6 +365,7 @@ def compute_difference(values: Tensor, baseline: Tensor) -> Tensor:
 
 
 def _build_area_layers(coverages: Mapping[str, Coverage], conditions: str) -> Iterator[MapLayer]:
+    """Yield the layers of averages over area, merged to squares where points are few."""
     first = next(iter(coverages.values()))
     if first.area_sums is None:
         return

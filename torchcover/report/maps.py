@@ -169,6 +169,7 @@ class _Band:
 def _plot_layers(
     coverages: Mapping[str, Coverage], context: _MapContext, quantity_key: str | None
 ) -> Iterator[NamedFigure]:
+    """Yield maps, near-field maps and difference maps, quantity by quantity."""
     grid, ego_outline_m = next(iter(coverages.values())).grid, context.ego_outline_m
     window = find_observed_window(next(iter(coverages.values())), ego_outline_m)
     near_window = None if ego_outline_m is None else find_near_field_window(grid, ego_outline_m)
@@ -189,11 +190,13 @@ def _plot_layers(
 
 
 def _crop_layer(layer: MapLayer, window: Window) -> MapLayer:
+    """Crop the values and opacities of all rigs to a window."""
     values = {rig: window.crop(rig_values) for rig, rig_values in layer.values.items()}
     return replace(layer, values=values, opacity=None if layer.opacity is None else window.crop(layer.opacity))
 
 
 def _plot_rigs(layer: MapLayer, grid: BevGrid, bands: Sequence[_Band], context: _MapContext) -> Iterator[NamedFigure]:
+    """Yield a figure for each band with all rigs side by side."""
     headings = {rig: rig if len(layer.values) > 1 else "" for rig in layer.values}
     for band in bands:
         opacity = band.get_opacity(layer)
@@ -212,6 +215,7 @@ def _plot_rigs(layer: MapLayer, grid: BevGrid, bands: Sequence[_Band], context: 
 
 
 def _plot_near_field(layer: MapLayer, grid: BevGrid, bands: Sequence[_Band], context: _MapContext) -> NamedFigure:
+    """Plot the near field of all rigs and bands side by side, without directions of sensors."""
     values, sensors, opacity = {}, {}, {}
     for rig, rig_values in layer.values.items():
         for band in bands:
@@ -241,6 +245,7 @@ def _plot_near_field(layer: MapLayer, grid: BevGrid, bands: Sequence[_Band], con
 def _plot_differences(
     layer: MapLayer, grid: BevGrid, bands: Sequence[_Band], context: _MapContext
 ) -> Iterator[NamedFigure]:
+    """Yield the differences of each rig to the first in all bands, on one scale."""
     (first, baseline), *compared = layer.values.items()
     if not compared:
         return
@@ -251,7 +256,7 @@ def _plot_differences(
         for band in bands:
             opacity = band.get_opacity(layer)
             figure = plot_side_by_side(
-                # An infinite difference gets the last color, not that of frames without points.
+                # An infinite difference gets the last color; the infinite color is for frames without points.
                 {"": difference[band.index].clamp(2 * scale.low, 2 * scale.high)},
                 grid,
                 scale,

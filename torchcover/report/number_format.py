@@ -121,6 +121,7 @@ def count_decimals(error: float, max_decimals: int) -> int:
 
 
 def _get_default_decimals(value: float, display_unit: DisplayUnit) -> int:
+    """Return the decimals of the unit, or enough for four significant digits up to its maximum."""
     if display_unit.decimals is not None:
         return display_unit.decimals
     return min(display_unit.max_decimals, max(0, 3 - math.floor(math.log10(abs(value))))) if value else 0
@@ -137,6 +138,7 @@ def _keep_off_ends(rounded: RoundedNumber, value: float, display_unit: DisplayUn
 
 
 def _round(value: float, decimals: int) -> RoundedNumber:
+    """Round to the value that the formatted text shows."""
     return RoundedNumber(float(f"{value:.{decimals}f}"), decimals)
 
 
@@ -307,10 +309,12 @@ def format_resolution(num_frames: int, grid: BevGrid) -> str:
 
 
 def _format_rounded(number: RoundedNumber) -> str:
+    """Format a rounded number with its relation, such as "<"."""
     return f"{number.relation}{number.value:.{number.decimals}f}"
 
 
 def _format_signed(value: float, decimals: int) -> str:
+    """Format a number with its sign; zero has none."""
     # A number that is rounded to 0 has no sign. Adding 0 turns -0.0 into 0.0.
     rounded = round(value, decimals) + 0.0
     return f"{rounded:{'+' if rounded else ''}.{decimals}f}"

@@ -120,7 +120,7 @@ class SensorView:
 
     @property
     def is_tilted(self) -> bool:
-        """Whether its pitch or roll differs from zero."""
+        """True if pitch or roll differs from zero."""
         return not np.allclose(self.tilt_deg, 0.0)
 
     def compute_level_range_m(self, max_range_m: float) -> float:
@@ -239,6 +239,7 @@ def plot_sensor_positions(sheet: Sheet, sensors: Sequence[SensorView]) -> list[A
 
 
 def _plot_field_of_view(sheet: Sheet, sensor: SensorView) -> None:
+    """Fill the horizontal field of view up to its range or the edge of the map."""
     start = sensor.x_m, sensor.y_m
     furthest = max(math.dist(start, corner) for corner in product(sheet.axes.get_xlim(), sheet.axes.get_ylim()))
     # Infinity cannot be plotted; beyond the map all ranges look the same.
@@ -255,6 +256,7 @@ def _plot_field_of_view(sheet: Sheet, sensor: SensorView) -> None:
 
 
 def _plot_arrow(sheet: Sheet, sensor: SensorView) -> None:
+    """Plot an arrow in the direction of a sensor."""
     start, tip = (sensor.x_m, sensor.y_m), _find_point_ahead(sheet, sensor, 20.0)
     arrow = FancyArrowPatch(
         start, tip, arrowstyle="-|>", mutation_scale=9, shrinkA=0, shrinkB=0, linewidth=1.2, color="black", zorder=4
@@ -265,6 +267,7 @@ def _plot_arrow(sheet: Sheet, sensor: SensorView) -> None:
 
 
 def _plot_numbers(sheet: Sheet, sensors: Sequence[SensorView]) -> None:
+    """Write the numbers of sensors, with one label for sensors at the same position."""
     for (x, y), numbers in _assign_label_positions(sheet, sensors).items():
         # The text grows away from the arrow.
         side = {1: "left", 0: "center", -1: "right"}[round(math.cos(math.radians(sensors[numbers[0] - 1].yaw_deg)))]
@@ -284,6 +287,7 @@ def _assign_label_positions(sheet: Sheet, sensors: Sequence[SensorView]) -> dict
 
 
 def _build_legend_entry(sheet: Sheet, mark: str, sensor: SensorView) -> Artist:
+    """Build the entry of one sensor, which says whether it lies outside the map."""
     (left, right), (bottom, top) = sheet.axes.get_xlim(), sheet.axes.get_ylim()
     is_on_map = left <= sensor.x_m <= right and bottom <= sensor.y_m <= top
     label = f"{sensor.name}{'' if is_on_map else ' (outside the map)'}"

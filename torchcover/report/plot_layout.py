@@ -99,6 +99,7 @@ def create_sheets(grid: BevGrid, num_maps: int = 1) -> list[Sheet]:
     figure = Figure(figsize=tuple(paper_in), dpi=dpi)
 
     def build_box(left_in: float, top_in: float, size_in: NDArray[np.float64]) -> tuple[float, float, float, float]:
+        """Build the box of axes in figure coordinates from its upper left corner and size in inches."""
         corner = np.array([left_in, paper_in[1] - top_in - size_in[1]]) / paper_in
         return (*corner.tolist(), *(size_in / paper_in).tolist())
 
@@ -198,6 +199,7 @@ def write_heading(axes: Axes, heading: str) -> None:
 
 
 def _write_above(axes: Axes, text: str, points: float, **style: Any) -> None:  # noqa: ANN401  (style of matplotlib)
+    """Write plain text at a distance above the axes, in points."""
     axes.annotate(
         text, (0, 1), (0, points), xycoords="axes fraction", textcoords="offset points", parse_math=False, **style
     )
@@ -289,6 +291,7 @@ def write_animation(path: Path, figures: Iterable[Figure], *, frames_per_s: floa
 
 
 def _write_frames(figures: Iterable[Figure], frames_per_s: float, path: Path) -> None:
+    """Render figures one by one and append them to the animation."""
     writer: AbstractMovieWriter = ANIMATION_WRITERS[path.suffix](fps=frames_per_s)  # type: ignore[arg-type]  # not only int
     screen: Figure | None = None
     for figure in figures:

@@ -183,23 +183,28 @@ def _is_leading(key: str, row: Row) -> bool:
 
 
 def _is_significant(get_difference: Callable[[Row], Difference | None], row: Row) -> bool | None:
+    """Return whether a difference is significant; None if there is no difference or no error."""
     difference = get_difference(row)
     return None if difference is None else difference.is_significant
 
 
 def _get_most_critical_sensor(row: Row) -> str:
+    """Return the sensor whose failure changes most; empty without redundancy or effect."""
     return "" if row.summary.redundancy is None else row.summary.redundancy.most_critical_sensor or ""
 
 
 def _get_redundancy(key: str, row: Row) -> Number | None:
+    """Return a number of redundancy; None without redundancy."""
     return row.summary.redundancy.detecting_sensors[key] if row.summary.redundancy else None
 
 
 def _get_failure_number(sensor: str, key: str, row: Row) -> Number | None:
+    """Return a number of the rig without a sensor; None if it was not computed."""
     return row.summary.redundancy.failure_numbers.get(sensor, {}).get(key) if row.summary.redundancy else None
 
 
 def _get_failure_effect(sensor: str, key: str, row: Row) -> Difference | None:
+    """Return the change of a number without a sensor; None if it was not computed."""
     return row.summary.redundancy.failure_effects.get(sensor, {}).get(key) if row.summary.redundancy else None
 
 
@@ -210,6 +215,7 @@ def _build_number_columns(key: str, get_number: NumberGetter) -> ColumnGetters:
 
 
 def _get_part(get_number: NumberGetter, part: str, row: Row) -> object:
+    """Return a part of a number, such as its error; NaN if there is no number."""
     return getattr(get_number(row), part, math.nan)
 
 
@@ -271,6 +277,7 @@ def to_json_record(record: Mapping[str, object]) -> Record:
 
 
 def _to_json_number(value: object) -> object:
+    """Convert a float for JSON, which has neither NaN nor infinity."""
     if not isinstance(value, float) or math.isfinite(value):
         return value
     if math.isnan(value):

@@ -205,6 +205,7 @@ def _wrap_intervals(table: PageTable) -> PageTable:
 
 
 def _format_cell(cell: TextCell) -> Text:
+    """Format a cell for rich: marked cells are bold and have the sign of their mark."""
     return Text(f"{SIGNS[cell.mark]} {cell.text}", style="bold") if cell.mark else Text(cell.text)
 
 
@@ -225,6 +226,7 @@ def render_markdown(table: CoverageTable) -> str:
 
 
 def _render_markdown_table(table: PageTable) -> Iterator[str]:
+    """Yield the lines of a table, with numbers aligned to the right."""
     if table.title:
         yield f"{escape_markdown(table.title)}\n"
     yield _join_cells([escape_markdown(heading) for heading in table.headings])

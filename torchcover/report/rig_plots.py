@@ -318,6 +318,7 @@ def _plot_sensor(
 
 
 def _build_legend_entry(index: int, sensor: SensorView) -> Artist:
+    """Build the legend entry of a sensor with its field of view and range."""
     low, high = sensor.vertical_fov_deg
     max_range = f"to {sensor.range_m:g} m" if np.isfinite(sensor.range_m) else "without a limit"
     field_of_view = f"{sensor.horizontal_fov_deg:.1f}° wide, {low:.1f}° to {high:.1f}° high"

@@ -156,8 +156,8 @@ def plot_scene(
     entries.append(_plot_points(axes, sensor_points, PARAMS.sensor_color, "points of the rig"))
     entries += _plot_actors(axes, [actor for actor in actors if _is_inside(actor.outline_m, x, y)])
     if path_m is not None:
-        style = {"color": PARAMS.path_color, "linewidth": 1.2, "zorder": 3}
-        entries += axes.plot(*path_m.T, label="path of the ego vehicle", **style)
+        label = "path of the ego vehicle"
+        entries += axes.plot(path_m[:, 0], path_m[:, 1], color=PARAMS.path_color, linewidth=1.2, label=label, zorder=3)
     entries += plot_ego(axes, ego_outline_m)
     write_title(axes, title, subtitle)
     write_legend(axes, entries, columns=4)
@@ -182,12 +182,14 @@ def _plot_static_faces(axes: Axes, static_faces: StaticFaces) -> list[Artist]:
 
 
 def _plot_points(axes: Axes, points: Points, color: str, label: str) -> Artist:
+    """Plot a point cloud and return its legend entry with the number of points."""
     # Each point is one pixel, for any number of points.
     axes.plot(points[:, 0], points[:, 1], linestyle="none", marker=",", color=color, zorder=1)
     return Line2D([], [], linestyle="none", marker=".", color=color, label=f"{label} ({len(points):,})")
 
 
 def _plot_actors(axes: Axes, actors: Sequence[ActorMark]) -> list[Artist]:
+    """Plot outlines of actors in the color of their category; the legend counts each category."""
     counts = Counter(actor.category for actor in actors)
     colors = dict(PARAMS.category_colors)
     palette = (*colors.values(), *PARAMS.other_colors)
@@ -205,6 +207,7 @@ def _plot_actors(axes: Axes, actors: Sequence[ActorMark]) -> list[Artist]:
 
 
 def _is_inside(outline_m: Points, x: Bounds, y: Bounds) -> bool:
+    """Test whether the bounding box of an outline overlaps the bounds."""
     low, high = outline_m.min(axis=0), outline_m.max(axis=0)
     return bool(high[0] >= x[0] and low[0] <= x[1] and high[1] >= y[0] and low[1] <= y[1])
 
@@ -251,6 +254,7 @@ def plot_depth_images(images: Mapping[str, Image], *, title: str, subtitle: str 
 
 
 def _check_image(name: str, image: Image) -> NDArray[np.float64]:
+    """Convert a depth image to float64, or raise ValueError if it is no image."""
     array = np.asarray(image, dtype=np.float64)
     if array.ndim != 2 or array.size == 0:
         raise ValueError(f"image {name!r}: got shape {array.shape}; give (rows, columns) distances")
@@ -258,6 +262,7 @@ def _check_image(name: str, image: Image) -> NDArray[np.float64]:
 
 
 def _build_depth_scale(depths_m: NDArray[np.float64]) -> ColorScale:
+    """Build the logarithmic color scale of all depths, robust to outliers."""
     hits_m = depths_m[np.isfinite(depths_m) & (depths_m > 0)]
     low, high = np.percentile(hits_m, PARAMS.depth_percentiles) if len(hits_m) else PARAMS.default_depths_m
     # A scale needs low < high, also if all depths are equal.
@@ -288,13 +293,14 @@ def _create_image_axes(arrays: list[NDArray[np.float64]]) -> Figure:
 
     for array, (left_in, top_in), width_in in zip(arrays, corners_in, widths_in, strict=True):
         rows, columns = array.shape
-        limits = {"xlim": (-0.5, columns - 0.5), "ylim": (-0.5, rows - 0.5)}
-        figure.add_axes(build_box(left_in, top_in, width_in), **limits, xticks=[], yticks=[])
+        axes = figure.add_axes(build_box(left_in, top_in, width_in))
+        axes.set(xlim=(-0.5, columns - 0.5), ylim=(-0.5, rows - 0.5), xticks=[], yticks=[])
     figure.add_axes(build_box(paper_width_in + gap_in, 0.0, LAYOUT.color_bar_width_in))
     return figure
 
 
 def _build_depth_legend(depths_m: NDArray[np.float64]) -> list[Artist]:
+    """Build the entries of pixels without a hit and without a ray, as far as there are any."""
     infinite_share, missing_share = float(np.isinf(depths_m).mean()), float(np.isnan(depths_m).mean())
     entries: list[Artist] = []
     if infinite_share:
@@ -358,6 +364,7 @@ def plot_target_visibility(
 
 
 def _plot_point_counts(sheet: Sheet, point_counts: Float64) -> list[Artist]:
+    """Plot cells by the logarithm of their points; cells without a point have a color of their own."""
     positive = point_counts[point_counts > 0]
     high = max(float(np.percentile(positive, PARAMS.points_percentile)), 10.0) if len(positive) else 10.0
     scale = ColorScale("points on the target", "mean of the frames", "viridis", 1.0, high, logarithmic=True)

@@ -157,7 +157,7 @@ class CoverageTable:
 
     @property
     def has_intervals(self) -> bool:
-        """Whether some region has enough effective blocks for confidence intervals."""
+        """True if some region has enough effective blocks for confidence intervals."""
         return self.first_conditions.effective_blocks[1] > MIN_BLOCKS - ROUND_OFF
 
     @property
@@ -175,6 +175,7 @@ class CoverageTable:
 
 
 def _group_by_rig(rows: Sequence[Mapping[str, Row]], rigs: Iterable[str]) -> dict[str, tuple[Row, ...]]:
+    """Group the rows of each region by rig."""
     rows_by_rig = {}
     for rig in rigs:
         rows_by_rig[rig] = tuple(row[rig] for row in rows)
@@ -204,6 +205,7 @@ def _build_rows(
 
 
 def _split_mixture(coverage: Coverage | CoverageMixture) -> list[Coverage]:
+    """Return the coverage of each scenario of a mixture, or the only coverage."""
     return [coverage] if isinstance(coverage, Coverage) else [part for _, part in coverage.weighted_coverages]
 
 

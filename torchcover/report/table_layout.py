@@ -27,7 +27,7 @@ from torchcover.report.table_notes import (
 )
 
 REGION_HEADINGS = ("region", "band")
-# How marks are shown where text may be bold.
+# Explanation of marks in formats with bold text.
 BOLD_MARKS: Mapping[str, str] = MappingProxyType({"best": "In bold", "significant": "In bold among the differences"})
 
 
@@ -95,6 +95,7 @@ def build_page_tables(table: CoverageTable, *, sensors_in_rows: bool = False) ->
 def _build_number_tables(
     table: CoverageTable, rows_by_region: Sequence[tuple[Row, ...]], quantities: Sequence[Quantity]
 ) -> list[PageTable]:
+    """Build the tables of numbers: one for a single rig, else one for each quantity."""
     if len(table.rigs) == 1:
         headings = [fill(format_heading(quantity), MAX_HEADING_CHARS) for quantity in quantities]
         cells = []
@@ -176,10 +177,12 @@ def _add_common_columns(
 
 
 def _format_number_cell(row: Row, quantity: Quantity) -> TextCell:
+    """Format a number with its interval, marked if it leads significantly."""
     text = format_number(row.summary.numbers[quantity.key])
     return TextCell(text, "best" if quantity.key in row.leading_keys else "")
 
 
 def _format_difference_cell(row: Row, quantity: Quantity) -> TextCell:
+    """Format a difference with its interval, marked if it is significant."""
     difference = row.differences[quantity.key]
     return TextCell(format_difference(difference), "significant" if difference.is_significant else "")

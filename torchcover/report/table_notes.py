@@ -59,7 +59,7 @@ def format_failure_title(table: CoverageTable, rig: str) -> str:
 
 
 def format_failure_headings(table: CoverageTable, rig: str) -> list[str]:
-    """Format the headings of the table of sensor failures, without those of region and band.
+    """Format the headings of the table of sensor failures, without region and band.
 
     Args:
         table: The table.
@@ -178,6 +178,7 @@ def _is_significant(row: Row, quantity: Quantity) -> bool | None:
 
 
 def _get_loss(redundancy: RegionRedundancy | None, quantity: Quantity) -> float:
+    """Return the loss without the most critical sensor; 0 without redundancy or effect."""
     if redundancy is None or redundancy.most_critical_sensor is None:
         return 0.0
     return -redundancy.failure_effects[redundancy.most_critical_sensor][quantity.key].improvement
@@ -338,6 +339,7 @@ def explain_marks(table: CoverageTable) -> dict[str, str]:
 
 
 def _format_rig_notes(table: CoverageTable, rig: str) -> list[str]:
+    """Format the resolution, all notes and the single point of failure of a rig."""
     bands = ", ".join(f"{name} {format_height_band(table.grid, name)}" for name in table.grid.heights)
     resolution = f"{format_resolution(table.conditions[rig].counts['num_frames'], table.grid)}; {bands}."
     sentences = [note.sentence for note in collect_table_notes(table, rig)]

@@ -1,1 +1,1 @@
-"""One file that shows a run in any browser: tables, maps to look into, the rig, and where the numbers come from."""
+"""Page of a run in one HTML file: tables, interactive maps, the rigs, and the origin of the numbers."""

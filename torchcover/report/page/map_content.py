@@ -69,6 +69,7 @@ class CellBuffer:
         return self._text
 
     def _append(self, content: bytes) -> int:
+        """Append bytes unless they are already there, and return their offset."""
         if content not in self._offsets:
             self._offsets[content] = self._length
             self._parts.append(content)
@@ -158,6 +159,7 @@ def build_map_content(page: Page, cells: CellBuffer) -> dict[str, Any]:
 
 
 def _build_map(page_map: PageMap, raster: int, cells: CellBuffer) -> dict[str, Any]:
+    """Build the record of one map with offsets into the packed cells."""
     return {
         "quantity": page_map.quantity,
         "band": page_map.band,
@@ -211,6 +213,7 @@ def _build_raster(maps: Sequence[PageMap]) -> dict[str, Any]:
 
 
 def _find_observed_bounds(is_observed: NDArray[np.bool_], bounds: tuple[float, float], cell_m: float) -> list[float]:
+    """Find the outer edges of observed rows or columns in meters; all bounds if there are none."""
     indices = np.flatnonzero(is_observed)
     if not len(indices):
         return list(bounds)
@@ -241,10 +244,12 @@ def _build_views(page: Page) -> list[dict[str, Any]]:
 
 
 def _build_lines(lines: Iterable[MapLine]) -> list[dict[str, Any]]:
+    """Build the records of named lines."""
     return [{"name": line.name, "points": _round_points(line.points_m)} for line in lines]
 
 
 def _round_points(points_m: Array) -> list[list[float | None]]:
+    """Round points to 0.1 mm; NaN, which separates lines, becomes None."""
     rounded = []
     for point in points_m:
         rounded.append([None if np.isnan(value) else round(float(value), 4) for value in point])
@@ -252,6 +257,7 @@ def _round_points(points_m: Array) -> list[list[float | None]]:
 
 
 def _build_scale(scale: ColorScale) -> dict[str, Any]:
+    """Build the record of a color scale."""
     return {
         "quantity": scale.quantity,
         "unit": scale.unit,

@@ -162,6 +162,7 @@ def to_json(content: object) -> str:
 
 @cache
 def _read_file(name: str) -> str:
+    """Read a file of the page template once."""
     return files("torchcover.report.page").joinpath(name).read_text(encoding="utf-8")
 
 
@@ -182,23 +183,27 @@ def render_table(table: PageTable) -> str:
 
 
 def _render_picture(picture: PagePicture) -> str:
+    """Render a picture with its title as a data URL."""
     title, data = picture.title, base64.b64encode(picture.png).decode()
     image = f'<img src="data:image/png;base64,{data}" alt="{escape_html_attribute(title)}">'
     return f'<figure class="picture">{image}<figcaption>{render_text_html(title)}</figcaption></figure>'
 
 
 def _render_notes(notes: Sequence[str]) -> str:
+    """Render notes as a list; empty without notes."""
     items = "".join(f"<li>{render_text_html(note)}</li>" for note in notes)
     return f'<ul class="notes">{items}</ul>' if notes else ""
 
 
 def _render_cell(cell: TextCell, kind: str) -> str:
+    """Render a cell: text columns are row headers, others have the class of their mark."""
     if not kind:
         return f'<th scope="row">{render_text_html(cell.text)}</th>'
     return f'<td class="{kind} {escape_html_attribute(cell.mark)}">{render_text_html(cell.text)}</td>'
 
 
 def _render_rig_section(rig: PageRig, ego_outline_m: Array | None, number: int) -> str:
+    """Render the drawing, the sensors and the YAML document of a rig."""
     drawing = render_rig(rig.sensors, ego_outline_m, number) if rig.sensors else ""
     table = render_table(build_sensor_table(rig.sensors)) if rig.sensors else "<p>Sensors unknown.</p>"
     document = (
@@ -210,6 +215,7 @@ def _render_rig_section(rig: PageRig, ego_outline_m: Array | None, number: int) 
 
 
 def _render_facts(heading: str, facts: Mapping[str, str]) -> str:
+    """Render named facts as a definition list under a heading."""
     each = "".join(
         f"<dt>{render_text_html(name)}</dt><dd>{render_text_html(value)}</dd>" for name, value in facts.items()
     )

@@ -88,6 +88,7 @@ def render_detection_shares(detection_shares: Sequence[DetectionShares]) -> str:
 
 
 def _render_target_map(target_map: TargetVisibilityMap, max_effect_m2: float) -> str:
+    """Render the map of a test target and a bar for the loss without each sensor."""
     rows = []
     for sensor, loss in target_map.failure_effects_m2.items():
         width = 100 * loss / max_effect_m2 if max_effect_m2 else 0.0
@@ -189,6 +190,7 @@ def build_sensor_table(sensors: Sequence[SensorView]) -> PageTable:
 
 
 def _find_bounds(values: Array) -> tuple[float, float]:
+    """Find the range of values with a margin of 3 m."""
     margin_m = 3.0
     return float(values.min()) - margin_m, float(values.max()) + margin_m
 
@@ -226,6 +228,7 @@ def _separate_numbers(positions: Array) -> Array:
 
 
 def _render_number(index: int, x: float, y: float) -> str:
+    """Render the number of a sensor in a disc of its color."""
     return (
         f'<circle cx="{x:.3f}" cy="{-y:.3f}" r="{NUMBER_M / 2}" fill="{get_sensor_color(index)}" stroke="white" '
         f'stroke-width="0.03"/><text x="{x:.3f}" y="{-y + 0.075:.3f}" font-size="0.22" text-anchor="middle" '
@@ -234,6 +237,7 @@ def _render_number(index: int, x: float, y: float) -> str:
 
 
 def _render_scale_bar(left: float, bottom: float) -> str:
+    """Render a bar of 1 m in the lower left corner."""
     x, y = left + 0.3, bottom - 0.3
     line = f"M{x:.3f} {y - 0.1:.3f}V{y:.3f}H{x + 1:.3f}V{y - 0.1:.3f}"
     font = 'font-size="0.32" font-family="sans-serif" fill="currentColor"'
