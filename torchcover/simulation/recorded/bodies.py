@@ -30,7 +30,7 @@ from torchcover.simulation.world import Actor
 
 
 @dataclass(frozen=True)
-class StreetParams:
+class RecordedStreetParams:
     """Assumed geometry of streets around recorded tracks.
 
     Args:
@@ -150,7 +150,7 @@ def find_visible_sides(
     actors: Sequence[Actor],
     built_share: float,
     generator: np.random.Generator,
-    params: StreetParams = StreetParams(),
+    params: RecordedStreetParams = RecordedStreetParams(),
 ) -> tuple[list[StreetSide], list[shapely.Geometry], list[shapely.Geometry]]:
     """Find the visible sides of the streets along recorded tracks.
 
