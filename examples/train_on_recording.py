@@ -1,12 +1,11 @@
-"""Train a detector on a recording: was visible what it misses? `python examples/train_on_recording.py PATH`.
+"""Train a detector on a recording and compare its misses with visibility: `python examples/train_on_recording.py PATH`.
 
-PATH is a recording with poses and labelled cars, such as a drive of KITTI's raw data with its tracklets
-(`2011_09_26/2011_09_26_drive_0005_sync`). Without it, a small one is simulated and written first, with one LiDAR where
-KITTI has its own.
+PATH is a recording with poses and labeled cars, such as a drive of KITTI raw with its tracklets
+(`2011_09_26/2011_09_26_drive_0005_sync`). Without it, a small recording with KITTI's LiDAR is simulated first.
 
-The reference is accumulated from the recording itself. The coverage of its frames does not depend on the detector: it
-is measured once, and says nothing about which epoch is best. Recall over visibility does. The detector is that of
-train_detector.py; needs `pip install 'torchcover[lightning,tensorboard]'`.
+The reference is accumulated from the recording itself. The coverage of its frames does not depend on the detector and
+is measured once; recall over visibility depends on it. The detector is that of train_detector.py. Needs
+`pip install 'torchcover[lightning,tensorboard]'`.
 """
 
 import argparse
@@ -17,15 +16,23 @@ import matplotlib.pyplot as plt
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
-from train_detector import OPERATING_SCORE, REGIONS, SCORES, coverage_metric, in_region, thinned, train
+from train_detector import (
+    OPERATING_SCORE,
+    REGIONS,
+    SCORES,
+    build_coverage_metric,
+    select_cars_in_region,
+    thin_cloud,
+    train,
+)
 
 from torchcover import Rig
 from torchcover.data import AccumulatedReference, RecordedFrames, SimulatedFrames, write_recording
 from torchcover.simulation import PaperReference
 
-CARS = ("car", "Car", "vehicle.car", "REGULAR_VEHICLE")  # in simulations and KITTI, in nuScenes, in Argoverse 2
-# The last fifth is validated on: neighbours in time are alike, and must not be on both sides.
-TRAINED = 0.8
+CARS = ("car", "Car", "vehicle.car", "REGULAR_VEHICLE")  # simulations, KITTI, nuScenes, Argoverse 2
+# Share of the frames for training; the last fifth is for validation, because consecutive frames are correlated.
+TRAINING_SHARE = 0.8
 LIDAR = {
     "type": "lidar",
     "name": "velodyne",
@@ -39,7 +46,7 @@ LIDAR = {
 
 
 def write_small_recording(folder):
-    """Ten seconds of city traffic as a plain folder: clouds, poses, boxes."""
+    """Write ten seconds of city traffic in the folder format: point clouds, poses, boxes."""
     rig = Rig.model_validate({"name": "kitti", "sensors": [LIDAR]})
     unused = PaperReference(rows=1, columns=1)
     write_recording(
@@ -49,46 +56,47 @@ def write_small_recording(folder):
     )
 
 
-def read(frames):
-    """What to train on, and what to validate on with its reference; `network RIG` is what the detector is fed."""
-    rig, trained, kept = frames.rigs[0], int(TRAINED * len(frames)), []
+def prepare_frames(frames):
+    """Prepare training frames, and validation frames with reference; `network RIG` is the input of the detector."""
+    rig, training_count, prepared = frames.rigs[0], int(TRAINING_SHARE * len(frames)), []
     for frame in track(frames, description="accumulating the reference", total=len(frames)):
         if frame.boxes is None:
-            raise SystemExit(f"{frames.recording.path}: no labelled boxes, and recall is about objects")
-        fed, boxes = {f"network {rig}": thinned(frame.get_measured_points(rig))}, in_region(frame.boxes, CARS)
-        if len(kept) < trained:
-            kept.append(replace(frame, clouds=fed, reference=frame.reference[:0], boxes=boxes))
+            raise SystemExit(f"{frames.recording.path}: labeled boxes are needed for recall, and there are none")
+        inputs = {f"network {rig}": thin_cloud(frame.get_measured_points(rig))}
+        boxes = select_cars_in_region(frame.boxes, CARS)
+        if len(prepared) < training_count:
+            prepared.append(replace(frame, clouds=inputs, reference=frame.reference[:0], boxes=boxes))
         else:
-            kept.append(replace(frame, clouds={rig: frame.get_cloud(rig), **fed}, boxes=boxes))
-    return rig, kept[:trained], kept[trained:]
+            prepared.append(replace(frame, clouds={rig: frame.get_cloud(rig), **inputs}, boxes=boxes))
+    return rig, prepared[:training_count], prepared[training_count:]
 
 
-def report(module, coverage, path, console):
-    """A table and a figure of both: what could be seen, and what was found of it."""
-    for line in coverage.summary(REGIONS):
-        seen = line.numbers["detection_0.4m"].value
+def print_report(module, coverage, path, console):
+    """Print and plot the coverage and the recall over visibility."""
+    for row in coverage.summary(REGIONS):
+        rate = row.numbers["detection_0.4m"].value
         console.print(
-            f"{line.region}: {seen:.1%} within 0.4 m, of the {line.observed_share:.1%} of the cells that are known"
+            f"{row.region}: {rate:.1%} within 0.4 m, of the {row.observed_share:.1%} of the cells that are observed"
         )
     recall = module.counts.compute_curve("visibility").recall
     table = Table("visibility", "cars", "recall", "95 % interval", title=f"recall at score {OPERATING_SCORE}")
-    row = SCORES.index(OPERATING_SCORE)
+    score_index = SCORES.index(OPERATING_SCORE)
     for column, name in enumerate(module.counts.visibility_bins):
-        value, low, high = (float(part[row, column]) for part in (recall.value, recall.low, recall.high))
-        table.add_row(name, str(int(recall.trials[row, column])), f"{value:.2f}", f"{low:.2f} to {high:.2f}")
+        value, low, high = (float(part[score_index, column]) for part in (recall.value, recall.low, recall.high))
+        table.add_row(name, str(int(recall.trials[score_index, column])), f"{value:.2f}", f"{low:.2f} to {high:.2f}")
     console.print(table)
     figure, (left, right) = plt.subplots(1, 2, figsize=(12.0, 4.5), layout="constrained")
-    coverage_metric(has_area_weights=False).plot(coverage, left)
+    build_coverage_metric(has_area_weights=False).plot(coverage, left)
     module.recall.plot(module.counts, right, score_threshold=OPERATING_SCORE)
     figure.savefig(path, dpi=110)
     plt.close(figure)
 
 
 def main():
-    """Read, train, report."""
+    """Read the recording, train the detector and report the results."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("recording", nargs="?", type=Path)
-    parser.add_argument("--window", type=float, default=1.0, help="seconds that the reference is accumulated over")
+    parser.add_argument("--window", type=float, default=1.0, help="accumulation window of the reference in seconds")
     parser.add_argument("--epochs", type=int, default=10)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=Path("out/train_on_recording"))
@@ -102,11 +110,11 @@ def main():
         write_small_recording(recording)
     frames = RecordedFrames(recording, reference=AccumulatedReference(options.window), use_ground_model=False)
     console.print(*frames.reference_record["notes"], sep="\n")
-    rig, training_frames, validation_frames = read(frames)
-    metric = coverage_metric(has_area_weights=False)
+    rig, training_frames, validation_frames = prepare_frames(frames)
+    metric = build_coverage_metric(has_area_weights=False)
     module, coverage = train(rig, training_frames, validation_frames, metric, options, console)
-    report(module, coverage, options.out / "recall.png", console)
-    console.print(f"Wrote {options.out / 'recall.png'} and event files for TensorBoard beside it")
+    print_report(module, coverage, options.out / "recall.png", console)
+    console.print(f"Wrote {options.out / 'recall.png'} and event files for TensorBoard")
 
 
 if __name__ == "__main__":

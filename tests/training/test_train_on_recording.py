@@ -49,7 +49,7 @@ def drive(tmp_path_factory):
 
 def test_last_fifth_of_a_recording_is_the_validation(example, drive):
     frames = RecordedFrames(drive, reference=AccumulatedReference(0.6))
-    rig, trained, validated = example.read(frames)
+    rig, trained, validated = example.prepare_frames(frames)
     assert (rig, len(trained), len(validated)) == ("kitti", 8, 2)
     assert [frame.index for frame in (*trained, *validated)] == list(range(10))
     assert all(len(frame.boxes) == 1 for frame in (*trained, *validated))
@@ -82,5 +82,5 @@ def test_small_kitti_run_ends_with_table_and_figure(example, drive, tmp_path, mo
 def test_a_recording_without_boxes_is_refused(example, drive, tmp_path):
     frames = RecordedFrames(kitti_raw(Straight(steps=3), tmp_path), reference=AccumulatedReference(0.6))
     (frames.recording.path / "tracklet_labels.xml").unlink()
-    with pytest.raises(SystemExit, match="no labelled boxes, and recall is about objects"):
-        example.read(frames)
+    with pytest.raises(SystemExit, match="labeled boxes are needed for recall, and there are none"):
+        example.prepare_frames(frames)
