@@ -18,8 +18,9 @@ from torchcover.files import BadFileError, parse_xml
 from torchcover.simulation import PaperReference
 from torchcover.simulation.sumo import SumoTraffic, simulating, traffic
 from torchcover.simulation.sumo.network import read_network
+from torchcover.simulation.sumo.routes import write_routes
 from torchcover.simulation.sumo.simulating import convert_opendrive
-from torchcover.simulation.sumo.streets import TOWN, RandomStreets, compute_turning_speed_mps, write_routes
+from torchcover.simulation.sumo.streets import TOWN, RandomStreets, compute_turning_speed_mps
 from torchcover.simulation.traffic.fleet import BODY_KINDS, Fleet, load_bodies
 
 from .towns import XODR, street, write_net

@@ -11,7 +11,7 @@ from torchcover.simulation.sumo.motion import PARAMS, RoadUser, compute_motions
 from torchcover.simulation.sumo.network import read_network
 from torchcover.simulation.sumo.paths import compute_rectangle_corners_m
 from torchcover.simulation.sumo.vicinity import Vicinity
-from torchcover.simulation.traffic.fleet import HITCHES, compute_tractrix_yaw_rad
+from torchcover.simulation.traffic.trailers import HITCHES, compute_tractrix_yaw_rad
 
 from .towns import DRIVE, WALK, edge, write_net
 

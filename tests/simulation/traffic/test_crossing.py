@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from torchcover.simulation.traffic.assemble import Footpath, compute_step_height_m, is_free_for, simulate_walking
+from torchcover.simulation.traffic.walking import Footpath, compute_step_height_m, is_free_for, simulate_walking
 
 TIMES_S = np.arange(0.0, 120.0, 0.1)
 PATH = Footpath(np.array([3.0, -8.0]), np.array([3.0, 8.0]), curb_distance_m=0.5)

@@ -6,17 +6,9 @@ import numpy as np
 import pytest
 
 from torchcover.simulation.traffic.alignment import Polyline, build_rounded_rectangle
-from torchcover.simulation.traffic.flow import (
-    CROSS,
-    MAIN,
-    Agent,
-    JunctionParams,
-    JunctionPassage,
-    Lane,
-    LaneSimulation,
-    TrafficSignals,
-)
+from torchcover.simulation.traffic.flow import Agent, JunctionParams, Lane, LaneSimulation
 from torchcover.simulation.traffic.idm import Driver, compute_acceleration_mps2, compute_gap_ratio, integrate_motion
+from torchcover.simulation.traffic.junctions import CROSS, MAIN, JunctionPassage, TrafficSignals
 
 TIMES_S = np.arange(0.0, 60.0, 0.1)
 CAR = Driver(14.0)

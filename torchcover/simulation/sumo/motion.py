@@ -20,7 +20,7 @@ from torchcover.simulation.sumo.paths import (
     smooth_positions,
     spread_jumps,
 )
-from torchcover.simulation.traffic.fleet import HITCHES, compute_tractrix_yaw_rad, compute_trailer_poses, stack_paths
+from torchcover.simulation.traffic.trailers import HITCHES, compute_tractrix_yaw_rad, compute_trailer_poses, stack_paths
 
 
 @dataclass(frozen=True)

@@ -25,8 +25,9 @@ from torchcover.simulation.sumo.floating import (
 from torchcover.simulation.sumo.ground import BodyPlacer, Sidewalks, build_bridges, build_ground, place_parked_vehicles
 from torchcover.simulation.sumo.motion import Motion, RoadUser, compute_motions
 from torchcover.simulation.sumo.network import SAME_POSITION_M, read_network
+from torchcover.simulation.sumo.routes import EGO_TYPE, write_routes
 from torchcover.simulation.sumo.simulating import convert_opendrive, find_sumo_home, simulate
-from torchcover.simulation.sumo.streets import EGO_TYPE, RandomStreets, write_routes
+from torchcover.simulation.sumo.streets import RandomStreets
 from torchcover.simulation.sumo.vicinity import Vicinity
 from torchcover.simulation.traffic.fleet import EGO, Fleet
 from torchcover.simulation.traffic.frontage import RoadsideDensity, StreetSide, find_street_sides, place_scenery

@@ -16,17 +16,15 @@ from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.traffic.alignment import build_rounded_rectangle
 from torchcover.simulation.traffic.assemble import (
     BodyTrajectories,
-    Footpath,
     build_ego_actor,
     build_nearby_actors,
     compute_body_trajectories,
-    is_free_for,
-    simulate_walking,
 )
 from torchcover.simulation.traffic.fleet import EGO, PEDESTRIAN, Fleet
-from torchcover.simulation.traffic.flow import Agent, Lane, LaneSimulation, TrafficSignals
+from torchcover.simulation.traffic.flow import Agent, Lane, LaneSimulation
 from torchcover.simulation.traffic.frontage import RoadsideDensity, find_street_sides, place_scenery
 from torchcover.simulation.traffic.idm import Driver
+from torchcover.simulation.traffic.junctions import TrafficSignals
 from torchcover.simulation.traffic.kind import ProceduralTraffic, SceneParts
 from torchcover.simulation.traffic.scenery import (
     CURB_HEIGHT_M,
@@ -38,6 +36,7 @@ from torchcover.simulation.traffic.scenery import (
     build_tree,
     merge_by_kind,
 )
+from torchcover.simulation.traffic.walking import Footpath, is_free_for, simulate_walking
 
 
 @dataclass(frozen=True)

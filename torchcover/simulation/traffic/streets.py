@@ -7,7 +7,8 @@ import numpy as np
 
 from torchcover.geometry.arrays import Bools, Float64, Int64
 from torchcover.simulation.traffic.alignment import Alignment, OffsetPath, StreetCorridor
-from torchcover.simulation.traffic.flow import CROSS, MAIN, SPEED_LIMIT_SPACING_M, JunctionPassage, Lane, TrafficSignals
+from torchcover.simulation.traffic.flow import SPEED_LIMIT_SPACING_M, Lane
+from torchcover.simulation.traffic.junctions import CROSS, MAIN, JunctionPassage, TrafficSignals
 from torchcover.simulation.traffic.main_street import MainStreet, sample_main_street
 
 

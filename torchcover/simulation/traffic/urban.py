@@ -12,30 +12,21 @@ from torchcover.simulation.traffic.alignment import OffsetPath, StreetCorridor
 from torchcover.simulation.traffic.assemble import (
     HORIZON_M,
     BodyTrajectories,
-    Footpath,
     build_ego_actor,
     build_nearby_actors,
     compute_body_trajectories,
-    compute_step_height_m,
     find_nearby_agents,
-    simulate_walking,
 )
 from torchcover.simulation.traffic.city import CityBuilder
 from torchcover.simulation.traffic.fleet import CATEGORIES, CYCLIST, EGO, PEDESTRIAN, Fleet
-from torchcover.simulation.traffic.flow import (
-    CROSS,
-    MAIN,
-    Agent,
-    Lane,
-    LaneSimulation,
-    TrafficHistory,
-    check_traffic_memory,
-)
+from torchcover.simulation.traffic.flow import Agent, Lane, LaneSimulation, TrafficHistory, check_traffic_memory
 from torchcover.simulation.traffic.frontage import RoadsideDensity
 from torchcover.simulation.traffic.hills import Bounds, Hills
 from torchcover.simulation.traffic.idm import Driver
+from torchcover.simulation.traffic.junctions import CROSS, MAIN
 from torchcover.simulation.traffic.kind import PeoplePerKm, ProceduralTraffic, SceneParts, VehiclesPerKm
 from torchcover.simulation.traffic.streets import STREETS, CrossSection, StreetPlan, sample_street_plan
+from torchcover.simulation.traffic.walking import Footpath, compute_step_height_m, simulate_walking
 
 
 @dataclass(frozen=True)
