@@ -9,8 +9,8 @@ import torch
 
 from torchcover.coverage import BevGrid, CoverageMetric, Region
 from torchcover.report import CoverageTable, summarize_findings
+from torchcover.report.sensor_failures import describe_single_point_of_failure
 from torchcover.report.table import Row
-from torchcover.report.table_notes import describe_single_point_of_failure
 
 AHEAD = (Region("near", (0.0, 4.0), (-5.0, 5.0)), Region("far", (0.0, 12.0), (-5.0, 5.0)),
          Region("behind", (-8.0, -6.0), (-5.0, 5.0)))  # fmt: skip

@@ -10,7 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from torchcover.evaluation import build_flat_ground, build_target_record, map_target_visibility, save_target_map
 from torchcover.geometry import BoundingBox
-from torchcover.report.scene_plots import PARAMS
+from torchcover.report.target_plots import PARAMS
 from torchcover.simulation import set_ego
 from torchcover.targets import Raster, Target, TargetMap
 

@@ -40,7 +40,7 @@ from torchcover.report import (
 )
 from torchcover.report.map_layers import list_map_quantities
 from torchcover.report.records import build_records
-from torchcover.report.table_notes import get_main_quantity
+from torchcover.report.sensor_failures import get_main_quantity
 from torchcover.simulation import Sensor
 from torchcover.simulation.memory import check_memory_fits
 

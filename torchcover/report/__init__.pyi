@@ -8,6 +8,11 @@ from .colors import ColorScale as ColorScale
 from .colors import build_color_scale as build_color_scale
 from .colors import build_difference_scale as build_difference_scale
 from .colors import plot_side_by_side as plot_side_by_side
+from .findings import describe_range as describe_range
+from .findings import explain_missing_intervals as explain_missing_intervals
+from .findings import format_target_name as format_target_name
+from .findings import format_whole_percent as format_whole_percent
+from .findings import summarize_findings as summarize_findings
 from .maps import build_file_stems as build_file_stems
 from .maps import plot_band_maps as plot_band_maps
 from .maps import plot_maps as plot_maps
@@ -47,7 +52,6 @@ from .scene_plots import ActorMark as ActorMark
 from .scene_plots import StaticFaces as StaticFaces
 from .scene_plots import plot_depth_images as plot_depth_images
 from .scene_plots import plot_scene as plot_scene
-from .scene_plots import plot_target_visibility as plot_target_visibility
 from .table import CoverageTable as CoverageTable
 from .table import Row as Row
 from .table_layout import BOLD_MARKS as BOLD_MARKS
@@ -57,11 +61,7 @@ from .table_layout import build_page_tables as build_page_tables
 from .table_layout import build_text_cells as build_text_cells
 from .table_notes import TableNote as TableNote
 from .table_notes import collect_table_notes as collect_table_notes
-from .table_notes import describe_range as describe_range
 from .table_notes import explain_marks as explain_marks
-from .table_notes import explain_missing_intervals as explain_missing_intervals
-from .table_notes import format_target_name as format_target_name
-from .table_notes import format_whole_percent as format_whole_percent
 from .table_notes import list_notes as list_notes
 from .table_notes import merge_notes as merge_notes
-from .table_notes import summarize_findings as summarize_findings
+from .target_plots import plot_target_visibility as plot_target_visibility

@@ -12,8 +12,8 @@ from torchcover.coverage.redundancy import list_redundancy_quantities
 from torchcover.estimation import Difference, Number
 from torchcover.files import format_csv
 from torchcover.report.number_format import format_percent, format_square_meters
+from torchcover.report.sensor_failures import get_failure_sensors
 from torchcover.report.table import CoverageTable, Row
-from torchcover.report.table_notes import get_failure_sensors
 
 Record = dict[str, object]
 ColumnGetters = dict[str, Callable[[Row], object]]

@@ -19,10 +19,11 @@ from rich.table import Table
 from rich.text import Text
 
 from torchcover.files import escape_control_chars
+from torchcover.report.findings import summarize_findings
 from torchcover.report.records import render_csv, render_json
 from torchcover.report.table import CoverageTable
 from torchcover.report.table_layout import BOLD_MARKS, PageTable, TextCell, build_page_tables
-from torchcover.report.table_notes import explain_marks, list_notes, summarize_findings
+from torchcover.report.table_notes import explain_marks, list_notes
 
 SIGNS = {"best": "*", "significant": "!"}  # marks in text files and terminals without bold type
 

@@ -16,8 +16,7 @@ from torchcover.report.number_format import (
     format_number,
 )
 from torchcover.report.records import COLUMNS, get_common_values
-from torchcover.report.table import CoverageTable, Row
-from torchcover.report.table_notes import (
+from torchcover.report.sensor_failures import (
     MAX_HEADING_CHARS,
     format_failure_cells,
     format_failure_headings,
@@ -25,6 +24,7 @@ from torchcover.report.table_notes import (
     get_failure_sensors,
     get_main_quantity,
 )
+from torchcover.report.table import CoverageTable, Row
 
 REGION_HEADINGS = ("region", "band")
 # Explanation of marks in formats with bold text.

@@ -7,12 +7,13 @@ from itertools import groupby
 import numpy as np
 
 from torchcover.notebooks import escape_html, escape_html_attribute
+from torchcover.report.findings import describe_criterion, describe_surface
 from torchcover.report.number_format import UNKNOWN, format_number, format_square_meters
 from torchcover.report.overlay import SensorView, get_sensor_color
 from torchcover.report.page.content import Array, DetectionShares, TargetVisibilityMap
+from torchcover.report.sensor_failures import get_main_quantity
 from torchcover.report.table import CoverageTable
 from torchcover.report.table_layout import PageTable, build_text_cells
-from torchcover.report.table_notes import describe_criterion, describe_surface, get_main_quantity
 
 MAP_MARGIN_M = 3.4  # width of the map of test targets around the vehicle
 # Labels of 0, 1 and 2 or more detecting sensors; their colors are in `page.css`.
