@@ -19,13 +19,13 @@ BOX = Skin(Box(type="box", size_m=(4.0, 2.0, 1.5)).build_mesh())
 
 
 @cache
-def loaded(name):
+def load_vehicle(name):
     """Load a vehicle and its skin."""
     vehicle = Vehicle.load(name)
     return vehicle, Skin(vehicle.build_mesh())
 
 
-def distance_m(mesh, place_m):
+def compute_distance_m(mesh, place_m):
     """Compute the distance of a position from the nearest triangle of a mesh."""
     triangles = mesh.vertices_m[mesh.faces]
     nearest = trimesh.triangles.closest_point(triangles, np.broadcast_to(place_m, (len(triangles), 3)))
@@ -34,13 +34,15 @@ def distance_m(mesh, place_m):
 
 @pytest.mark.parametrize("name", VEHICLES)
 def test_mount_points_lie_on_the_surface(name):
-    (vehicle, skin), generator = loaded(name), np.random.default_rng(0)
+    (vehicle, skin), generator = load_vehicle(name), np.random.default_rng(0)
     assert vehicle.mount_regions
     for region in vehicle.mount_regions.values():
         u, v = generator.random(2)
         point, height_m = region.find_mount_point(skin, u, v), 0.02
-        assert distance_m(skin.mesh, point.position_m) < 1e-12
-        assert distance_m(skin.mesh, point.position_m + height_m * point.normal) == pytest.approx(height_m, abs=1e-9)
+        assert compute_distance_m(skin.mesh, point.position_m) < 1e-12
+        assert compute_distance_m(skin.mesh, point.position_m + height_m * point.normal) == pytest.approx(
+            height_m, abs=1e-9
+        )
         assert not skin.is_inside(point.position_m + height_m * point.normal)
         assert skin.is_inside(point.position_m - 1e-3 * point.normal)
 
@@ -48,7 +50,7 @@ def test_mount_points_lie_on_the_surface(name):
 @pytest.mark.parametrize("name", VEHICLES)
 def test_regions_are_one_patch_facing_their_side(name):
     """Neighboring points lie on the same part of the body."""
-    (vehicle, skin), shares = loaded(name), np.linspace(0.0, 1.0, 5)
+    (vehicle, skin), shares = load_vehicle(name), np.linspace(0.0, 1.0, 5)
     for region in vehicle.mount_regions.values():
         axis, sign = SIDE_VIEWS[region.side][:2]
         points = [[region.find_mount_point(skin, u, v) for v in shares] for u in shares]
@@ -61,7 +63,7 @@ def test_regions_are_one_patch_facing_their_side(name):
 
 @pytest.mark.parametrize("name", VEHICLES)
 def test_left_and_right_are_mirror_images(name):
-    vehicle, skin = loaded(name)
+    vehicle, skin = load_vehicle(name)
     regions = vehicle.mount_regions
     pairs = [(regions[key], regions[key.replace("left", "right")]) for key in regions if "left" in key]
     assert pairs

@@ -15,7 +15,7 @@ GROUND = {"name": "ground", "shape": {"type": "plane", "size_m": [400, 400]}}
 BAR = {"name": "bar", "shape": {"type": "box", "size_m": [1, 8, 1]}, "poses": [{"x_m": 5.0, "z_m": 1.5}]}
 
 
-def simulator(tmp_path, mount, *, speed_mps=0.0, bodies=(), actors=()):
+def build_simulator(tmp_path, mount, *, speed_mps=0.0, bodies=(), actors=()):
     """Simulate a sensor `top` of the rig `mine`; with a speed, the ego drives along x for five seconds."""
     ego, steps = EGO, {}
     if speed_mps:
@@ -32,16 +32,16 @@ def simulator(tmp_path, mount, *, speed_mps=0.0, bodies=(), actors=()):
 @pytest.mark.parametrize("mount", [{"z_m": -1.73}, {"x_m": 3.0, "z_m": -0.01}])
 def test_sensors_below_the_ground_are_refused(tmp_path, mount, speed_mps):
     with pytest.raises(ValueError, match=r"rig 'mine': sensor 'top' at .* lies below the ground, or inside a wall"):
-        simulator(tmp_path, mount, speed_mps=speed_mps).simulate_frame(0)
+        build_simulator(tmp_path, mount, speed_mps=speed_mps).simulate_frame(0)
 
 
 def test_distant_mounts_suggest_wrong_units(tmp_path):
     # The ego box ends 2 m ahead and 1 m up: 20 m from its upper front edge on either axis.
-    assert len(simulator(tmp_path, {"x_m": 2.0, "z_m": 20.9}).simulate_frame(0).clouds["mine"]) > 0
+    assert len(build_simulator(tmp_path, {"x_m": 2.0, "z_m": 20.9}).simulate_frame(0).clouds["mine"]) > 0
     with pytest.raises(ValueError, match=r"'top' at .* lies 1799 m away from the ego .*in meters.* millimeters\?"):
-        simulator(tmp_path, {"z_m": 1800.0}).simulate_frame(0)
+        build_simulator(tmp_path, {"z_m": 1800.0}).simulate_frame(0)
     with pytest.raises(ValueError, match=r"'top' at .* lies 20 m away from the ego"):
-        simulator(tmp_path, {"x_m": -22.1, "z_m": 0.5}).simulate_frame(0)
+        build_simulator(tmp_path, {"x_m": -22.1, "z_m": 0.5}).simulate_frame(0)
 
 
 def test_only_foreign_vehicles_suggest_the_vehicle_option():
@@ -59,14 +59,14 @@ def test_only_foreign_vehicles_suggest_the_vehicle_option():
 
 def test_sensors_inside_other_bodies_are_refused(tmp_path):
     with pytest.raises(ValueError, match=r"'top' at .* inside a wall"):
-        simulator(tmp_path, {"x_m": 5.0, "z_m": 2.0}, bodies=[BAR]).simulate_frame(0)
+        build_simulator(tmp_path, {"x_m": 5.0, "z_m": 2.0}, bodies=[BAR]).simulate_frame(0)
     van = {"name": "van", "category": "car", "shape": {"type": "box", "size_m": [5, 2, 3]}, "pose": {"y_m": 4.0}}
     with pytest.raises(ValueError, match=r"'top' at .* or another body"):
-        simulator(tmp_path, {"y_m": 3.5, "z_m": 2.0}, actors=[van]).simulate_frame(0)
+        build_simulator(tmp_path, {"y_m": 3.5, "z_m": 2.0}, actors=[van]).simulate_frame(0)
 
 
 def test_driving_into_a_wall_is_refused_there(tmp_path):
-    driving = simulator(tmp_path, {"z_m": 2.0}, speed_mps=1.0, bodies=[BAR])
+    driving = build_simulator(tmp_path, {"z_m": 2.0}, speed_mps=1.0, bodies=[BAR])
     assert len(driving.simulate_frame(4).clouds["mine"]) > 0
     with pytest.raises(ValueError, match="'top' at"):
         driving.simulate_frame(5)
@@ -74,7 +74,7 @@ def test_driving_into_a_wall_is_refused_there(tmp_path):
 
 @pytest.mark.parametrize("speed_mps", [0.0, 2.0])
 def test_sensors_exactly_on_the_ground_cause_warnings(tmp_path, speed_mps):
-    lying = simulator(tmp_path, {"x_m": 3.0, "z_m": 0.0}, speed_mps=speed_mps)
+    lying = build_simulator(tmp_path, {"x_m": 3.0, "z_m": 0.0}, speed_mps=speed_mps)
     with pytest.warns(UserWarning, match=r"rig 'mine': sensor 'top' at \[3.0, 0.0, 0.0\] m lies exactly on the ground"):
         lying.simulate_frame(1 if speed_mps else 0)
 
@@ -84,14 +84,18 @@ def test_sensors_may_lie_on_the_ego_surface(tmp_path, speed_mps):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert (
-            len(simulator(tmp_path, {"z_m": 1.0}, speed_mps=speed_mps, bodies=[BAR]).simulate_frame(0).clouds["mine"])
+            len(
+                build_simulator(tmp_path, {"z_m": 1.0}, speed_mps=speed_mps, bodies=[BAR])
+                .simulate_frame(0)
+                .clouds["mine"]
+            )
             > 0
         )
 
 
 @pytest.mark.parametrize("moving", [False, True])
 def test_the_ego_is_neither_ground_nor_enclosing(tmp_path, moving):
-    scene = SceneGeometry(simulator(tmp_path, {"z_m": 1.6}, speed_mps=2.0 * moving).scenario.build_scene())
+    scene = SceneGeometry(build_simulator(tmp_path, {"z_m": 1.6}, speed_mps=2.0 * moving).scenario.build_scene())
     snapshot = scene.get_snapshot(0)
     assert not snapshot.is_occupied(np.array([0.0, 0.0, 0.5]))
     assert not snapshot.is_on_surface(np.array([0.5, 0.5, 1.0]))

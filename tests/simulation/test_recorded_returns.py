@@ -28,7 +28,7 @@ RIG = Rig.model_validate(
 ROAD = Material.load("road")
 
 
-def sweep(generator, wall_m=np.inf, top_m=np.inf):
+def simulate_sweep(generator, wall_m=np.inf, top_m=np.inf):
     """Simulate the returns from a plain with a wall of a given height across the road ahead."""
     directions = RIG.sensors[0].compute_directions().reshape(3, -1)
     range_m = HEIGHT_M / -directions[2]
@@ -44,7 +44,7 @@ def sweep(generator, wall_m=np.inf, top_m=np.inf):
     return (directions * measured_m).T[returned] + [0.0, 0.0, HEIGHT_M]
 
 
-def written(folder, sweeps, poses=True):
+def write_recording(folder, sweeps, poses=True):
     (folder / "sensor").mkdir()
     for number, points_m in enumerate(sweeps):
         np.save(folder / "sensor" / f"{number}.npy", points_m)
@@ -58,11 +58,11 @@ def written(folder, sweeps, poses=True):
 @pytest.fixture(scope="module")
 def sweeps():
     generator = np.random.default_rng(5)
-    return [sweep(generator) for _ in range(3)]
+    return [simulate_sweep(generator) for _ in range(3)]
 
 
 def test_calibration_recovers_a_simulated_plain(sweeps, tmp_path):
-    rig, [found] = calibrate(written(tmp_path, sweeps), RIG)
+    rig, [found] = calibrate(write_recording(tmp_path, sweeps), RIG)
     assert abs(np.log(found.fit.range_at_10_percent_m / RANGE_M)) < 3 * found.fit.log_range_error < 0.15
     assert abs(np.log(found.fit.log_range_std / SPREAD)) < 3 * found.fit.log_std_error < 0.6
     assert found.range_noise_m == pytest.approx(NOISE_M, rel=0.1)
@@ -73,7 +73,7 @@ def test_errors_follow_the_curvature_of_the_likelihood(sweeps):
     rays = count_ground_rays(sweeps, RIG.sensors[0])
     fit, returned = fit_returns(rays, ROAD), rays.return_counts / rays.ray_counts
 
-    def surprise(log_range, log_spread):
+    def compute_loss(log_range, log_spread):
         excess = compute_log_excess(
             rays.range_m,
             rays.cos_incidence,
@@ -86,7 +86,7 @@ def test_errors_follow_the_curvature_of_the_likelihood(sweeps):
         return prior - (returned * np.log(seen) + (1 - returned) * np.log1p(-seen)).sum()
 
     x, y, step = np.log(fit.range_at_10_percent_m), np.log(fit.log_range_std), 0.02
-    grid = np.array([[surprise(x + i * step, y + j * step) for j in (-1, 0, 1)] for i in (-1, 0, 1)])
+    grid = np.array([[compute_loss(x + i * step, y + j * step) for j in (-1, 0, 1)] for i in (-1, 0, 1)])
     mixed = (grid[2, 2] - grid[0, 2] - grid[2, 0] + grid[0, 0]) / 4
     curvature = np.array([[np.diff(grid[:, 1], 2)[0], mixed], [mixed, np.diff(grid[1], 2)[0]]]) / step**2
     expected = np.sqrt(np.diag(np.linalg.inv(curvature)))
@@ -115,14 +115,14 @@ def test_fit_predicts_the_other_half_of_revolutions(sweeps):
 
 def test_rays_behind_walls_are_not_counted():
     """Otherwise the occluded road would count as missing returns."""
-    rays = count_ground_rays([sweep(np.random.default_rng(1), wall_m=30.0)], RIG.sensors[0])
+    rays = count_ground_rays([simulate_sweep(np.random.default_rng(1), wall_m=30.0)], RIG.sensors[0])
     ahead = np.abs(rays.azimuth_deg) < 10
     assert rays.range_m[ahead].max() < 31 < 60 < rays.range_m[~ahead].max()
 
 
 def test_rays_pass_above_low_obstacles():
     """A beam of 0.5 m occludes the road from 30 to 30 / (1 - 0.5 / 1.9) = 41 m only."""
-    beam = count_ground_rays([sweep(np.random.default_rng(1), wall_m=30.0, top_m=0.5)], RIG.sensors[0])
+    beam = count_ground_rays([simulate_sweep(np.random.default_rng(1), wall_m=30.0, top_m=0.5)], RIG.sensors[0])
     ahead = np.abs(beam.azimuth_deg) < 10
     assert not ((beam.range_m[ahead] > 31) & (beam.range_m[ahead] < 40)).any()
     assert ((beam.range_m[ahead] > 45) & (beam.range_m[ahead] < 80)).sum() > 100
@@ -158,7 +158,7 @@ def test_near_rays_are_not_counted(sweeps):
 
 def test_near_road_does_not_determine_the_range(sweeps, tmp_path):
     """All rays return, which any sufficient range explains."""
-    _, [found] = calibrate(written(tmp_path, sweeps), RIG)
+    _, [found] = calibrate(write_recording(tmp_path, sweeps), RIG)
     rays = count_ground_rays(sweeps, RIG.sensors[0])
     fit = fit_returns(rays.select(rays.range_m < 16), ROAD)
     assert found.fit.is_range_observable
@@ -178,9 +178,9 @@ def test_near_road_does_not_determine_the_range(sweeps, tmp_path):
 )
 def test_uninformative_recordings_are_refused(sweeps, tmp_path, sweeps_made, poses, told):
     with pytest.raises(ValueError, match=told):
-        calibrate(written(tmp_path, sweeps_made(sweeps), poses), RIG)
+        calibrate(write_recording(tmp_path, sweeps_made(sweeps), poses), RIG)
 
 
 def test_rigs_without_common_sensors_are_refused(sweeps, tmp_path):
     with pytest.raises(ValueError, match="no LiDAR of the rig 'argoverse2' is in it"):
-        calibrate(written(tmp_path, sweeps[:1]), Rig.load("argoverse2"))
+        calibrate(write_recording(tmp_path, sweeps[:1]), Rig.load("argoverse2"))

@@ -18,7 +18,7 @@ from torchcover.simulation.camera_sensor import MOUNT_T_CAMERA
 from torchcover.simulation.scan_estimate import estimate_scan, infer_laser_indices
 
 
-def in_a_room(lidar, seed, dropout=0.2):
+def simulate_room_scan(lidar, seed, dropout=0.2):
     """Simulate the points of a LiDAR in a room, in its frame; rays are lost by chance only."""
     directions = lidar.compute_directions()
     random = np.random.default_rng(seed)
@@ -31,7 +31,7 @@ def in_a_room(lidar, seed, dropout=0.2):
 @pytest.mark.parametrize("model", list_builtin_names("lidars"))
 def test_scan_pattern_of_every_model_is_estimated(model):
     lidar = Lidar.model_validate({"name": "a", "model": model, "columns": 240})
-    found = estimate_scan([in_a_room(lidar, seed) for seed in range(2)])
+    found = estimate_scan([simulate_room_scan(lidar, seed) for seed in range(2)])
     np.testing.assert_allclose(found.elevations_deg, np.sort(lidar.compute_elevations_deg())[::-1], atol=1e-9)
     step_deg = lidar.horizontal_fov_deg / lidar.columns
     if lidar.horizontal_fov_deg < 360 and lidar.azimuth_offsets_deg is not None:  # rows begin at different azimuths
@@ -43,17 +43,17 @@ def test_scan_pattern_of_every_model_is_estimated(model):
 
 def test_noisy_rows_are_found_but_not_blended_ones():
     lidar = Lidar.model_validate({"name": "a", "model": "velodyne_hdl32e", "columns": 400})
-    points_m = in_a_room(lidar, 0, 0.0)
+    points_m = simulate_room_scan(lidar, 0, 0.0)
 
-    def shaken(by_deg):
+    def shake_rows(by_deg):
         angles = np.random.default_rng(1).normal(scale=np.deg2rad(by_deg), size=len(points_m))
         flat_m = np.hypot(points_m[:, 0], points_m[:, 1])
         return points_m + np.c_[0 * flat_m, 0 * flat_m, angles * flat_m]
 
-    found = estimate_scan([shaken(0.15)])
+    found = estimate_scan([shake_rows(0.15)])
     spacing_deg = 1.33
     np.testing.assert_allclose(found.elevations_deg, lidar.compute_elevations_deg(), atol=spacing_deg / 10)
-    assert estimate_scan([shaken(0.8)]) is None
+    assert estimate_scan([shake_rows(0.8)]) is None
     assert estimate_scan([points_m[:1]]) is None
     assert estimate_scan([]) is None
 
@@ -134,7 +134,7 @@ def test_motion_is_not_undone_for_distant_frames():
 def test_clouds_stored_by_laser_need_no_separable_rows():
     # The upper half of the lasers is 0.1 m above the others: elevations of different lasers overlap.
     lidar = Lidar.model_validate({"name": "a", "model": "velodyne_hdl64e", "columns": 400})
-    points_m = in_a_room(lidar, 0, 0.0)
+    points_m = simulate_room_scan(lidar, 0, 0.0)
     laser = np.repeat(np.arange(64), 400)
     points_m[:, 2] += np.where(laser < 32, 0.2, 0.1)
     turned = np.mod(np.arctan2(points_m[:, 1], points_m[:, 0]), 2 * np.pi)
@@ -149,7 +149,7 @@ def test_clouds_stored_by_laser_need_no_separable_rows():
 def test_field_of_view_and_range_are_estimated():
     lidar = Lidar(name="a", channels=4, vertical_fov_deg=(-9, 0), columns=40, horizontal_fov_deg=80, max_range_m=99)
     turned = build_transform(convert_euler_to_rotation(170.0, 0.0, 0.0), np.zeros(3))
-    points_m = transform_points(turned, in_a_room(lidar, 0, 0.0))
+    points_m = transform_points(turned, simulate_room_scan(lidar, 0, 0.0))
     found = estimate_scan([points_m])
     assert (found.num_columns, found.horizontal_fov_deg) == (40, pytest.approx(80.0))
     assert found.center_azimuth_deg == pytest.approx(170.0)
@@ -157,7 +157,7 @@ def test_field_of_view_and_range_are_estimated():
     assert found.max_range_m == ranges_m.max()
 
 
-def nuscenes_with_camera(drive, root):
+def write_nuscenes_with_camera(drive, root):
     path = layouts.nuscenes_tables(drive, root)
     K = [[1266.0, 0.0, 816.0], [0.0, 1250.0, 491.0], [0.0, 0.0, 1.0]]
     camera = {"token": "cam", "sensor_token": "s", "camera_intrinsic": K, "rotation": [0.5, -0.5, 0.5, -0.5]}
@@ -183,7 +183,7 @@ def nuscenes_with_camera(drive, root):
     return path, "CAM_FRONT", (1600, 900), pixels
 
 
-def argoverse2_with_camera(drive, root):
+def write_argoverse2_with_camera(drive, root):
     import pyarrow as pa
     from pyarrow import feather
 
@@ -231,7 +231,7 @@ D2 = [-0.37, 0.19, 1.1e-3, 1.8e-3, -0.06]
 camera2_T_camera0 = build_transform(convert_euler_to_rotation(0.3, 0.2, -0.4), [0.06, 0.0, 0.004])
 
 
-def by_kitti(points_m, raw=False):
+def project_by_kitti(points_m, raw=False):
     """Compute pixels of the left color camera by the formula of the development kit, or of OpenCV for raw images."""
     velodyne_m = transform_points(invert(kitti.vehicle_T_velodyne), points_m)
     if raw:
@@ -248,46 +248,46 @@ def by_kitti(points_m, raw=False):
     return seen[:, :2] / seen[:, 2:]
 
 
-def numbers(array):
+def format_numbers(array):
     return " ".join(repr(float(number)) for number in np.ravel(array))
 
 
-def kitti_raw_with_cameras(drive, root):
+def write_kitti_raw_with_cameras(drive, root):
     path = layouts.kitti_raw(drive, root)
-    velodyne = f"R: {numbers(camera0_T_velodyne[:3, :3])}\nT: {numbers(camera0_T_velodyne[:3, 3])}\n"
+    velodyne = f"R: {format_numbers(camera0_T_velodyne[:3, :3])}\nT: {format_numbers(camera0_T_velodyne[:3, 3])}\n"
     (path.parent / "calib_velo_to_cam.txt").write_text(velodyne)
-    lines = ["calib_time: 09-Jan-2012 13:57:47", f"R_rect_00: {numbers(R0)}"]
+    lines = ["calib_time: 09-Jan-2012 13:57:47", f"R_rect_00: {format_numbers(R0)}"]
     for name in ("00", "01", "02", "03"):
         lines += [
             f"S_rect_{name}: 1242 375",
-            f"P_rect_{name}: {numbers(P2)}",
+            f"P_rect_{name}: {format_numbers(P2)}",
             f"S_{name}: 1392 512",
-            f"K_{name}: {numbers(K2)}",
-            f"D_{name}: {numbers(D2)}",
-            f"R_{name}: {numbers(camera2_T_camera0[:3, :3])}",
-            f"T_{name}: {numbers(camera2_T_camera0[:3, 3])}",
-            f"R_rect_{name.replace('00', '9')}: {numbers(R0)}",
+            f"K_{name}: {format_numbers(K2)}",
+            f"D_{name}: {format_numbers(D2)}",
+            f"R_{name}: {format_numbers(camera2_T_camera0[:3, :3])}",
+            f"T_{name}: {format_numbers(camera2_T_camera0[:3, 3])}",
+            f"R_rect_{name.replace('00', '9')}: {format_numbers(R0)}",
         ]
     (path.parent / "calib_cam_to_cam.txt").write_text("\n".join(lines))
-    return path, "image_02", (1242, 375), by_kitti
+    return path, "image_02", (1242, 375), project_by_kitti
 
 
-def kitti_object_with_camera(drive, root):
+def write_kitti_object_with_camera(drive, root):
     for folder in ("velodyne", "calib", "image_2"):
         (root / folder).mkdir()
     (root / "velodyne" / "000001.bin").write_bytes(layouts.records(np.eye(3), 4))
     rows = {**{f"P{number}": P2 for number in range(4)}, "R0_rect": R0, "Tr_velo_to_cam": camera0_T_velodyne[:3]}
-    (root / "calib" / "000001.txt").write_text("".join(f"{key}: {numbers(row)}\n" for key, row in rows.items()))
+    (root / "calib" / "000001.txt").write_text("".join(f"{key}: {format_numbers(row)}\n" for key, row in rows.items()))
     size = (1224).to_bytes(4, "big") + (370).to_bytes(4, "big")
     (root / "image_2" / "000001.png").write_bytes(b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR" + size)
-    return root, "P2", (1224, 370), by_kitti
+    return root, "P2", (1224, 370), project_by_kitti
 
 
 CAMERAS = {
-    "nuscenes": nuscenes_with_camera,
-    "argoverse2": argoverse2_with_camera,
-    "kitti_raw": kitti_raw_with_cameras,
-    "kitti_object": kitti_object_with_camera,
+    "nuscenes": write_nuscenes_with_camera,
+    "argoverse2": write_argoverse2_with_camera,
+    "kitti_raw": write_kitti_raw_with_cameras,
+    "kitti_object": write_kitti_object_with_camera,
 }
 
 
@@ -321,7 +321,7 @@ def test_cameras_project_points_like_their_data_set(layout, raw, tmp_path):
 
 
 def test_lidar_extrinsics_come_from_calibrations(tmp_path):
-    path, *_ = argoverse2_with_camera(Drive(steps=2), tmp_path)
+    path, *_ = write_argoverse2_with_camera(Drive(steps=2), tmp_path)
     rig = build_rig_document(
         open_recording(path), sensor_names=["down_lidar"], lidar_models={"down_lidar": "velodyne_vlp32c"}
     )
@@ -367,7 +367,7 @@ def test_recordings_without_usable_sensors_are_refused(tmp_path):
     ],
 )
 def test_invalid_kitti_calibrations_are_refused(tmp_path, line, instead, told):
-    path, *_ = kitti_raw_with_cameras(Drive(steps=2), tmp_path)
+    path, *_ = write_kitti_raw_with_cameras(Drive(steps=2), tmp_path)
     file = path.parent / "calib_cam_to_cam.txt"
     assert line in file.read_text()
     file.write_text(file.read_text().replace(line, instead))
@@ -383,13 +383,13 @@ def test_invalid_kitti_calibrations_are_refused(tmp_path, line, instead, told):
 def test_invalid_cameras_of_recordings_are_refused(tmp_path):
     from pyarrow import feather
 
-    path, *_ = argoverse2_with_camera(Drive(steps=2), tmp_path)
+    path, *_ = write_argoverse2_with_camera(Drive(steps=2), tmp_path)
     table = path / "calibration" / "egovehicle_SE3_sensor.feather"
     feather.write_feather(feather.read_table(table).slice(0, 2), str(table))
     with pytest.raises(BadFileError, match=r"egovehicle_SE3_sensor.feather has no down_lidar"):
         build_rig_document(open_recording(path))
     (tmp_path / "object").mkdir()
-    path, *_ = kitti_object_with_camera(None, tmp_path / "object")
+    path, *_ = write_kitti_object_with_camera(None, tmp_path / "object")
     (path / "image_2" / "000001.png").write_bytes(b"JFIF")
     with pytest.raises(BadFileError, match=r"000001.png: not a PNG image"):
         build_rig_document(open_recording(path))

@@ -23,12 +23,12 @@ CAMERA = """<camera{}><horizontal_fov>1.5</horizontal_fov><image><width>640</wid
 <clip><near>0.2</near><far>9</far></clip></camera>"""
 
 
-def joint(parent, child, xyz="0 0 0", rpy="0 0 0", inside="", kind="revolute"):
+def join(parent, child, xyz="0 0 0", rpy="0 0 0", inside="", kind="revolute"):
     ends = f"<parent link='{parent}'/><child link='{child}'/><origin xyz='{xyz}' rpy='{rpy}'/>"
     return f"<joint name='{parent}_{child}' type='{kind}'>{ends}{inside}</joint>"
 
 
-def on(link, *sensors):
+def embed(link, *sensors):
     return f"<gazebo reference='{link}'>{''.join(sensors)}</gazebo>"
 
 
@@ -49,8 +49,8 @@ def test_sensor_pose_chains_all_joints_at_zero(robot_of):
     words = [" ".join(map(str, rpy)) for _, rpy in turns]
     pose = "<pose>0.01 0.02 0.03 0 0 0.2</pose>"
     robot = robot_of(
-        CHASSIS, "<link name='arm'/><link name='head'/>", joint("base", "arm", turns[0][0], words[0]),
-        joint("arm", "head", turns[1][0], words[1]), on("head", LIDAR.format("l", pose, 0.0).replace("181", "1")),
+        CHASSIS, "<link name='arm'/><link name='head'/>", join("base", "arm", turns[0][0], words[0]),
+        join("arm", "head", turns[1][0], words[1]), embed("head", LIDAR.format("l", pose, 0.0).replace("181", "1")),
     )  # fmt: skip
     expected = places[0] @ places[1] @ places[2]
     expected[2, 3] += 0.2  # the center of the chassis is 0.2 m above the ground
@@ -61,7 +61,7 @@ def test_sensor_pose_chains_all_joints_at_zero(robot_of):
 
 
 def test_lidar_rays_equal_those_of_gazebo(robot_of):
-    keys = robot_of(CHASSIS, on("base", LIDAR.format("left", "<pose>0 0 1 0 0 0</pose>", math.pi))).sensors[0]
+    keys = robot_of(CHASSIS, embed("base", LIDAR.format("left", "<pose>0 0 1 0 0 0</pose>", math.pi))).sensors[0]
     (lidar,) = Rig.model_validate({"name": "a", "sensors": [keys]}).sensors
     rays = np.einsum("ij,jrc->irc", lidar.mount.to_matrix()[:3, :3], lidar.compute_directions())
     np.testing.assert_allclose(np.arctan2(rays[1], rays[0])[0], np.linspace(0.0, math.pi, 181), atol=1e-4)
@@ -77,8 +77,8 @@ def test_cameras_have_poses_names_and_depth_ranges(robot_of):
     )
     robot = robot_of(
         CHASSIS,
-        on("base", f"<sensor name='d' type='rgbd_camera'>{depth}</sensor>", "<sensor name='i' type='imu'/>"),
-        on("base", f"<sensor name='m' type='multicamera'><pose>0.5 0 0 0 0 0</pose>{two}</sensor>"),
+        embed("base", f"<sensor name='d' type='rgbd_camera'>{depth}</sensor>", "<sensor name='i' type='imu'/>"),
+        embed("base", f"<sensor name='m' type='multicamera'><pose>0.5 0 0 0 0 0</pose>{two}</sensor>"),
     )
     named = {keys["name"]: keys for keys in robot.sensors}
     assert list(named) == ["d", "m_l", "m_r"]
@@ -138,9 +138,9 @@ def test_housings_are_excluded_except_the_largest_body(robot_of):
     links = (
         "<link name='l'>" + BOX.format("0.1 0.1 0.1") + "</link><link name='m'>" + BOX.format("0.1 0.1 0.2") + "</link>"
     )
-    joints = joint("base", "l", "0 0 0.5") + joint("base", "m", "0.3 0 0.5")
+    joints = join("base", "l", "0 0 0.5") + join("base", "m", "0.3 0 0.5")
     robot = robot_of(
-        CHASSIS, links, joints, on("l", LIDAR.format("l", "", 1.0)), on("base", LIDAR.format("b", "", 1.0))
+        CHASSIS, links, joints, embed("l", LIDAR.format("l", "", 1.0)), embed("base", LIDAR.format("b", "", 1.0))
     )
     assert len(robot.body.vertices_m) == 16
     assert robot.notes == [
@@ -154,7 +154,7 @@ def test_posts_around_a_lidar_stay_and_block_rays(robot_of):
     corners = [f"{x} {y} 0" for x in (-0.06, 0.06) for y in (-0.06, 0.06)]
     posts = "".join(BOX.format("0.02 0.02 0.2").replace("<geo", f"<origin xyz='{xyz}'/><geo") for xyz in corners)
     full_turn = LIDAR.format("l", "", 2 * math.pi).replace("181", "3600")
-    robot = robot_of(CHASSIS, f"<link name='l'>{posts}</link>", joint("base", "l", "0 0 0.5"), on("l", full_turn))
+    robot = robot_of(CHASSIS, f"<link name='l'>{posts}</link>", join("base", "l", "0 0 0.5"), embed("l", full_turn))
     assert len(robot.body.vertices_m) == 5 * 8
     # From the center, a post spans from one of its corners to the opposite one.
     span_rad = 4 * 2 * (math.atan2(0.07, 0.05) - math.pi / 4)
@@ -171,8 +171,8 @@ def test_posts_around_a_lidar_stay_and_block_rays(robot_of):
     "<pose frame='__model__' degrees='true'>0.1 0 0 0 10 90</pose>",
 ])  # fmt: skip
 def test_pose_attributes_are_applied(robot_of, pose):
-    links = "<link name='l'/>" + joint("base", "l", "0.2 0 0.3")
-    mount = robot_of(CHASSIS, links, on("base", f"<sensor name='c' type='depth'>{pose}{CAMERA.format('')}</sensor>"))
+    links = "<link name='l'/>" + join("base", "l", "0.2 0 0.3")
+    mount = robot_of(CHASSIS, links, embed("base", f"<sensor name='c' type='depth'>{pose}{CAMERA.format('')}</sensor>"))
     assert mount.sensors[0]["mount"] == {"x_m": 0.1, "z_m": 0.2, "yaw_deg": 90.0, "pitch_deg": 10.0}
 
 
@@ -185,7 +185,7 @@ def test_camera_distortion_and_noise_are_applied(robot_of):
     cases = [("320", "240", "0"), ("310", "200", "0"), ("320", "240", "-0.1")]
     sensors = [f"<sensor name='c' type='depth'>{CAMERA.format('').replace('</camera>', inside.format(*case))}</sensor>"
                for case in cases]  # fmt: skip
-    robot = robot_of(CHASSIS, on("base", *sensors))
+    robot = robot_of(CHASSIS, embed("base", *sensors))
     plain, shifted, distorted = robot.sensors
     assert (plain["fov_deg"], plain["range_noise_m"]) == (90.0, 0.02)
     assert [shifted[key] for key in ("fx", "fy", "cx", "cy")] == [310.0, 320.0, 319.5, 199.5]
@@ -199,7 +199,7 @@ def test_resolution_is_applied_as_in_gazebo_classic(robot_of, samples, resolutio
     lidar = LIDAR.format("l", "", 1.0).replace(
         "<samples>3</samples>", f"<samples>{samples}</samples><resolution>{resolution}</resolution>"
     )
-    robot = robot_of(CHASSIS, on("base", lidar))
+    robot = robot_of(CHASSIS, embed("base", lidar))
     assert robot.sensors[0]["channels"] == channels
     note = f"Gazebo (gz-sim) ignores <resolution> and has {samples}."
     assert any(note in words for words in robot.notes) == (resolution != 1)
@@ -210,7 +210,7 @@ def test_ignored_settings_are_named(robot_of):
     lens = "<lens><type>equidistant</type></lens><visibility_mask>7</visibility_mask></camera>"
     camera = CAMERA.format("").replace("</camera>", lens)
     lidar = LIDAR.format("l", "", 1.0).replace("</sensor>", f"{plugin}</sensor>")
-    notes = robot_of(CHASSIS, on("base", lidar, f"<sensor name='c' type='depth'>{camera}</sensor>")).notes
+    notes = robot_of(CHASSIS, embed("base", lidar, f"<sensor name='c' type='depth'>{camera}</sensor>")).notes
     assert "l: settings of its plugin are not applied: <min_range> 0.9; set them in rig.yaml." in notes
     assert any(note.startswith("c: <lens><type> equidistant is not applied, a pinhole is assumed") for note in notes)
     assert "c: <visibility_mask> 7 is not applied; the sensor sees all bodies." in notes
@@ -223,9 +223,9 @@ def test_mimic_joints_have_offsets_and_limits_are_noted(robot_of):
     mimics = [f"<axis xyz='0 2 0'/><mimic joint='{of}' multiplier='2' offset='{offset}'/>"
               for of, offset in (("base_d", 0.1), ("base_b", 0.05))]  # fmt: skip
     robot = robot_of(
-        CHASSIS, links, joint("base", "d", "0 0 1", inside=limit),
-        joint("base", "c", "0 0 2", "0 0 1", mimics[1], "prismatic"),
-        joint("base", "b", "0 0 3", "", mimics[0], "prismatic").replace("rpy=''", ""),
+        CHASSIS, links, join("base", "d", "0 0 1", inside=limit),
+        join("base", "c", "0 0 2", "0 0 1", mimics[1], "prismatic"),
+        join("base", "b", "0 0 3", "", mimics[0], "prismatic").replace("rpy=''", ""),
     )  # fmt: skip
     center_m = robot.body.vertices_m.reshape(4, 8, 3).mean(axis=1)
     np.testing.assert_allclose(center_m[1], [0.0, 0.1, 3.2], atol=1e-9)
@@ -238,16 +238,16 @@ def test_reading_time_is_linear_in_links(robot_of):
     """A chain and a star of 20,000 links are read in seconds."""
     names = [f"l{k}" for k in range(20_000)]
     links = "".join(f"<link name='{name}'/>" for name in names)
-    joints = "".join(joint(names[k - 1] if k % 2 else names[0], names[k], "0 0 0.001") for k in range(1, len(names)))
+    joints = "".join(join(names[k - 1] if k % 2 else names[0], names[k], "0 0 0.001") for k in range(1, len(names)))
     start_s = time.process_time()
-    robot_of(CHASSIS, links, joints, joint("base", "l0"))
+    robot_of(CHASSIS, links, joints, join("base", "l0"))
     assert time.process_time() - start_s < 20.0
 
 
 def test_written_robots_can_be_simulated(robot_of, tmp_path):
     nasty = "&lt;b&gt;"
     sensor = LIDAR.format(nasty, "<pose>0 0 0.5 0 0 0</pose>", 6.28)
-    robot = robot_of(CHASSIS, on("base", sensor))
+    robot = robot_of(CHASSIS, embed("base", sensor))
     files = {path.name for path in robot.save(tmp_path / "out")}
     assert files == {"body.ply", "vehicle.yaml", "rig.yaml", "summary.json"}
     rig, vehicle = Rig.load(tmp_path / "out" / "rig.yaml"), Vehicle.load(tmp_path / "out" / "vehicle.yaml")
@@ -275,28 +275,28 @@ MESH = "<link name='base'><visual><geometry><mesh filename='package://p/{}.stl'/
 @pytest.mark.parametrize(
     ("content", "told"),
     [
-        ([CHASSIS, TWO, joint("base", "b"), joint("b", "c"), joint("base", "c")], "'c' is the child of 'b' and of"),
-        ([CHASSIS, TWO, joint("b", "c"), joint("c", "b")], "'b', 'c' form a ring"),
-        ([TWO, joint("b", "c"), joint("c", "b")], "'b', 'c' form a ring"),
-        ([CHASSIS, TWO, joint("b", "c")], "'base', 'b' have no parent"),
-        ([CHASSIS, joint("base", "nowhere")], "refers to 'nowhere', which is no link"),
+        ([CHASSIS, TWO, join("base", "b"), join("b", "c"), join("base", "c")], "'c' is the child of 'b' and of"),
+        ([CHASSIS, TWO, join("b", "c"), join("c", "b")], "'b', 'c' form a ring"),
+        ([TWO, join("b", "c"), join("c", "b")], "'b', 'c' form a ring"),
+        ([CHASSIS, TWO, join("b", "c")], "'base', 'b' have no parent"),
+        ([CHASSIS, join("base", "nowhere")], "refers to 'nowhere', which is no link"),
         ([CHASSIS, CHASSIS], "several of <link> are named 'base'"),
-        ([CHASSIS, joint("base", "b"), joint("base", "b"), TWO], "several of <joint> are named 'base_b'"),
-        ([CHASSIS, "<link name='b'/>", joint("base", "b", inside="<mimic joint='x'/>")], "mimics 'x', which is no"),
-        ([CHASSIS, "<link name='b'/>", joint("base", "b", inside="<mimic joint='base_b'/>")], "mimics itself"),
+        ([CHASSIS, join("base", "b"), join("base", "b"), TWO], "several of <joint> are named 'base_b'"),
+        ([CHASSIS, "<link name='b'/>", join("base", "b", inside="<mimic joint='x'/>")], "mimics 'x', which is no"),
+        ([CHASSIS, "<link name='b'/>", join("base", "b", inside="<mimic joint='base_b'/>")], "mimics itself"),
         (["<link name='b'><visual><geometry><heightmap/></geometry></visual></link>"], "<heightmap> cannot be applied"),
-        ([CHASSIS, on("base", LIDAR.format("l", "<pose relative_to='x'/>", 1.0))], "sensor 'l' is on 'x'"),
-        ([CHASSIS, on("base", LIDAR.format("l", "<pose rotation_format='axis'/>", 1.0))], "rotation_format 'axis'"),
-        ([CHASSIS, on("base", LIDAR.format("l", "", -1.0))], "horizontal_fov_deg"),
-        ([CHASSIS, on("base", f"<sensor name='c' type='depth'>{SKEWED}</sensor>")], "s 2 cannot be applied"),
-        ([CHASSIS, on("nowhere", LIDAR.format("l", "", 1.0))], "sensor 'l' is on 'nowhere'"),
+        ([CHASSIS, embed("base", LIDAR.format("l", "<pose relative_to='x'/>", 1.0))], "sensor 'l' is on 'x'"),
+        ([CHASSIS, embed("base", LIDAR.format("l", "<pose rotation_format='axis'/>", 1.0))], "rotation_format 'axis'"),
+        ([CHASSIS, embed("base", LIDAR.format("l", "", -1.0))], "horizontal_fov_deg"),
+        ([CHASSIS, embed("base", f"<sensor name='c' type='depth'>{SKEWED}</sensor>")], "s 2 cannot be applied"),
+        ([CHASSIS, embed("nowhere", LIDAR.format("l", "", 1.0))], "sensor 'l' is on 'nowhere'"),
         (["<link name='base'/>"], "no link has a visual"),
         ([MESH.format("one")], "1 of 1 meshes are missing: package://p/one.stl. Name the folder"),
         ([CHASSIS.replace("0.8", "1e308")], "the body reaches beyond 1e+09 m"),
         ([CHASSIS.replace("0.8", "4e9")], "the body reaches beyond 1e+09 m"),
         ([CHASSIS.replace("0.8", "wide")], "box size: 3 numbers needed; got 'wide 0.6 0.4'"),
-        ([CHASSIS, on("base", LIDAR.format("l", "", "far"))], "scan/horizontal/max_angle: 1 number needed; got 'far'"),
-        ([CHASSIS, on("base", "<sensor name='l' type='ray'/>")], "<lidar> or <ray> is missing"),
+        ([CHASSIS, embed("base", LIDAR.format("l", "", "far"))], "horizontal/max_angle: 1 number needed; got 'far'"),
+        ([CHASSIS, embed("base", "<sensor name='l' type='ray'/>")], "<lidar> or <ray> is missing"),
         (["<link name='base'/><x:include xmlns:x='http://ros.org/wiki/xacro'/>"], "xacro a.urdf > a_expanded.urdf"),
         ([], "a <robot> with links is needed"),
     ],

@@ -20,7 +20,7 @@ TIMES_S = STEP_S * np.arange(STEPS)
 ORIGIN_M = np.array([1400.0, 2200.0])
 
 
-class Somebody(NamedTuple):
+class RecordedBox(NamedTuple):
     """Box that drives straight, or stands, with positions relative to ORIGIN_M."""
 
     name: str
@@ -34,31 +34,31 @@ class Somebody(NamedTuple):
 
 
 OTHERS = (
-    Somebody("a1", "car", (4.5, 1.8, 1.5), (24.0, 0.0), 0.0, 9.0),
-    Somebody("a2", "car", (4.2, 1.75, 1.6), (60.0, 3.6), 180.0, 11.0),
-    Somebody("a3", "truck", (9.5, 2.5, 3.4), (-24.0, 0.0), 0.0, 9.0),
-    Somebody("a4", "bus", (11.6, 2.6, 3.1), (95.0, 3.6), 180.0, 8.0, 5),
-    Somebody("a5", "car", (4.0, 1.7, 1.4), (15.0, -5.5), 0.0),
-    Somebody("a6", "car", (5.6, 2.1, 2.4), (29.0, -5.5), 0.0),
-    Somebody("a7", "pedestrian", (0.7, 0.7, 1.75), (38.0, -9.0), 90.0, 1.4),
-    Somebody("a8", "bicycle", (1.8, 0.6, 1.75), (8.0, 6.5), 180.0, 4.0, 0, 14),
-    Somebody("a9", "bollard", (0.3, 0.3, 1.0), (22.0, -8.0), 0.0),
+    RecordedBox("a1", "car", (4.5, 1.8, 1.5), (24.0, 0.0), 0.0, 9.0),
+    RecordedBox("a2", "car", (4.2, 1.75, 1.6), (60.0, 3.6), 180.0, 11.0),
+    RecordedBox("a3", "truck", (9.5, 2.5, 3.4), (-24.0, 0.0), 0.0, 9.0),
+    RecordedBox("a4", "bus", (11.6, 2.6, 3.1), (95.0, 3.6), 180.0, 8.0, 5),
+    RecordedBox("a5", "car", (4.0, 1.7, 1.4), (15.0, -5.5), 0.0),
+    RecordedBox("a6", "car", (5.6, 2.1, 2.4), (29.0, -5.5), 0.0),
+    RecordedBox("a7", "pedestrian", (0.7, 0.7, 1.75), (38.0, -9.0), 90.0, 1.4),
+    RecordedBox("a8", "bicycle", (1.8, 0.6, 1.75), (8.0, 6.5), 180.0, 4.0, 0, 14),
+    RecordedBox("a9", "bollard", (0.3, 0.3, 1.0), (22.0, -8.0), 0.0),
 )
-EGO = Somebody("ego", "car", (4.9, 1.94, 1.63), (0.0, 0.0), 0.0, 9.0)
+EGO = RecordedBox("ego", "car", (4.9, 1.94, 1.63), (0.0, 0.0), 0.0, 9.0)
 
 
-def hill_m(places_m):
+def compute_hill_heights_m(places_m):
     """Compute the heights of (N, 2) positions: a street that rises and falls by meters, and leans to its side."""
     x, y = (places_m - ORIGIN_M).T
     return 31.0 + 2.5 * np.sin(x / 45.0) + 0.02 * y
 
 
-def flat_m(places_m):
+def compute_flat_heights_m(places_m):
     """Compute zero heights."""
     return np.zeros(len(places_m))
 
 
-def poses(somebody, heights=hill_m, times_s=TIMES_S):
+def poses(somebody, heights=compute_hill_heights_m, times_s=TIMES_S):
     """Compute the (T, 4, 4) poses of the center of the bottom, on the ground and tilted with it."""
     yaw = np.deg2rad(somebody.yaw_deg)
     ahead = np.array([np.cos(yaw), np.sin(yaw)])
@@ -78,27 +78,27 @@ def seen(somebody):
     return range(somebody.first, somebody.last + 1)
 
 
-def quaternion(matrix):
+def compute_quaternion(matrix):
     """Compute w, x, y, z of a rotation by less than 180 degrees about any axis, or about z."""
     r = matrix[:3, :3]
     w = np.sqrt(max(1 + np.trace(r), 0.0)) / 2
     if w < 1e-6:
-        return [0.0, 0.0, 0.0, 1.0] if r[2, 2] > 0.999999 else _half_turn(r)
+        return [0.0, 0.0, 0.0, 1.0] if r[2, 2] > 0.999999 else _rotate_half_turn(r)
     return [w, *((np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]])) / (4 * w)).tolist()]
 
 
-def _half_turn(r):
+def _rotate_half_turn(r):
     axis = np.sqrt(np.clip((np.diag(r) + 1) / 2, 0.0, None))
     axis[:2] *= np.sign(r[2, :2])
     return [0.0, *axis.tolist()]
 
 
-def about_middle(world_T_bottom, size_m):
+def compute_center_pose(world_T_bottom, size_m):
     """Compute the pose of the center of a box."""
     return world_T_bottom @ build_transform(np.eye(3), [0.0, 0.0, size_m[2] / 2])
 
 
-def write_argoverse2(folder, others=OTHERS, heights=hill_m):
+def write_argoverse2(folder, others=OTHERS, heights=compute_hill_heights_m):
     """Write a log; the poses of the ego vehicle are twice as dense as the cuboids, and begin earlier."""
     import pyarrow as pa
     from pyarrow import feather
@@ -108,27 +108,28 @@ def write_argoverse2(folder, others=OTHERS, heights=hill_m):
     dense_s = STEP_S / 2 * np.arange(-1, 2 * STEPS)
     world_T_ego = poses(EGO, heights, dense_s) @ argoverse2.vehicle_T_ego
     driven = [
-        {"timestamp_ns": T0_NS + round(1e9 * t), **_row(pose)} for t, pose in zip(dense_s, world_T_ego, strict=True)
+        {"timestamp_ns": T0_NS + round(1e9 * t), **_build_row(pose)}
+        for t, pose in zip(dense_s, world_T_ego, strict=True)
     ]
     cuboids = []
     for somebody in others:
-        world_T_box = about_middle(poses(somebody, heights), somebody.size_m)
+        world_T_box = compute_center_pose(poses(somebody, heights), somebody.size_m)
         size = dict(zip(("length_m", "width_m", "height_m"), somebody.size_m, strict=True))
         for k in seen(somebody):
             pose = invert(world_T_ego[2 * k + 1]) @ world_T_box[k]
             category = names.get(somebody.category, somebody.category.upper())
             row = {"timestamp_ns": T0_NS + round(1e9 * TIMES_S[k]), "track_uuid": somebody.name, "category": category}
-            cuboids.append({**row, **size, **_row(pose)})
+            cuboids.append({**row, **size, **_build_row(pose)})
     feather.write_feather(pa.Table.from_pylist(driven), str(folder / argoverse2.POSES_FILE))
     feather.write_feather(pa.Table.from_pylist(cuboids), str(folder / "annotations.feather"))
     return folder
 
 
-def _row(pose):
-    return dict(zip(argoverse2.POSE_COLUMNS, [*quaternion(pose), *pose[:3, 3].tolist()], strict=True))
+def _build_row(pose):
+    return dict(zip(argoverse2.POSE_COLUMNS, [*compute_quaternion(pose), *pose[:3, 3].tolist()], strict=True))
 
 
-def write_nuscenes(folder, others=OTHERS, heights=flat_m, scenes=("scene-0001",)):
+def write_nuscenes(folder, others=OTHERS, heights=compute_flat_heights_m, scenes=("scene-0001",)):
     """Write tables; every fifth frame is a sample. Scenes after the first are a minute later, without other objects."""
     names = {"car": "vehicle.car", "truck": "vehicle.truck", "bus": "vehicle.bus.rigid", "bicycle": "vehicle.bicycle",
              "pedestrian": "human.pedestrian.adult", "bollard": "movable_object.barrier"}  # fmt: skip
@@ -140,16 +141,16 @@ def write_nuscenes(folder, others=OTHERS, heights=flat_m, scenes=("scene-0001",)
         tables["scene"].append({"token": f"s{number}", "name": scene})
         for k, time_s in enumerate(TIMES_S.tolist()):
             time_us = T0_NS // 1000 + round(1e6 * (time_s + 60 * number))
-            place = {"rotation": quaternion(world_T_ego[k]), "translation": world_T_ego[k][:3, 3].tolist()}
+            place = {"rotation": compute_quaternion(world_T_ego[k]), "translation": world_T_ego[k][:3, 3].tolist()}
             tables["ego_pose"].append({"token": f"p{number}-{k}", "timestamp": time_us, **place})
             if k % 5 == 0:
                 token = f"k{number}-{k}"
                 tables["sample"].append({"token": token, "scene_token": f"s{number}", "timestamp": time_us})
     for one in others:
-        boxes, (length, width, height) = about_middle(poses(one, heights), one.size_m), one.size_m
+        boxes, (length, width, height) = compute_center_pose(poses(one, heights), one.size_m), one.size_m
         for k in seen(one):
             if k % 5 == 0:
-                place = {"rotation": quaternion(boxes[k]), "translation": boxes[k][:3, 3].tolist()}
+                place = {"rotation": compute_quaternion(boxes[k]), "translation": boxes[k][:3, 3].tolist()}
                 row = {"token": f"{one.name}-{k}", "sample_token": f"k0-{k}", "instance_token": one.name}
                 tables["sample_annotation"].append({**row, "size": [width, length, height], **place})
     folder.mkdir(parents=True, exist_ok=True)
@@ -166,28 +167,28 @@ def write_commonroad(path, others=OTHERS):
         length, width, _ = one.size_m
         shape = f"<rectangle><length>{length}</length><width>{width}</width></rectangle>"
         parts.append(f'<{kind}Obstacle id="{number}"><type>{one.category}</type><shape>{shape}</shape>')
-        states = [_state(one, k) for k in (seen(one) if one.speed_mps else range(1))]
+        states = [_build_state(one, k) for k in (seen(one) if one.speed_mps else range(1))]
         parts.append(f"<initialState>{states[0]}</initialState>")
         if len(states) > 1:
             parts.append(f"<trajectory>{''.join(f'<state>{state}</state>' for state in states[1:])}</trajectory>")
         parts.append(f"</{kind}Obstacle>")
     parts.append(
-        f'<planningProblem id="100"><initialState>{_state(EGO, 0)}</initialState></planningProblem></commonRoad>'
+        f'<planningProblem id="100"><initialState>{_build_state(EGO, 0)}</initialState></planningProblem></commonRoad>'
     )
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text("\n".join(parts) + "\n")
     return path
 
 
-def _state(one, k):
-    x, y, _ = poses(one, flat_m)[k][:3, 3]
+def _build_state(one, k):
+    x, y, _ = poses(one, compute_flat_heights_m)[k][:3, 3]
     return (
         f"<position><point><x>{x:.6f}</x><y>{y:.6f}</y></point></position>"
         f"<orientation><exact>{np.deg2rad(one.yaw_deg):.9f}</exact></orientation><time><exact>{k}</exact></time>"
     )
 
 
-def write_csv(folder, others=OTHERS, heights=hill_m):
+def write_csv(folder, others=OTHERS, heights=compute_hill_heights_m):
     """Write `boxes.csv` and `ego.csv`; the boxes do not tilt."""
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / "boxes.csv").open("w", newline="") as file:

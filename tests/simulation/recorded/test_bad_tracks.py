@@ -20,7 +20,7 @@ from tests.simulation.recorded.drives import (
     write_csv,
     write_nuscenes,
 )
-from tests.simulation.recorded.test_tracks import FEW, RIG, scenario
+from tests.simulation.recorded.test_tracks import FEW, RIG, build_scenario
 from torchcover import Scenario
 from torchcover.cli.app import main
 from torchcover.files import BadFileError, isolated
@@ -29,13 +29,13 @@ from torchcover.recordings.formats import read_objects
 from torchcover.simulation import Simulator
 
 
-def fails(drive, message, error=ValueError):
+def assert_fails(drive, message, error=ValueError):
     with pytest.raises(error, match=message) as caught:
         drive.build_scene()
     assert "\n" not in str(caught.value)
 
 
-def replaced(path, old, new, count=1):
+def replace_text(path, old, new, count=1):
     text = path.read_text()
     assert old in text
     path.write_text(text.replace(old, new, count))
@@ -49,56 +49,64 @@ def table(tmp_path):
 
 
 def test_paths_without_recordings_are_refused(tmp_path):
-    fails(scenario(tmp_path / "none"), "none: no such file or folder; recorded tracks are needed", FileNotFoundError)
-    fails(scenario(tmp_path), "recorded tracks are .* a log of Argoverse 2 .*; a table of boxes")
+    assert_fails(
+        build_scenario(tmp_path / "none"), "none: no such file or folder; recorded tracks are needed", FileNotFoundError
+    )
+    assert_fails(build_scenario(tmp_path), "recorded tracks are .* a log of Argoverse 2 .*; a table of boxes")
     (tmp_path / "a.txt").write_text("x")
-    fails(scenario(tmp_path / "a.txt"), r"a\.txt: recorded tracks are")
+    assert_fails(build_scenario(tmp_path / "a.txt"), r"a\.txt: recorded tracks are")
 
 
 def test_recordings_without_tracks_are_refused(tmp_path):
     drive = Drive()
     log = kitti_raw(drive, tmp_path / "kitti")
-    fails(scenario(log, scene="a"), "scene: applies to tables of nuScenes only")
+    assert_fails(build_scenario(log, scene="a"), "scene: applies to tables of nuScenes only")
     (log / "tracklet_labels.xml").unlink()
-    fails(scenario(log), rf"{log}: no frame has labeled objects", BadFileError)
+    assert_fails(build_scenario(log), rf"{log}: no frame has labeled objects", BadFileError)
     folder = plain_folder(drive, tmp_path / "folder")
     boxes = folder / "boxes" / "f1.csv"
     boxes.write_text(boxes.read_text().replace(",car,", ",,"))
-    fails(scenario(folder), rf"{folder}: an object of f1 has no id", BadFileError)
+    assert_fails(build_scenario(folder), rf"{folder}: an object of f1 has no id", BadFileError)
     (folder / "poses.csv").unlink()
-    fails(scenario(folder), rf"{folder}: the vehicle has no poses with times", BadFileError)
+    assert_fails(build_scenario(folder), rf"{folder}: the vehicle has no poses with times", BadFileError)
 
 
 def test_absent_egos_are_refused(tmp_path, table):
     path, keys = table
-    fails(scenario(path), "ego_id: the recording has no ego vehicle; name one of its tracks: 'a1', 'a2'")
-    fails(scenario(path, ego_id="a11"), "ego_id: there is no 'a11' in the recording; it has 'a1'")
-    fails(scenario(path, ego_id="a1", **keys), "ego_id and ego_trajectory exclude each other")
-    fails(scenario(path, ego_id="a1", ego_T_vehicle={"x_m": 1.0}), "ego_T_vehicle: only an ego vehicle without a box")
+    assert_fails(build_scenario(path), "ego_id: the recording has no ego vehicle; name one of its tracks: 'a1', 'a2'")
+    assert_fails(build_scenario(path, ego_id="a11"), "ego_id: there is no 'a11' in the recording; it has 'a1'")
+    assert_fails(build_scenario(path, ego_id="a1", **keys), "ego_id and ego_trajectory exclude each other")
+    assert_fails(
+        build_scenario(path, ego_id="a1", ego_T_vehicle={"x_m": 1.0}),
+        "ego_T_vehicle: only an ego vehicle without a box",
+    )
     log = write_argoverse2(tmp_path / "log")
-    fails(scenario(log, ego_id=7), "there is no '7' in the recording")
+    assert_fails(build_scenario(log, ego_id=7), "there is no '7' in the recording")
 
 
 def test_egos_that_leave_or_jump_are_refused(tmp_path, table):
     path, keys = table
-    fails(scenario(path, ego_id="a8", duration_s=4.0), r"'a8' and the others are known for 2\.8 s; begin_s 0 and")
-    assert scenario(path, ego_id="a8").num_time_steps == 29
-    fails(scenario(path, begin_s=9.0, **keys), "known for 4 s; begin_s 9 and duration_s 0 reach beyond")
+    assert_fails(
+        build_scenario(path, ego_id="a8", duration_s=4.0), r"'a8' and the others are known for 2\.8 s; begin_s 0 and"
+    )
+    assert build_scenario(path, ego_id="a8").num_time_steps == 29
+    assert_fails(build_scenario(path, begin_s=9.0, **keys), "known for 4 s; begin_s 9 and duration_s 0 reach beyond")
     whole = path.read_text()
     rewrite(path, lambda row: None if row[1] == "a1" and 1.3 < float(row[0]) < 2.9 else row)
-    fails(
-        scenario(path, ego_id="a1"), r"a gap of over 1 s \(max_gap_s\), or jumps. It is there from 0 to 1.2 s, 3 to 4 s"
+    assert_fails(
+        build_scenario(path, ego_id="a1"),
+        r"a gap of over 1 s \(max_gap_s\), or jumps. It is there from 0 to 1.2 s, 3 to 4 s",
     )
-    assert scenario(path, ego_id="a1", begin_s=3.0).num_time_steps == 11
+    assert build_scenario(path, ego_id="a1", begin_s=3.0).num_time_steps == 11
     path.write_text(whole)
     rewrite(path, lambda row: [*row[:3], "9999", *row[4:]] if row[:2] == ["2.0", "a1"] else row)
-    fails(scenario(path, ego_id="a1"), "or jumps. It is there from 0 to 1.8 s, 2 to 2 s, 2.2 to 4 s")
+    assert_fails(build_scenario(path, ego_id="a1"), "or jumps. It is there from 0 to 1.8 s, 2 to 2 s, 2.2 to 4 s")
 
 
 def test_egos_and_tracks_at_different_times_are_refused(table):
     path, keys = table
     path.write_text(re.sub(r"(?m)^(\d\.\d),", r"10\1,", path.read_text()))
-    fails(scenario(path, **keys), "the ego 'ego.csv' is there from 0 to 4 s, the others from 100 to 104 s")
+    assert_fails(build_scenario(path, **keys), "the ego 'ego.csv' is there from 0 to 4 s, the others from 100 to 104 s")
 
 
 @pytest.mark.parametrize(
@@ -114,7 +122,7 @@ def test_egos_and_tracks_at_different_times_are_refused(table):
 def test_invalid_box_tables_are_refused(table, old, new, message):
     path, keys = table
     with pytest.raises(BadFileError, match=message) as caught:
-        scenario(replaced(path, old, new), **keys).build_scene()
+        build_scenario(replace_text(path, old, new), **keys).build_scene()
     assert str(caught.value).startswith(str(path))
 
 
@@ -133,15 +141,15 @@ def test_invalid_box_tables_are_refused(table, old, new, message):
     ],
 )
 def test_invalid_commonroad_scenarios_are_refused(tmp_path, old, new, message):
-    path = replaced(write_commonroad(tmp_path / "a.xml"), old, new)
-    fails(scenario(path), rf"a\.xml: .*{message}", BadFileError)
+    path = replace_text(write_commonroad(tmp_path / "a.xml"), old, new)
+    assert_fails(build_scenario(path), rf"a\.xml: .*{message}", BadFileError)
 
 
 def test_commonroad_polygons_become_boxes(tmp_path):
     box = "<rectangle><length>4.5</length><width>1.8</width></rectangle>"
     corners = "".join(f"<point><x>{x}</x><y>{y}</y></point>" for x, y in ((0, -1), (4, -1), (4, 1), (0, 1)))
-    path = replaced(write_commonroad(tmp_path / "a.xml"), box, f"<polygon>{corners}</polygon>")
-    actor = scenario(path, ego_id=5, duration_s=0.4).build_scene().actors[0]
+    path = replace_text(write_commonroad(tmp_path / "a.xml"), box, f"<polygon>{corners}</polygon>")
+    actor = build_scenario(path, ego_id=5, duration_s=0.4).build_scene().actors[0]
     np.testing.assert_allclose(np.ptp(actor.mesh.vertices_m, axis=0)[:2], [4.0, 2.0])
     np.testing.assert_allclose(actor.trajectory.interpolate(0.0)[:2, 3], [1426.0, 2200.0])
 
@@ -171,7 +179,7 @@ RECTANGLE = "<rectangle><length>4.5</length><width>1.8</width>{}</rectangle>"
 def test_commonroad_shapes_have_centers_and_orientations(tmp_path, shapes, size_m, middle_m, turn_deg):
     path = write_commonroad(tmp_path / "a.xml")
     before = read_objects(path).tracks[0].trajectory
-    replaced(path, RECTANGLE.format(""), shapes)
+    replace_text(path, RECTANGLE.format(""), shapes)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         track = read_objects(path).tracks[0]
@@ -214,16 +222,16 @@ def test_invalid_nuscenes_tables_are_refused(tmp_path):
         ({"instance_token": "nobody"}, "no row has the token 'nobody'"),
     ):
         annotations.write_text(json.dumps([{**good[0], **change}, *good[1:]]))
-        fails(scenario(folder), message, BadFileError)
+        assert_fails(build_scenario(folder), message, BadFileError)
     annotations.write_text("[]")
-    assert len(scenario(folder).build_scene().actors) == 0
+    assert len(build_scenario(folder).build_scene().actors) == 0
     (folder / "ego_pose.json").write_text("[]")
-    fails(scenario(folder), "no ego_pose from the first sample", BadFileError)
+    assert_fails(build_scenario(folder), "no ego_pose from the first sample", BadFileError)
     (folder / "instance.json").unlink()
-    fails(scenario(folder), r"instance\.json: no such file", FileNotFoundError)
+    assert_fails(build_scenario(folder), r"instance\.json: no such file", FileNotFoundError)
 
 
-def feather(path, **columns):
+def write_feather(path, **columns):
     import pyarrow as pa
     from pyarrow import feather
 
@@ -245,30 +253,30 @@ def feather(path, **columns):
 )
 def test_invalid_argoverse_logs_are_refused(tmp_path, column, change, message):
     log = write_argoverse2(tmp_path)
-    feather(log / "annotations.feather", **{column: change})
-    fails(scenario(log), message, BadFileError)
+    write_feather(log / "annotations.feather", **{column: change})
+    assert_fails(build_scenario(log), message, BadFileError)
 
 
 def test_incomplete_logs_are_refused(tmp_path, monkeypatch):
     log = write_argoverse2(tmp_path, (*OTHERS, EGO._replace(category="ego_vehicle")))
     (log / "annotations.feather").rename(log / "annotations_with_ego.feather")
-    assert "ego" not in [actor.name for actor in scenario(log).build_scene().actors]
-    fails(scenario(log, scene="a"), "scene: applies to tables of nuScenes only")
-    lack_pyarrow(monkeypatch)
-    fails(scenario(log), r"annotations_with_ego.feather: .*pip install 'torchcover\[av2\]'", ImportError)
+    assert "ego" not in [actor.name for actor in build_scenario(log).build_scene().actors]
+    assert_fails(build_scenario(log, scene="a"), "scene: applies to tables of nuScenes only")
+    remove_pyarrow(monkeypatch)
+    assert_fails(build_scenario(log), r"annotations_with_ego.feather: .*pip install 'torchcover\[av2\]'", ImportError)
     monkeypatch.undo()
     (log / "city_SE3_egovehicle.feather").unlink()
-    fails(scenario(log), r"city_SE3_egovehicle\.feather: no such file", FileNotFoundError)
+    assert_fails(build_scenario(log), r"city_SE3_egovehicle\.feather: no such file", FileNotFoundError)
 
 
-def lack_pyarrow(monkeypatch):
+def remove_pyarrow(monkeypatch):
     """Run in the process that reads."""
     monkeypatch.setattr(isolated, "_processes", {})
     monkeypatch.setattr(isolated, "PROGRAM", f"import sys; sys.modules['pyarrow'] = None; {isolated.PROGRAM}")
 
 
 def test_missing_packages_are_reported_in_one_line(monkeypatch, capsys):
-    lack_pyarrow(monkeypatch)
+    remove_pyarrow(monkeypatch)
     monkeypatch.setattr(sys, "argv", ["torchcover", "evaluate", "front_roof_32", "--scenario", "tracks_argoverse2"])
     with pytest.raises(SystemExit) as ended:
         main()
@@ -283,9 +291,9 @@ def test_distant_ground_causes_a_hint(tmp_path, table):
     for height_m, hinted in ((29.0, False), (12.0, True)):
         plate.apply_translation([1400.0, 2200.0, height_m - plate.bounds[1][2]])
         plate.export(tmp_path / "ground.ply")
-        low = scenario(path, ground=str(tmp_path / "ground.ply"), **keys)
+        low = build_scenario(path, ground=str(tmp_path / "ground.ply"), **keys)
         if not hinted:
-            replaced(path, "category", "category")
+            replace_text(path, "category", "category")
         simulator = Simulator(low, {"rig": RIG}, FEW)
         if hinted:
             with pytest.warns(UserWarning, match="ground within 1 m below or above the wheels") as told:
@@ -296,7 +304,7 @@ def test_distant_ground_causes_a_hint(tmp_path, table):
                 for part in ("the ego had", "other moving actors had")
                 if part in str(warning.message)
             }
-    Simulator(scenario(path, **keys), {"rig": RIG}, FEW).check_run(8)
+    Simulator(build_scenario(path, **keys), {"rig": RIG}, FEW).check_run(8)
 
 
 def test_true_poses_above_a_plane_cause_the_hint(tmp_path):

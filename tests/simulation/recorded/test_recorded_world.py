@@ -37,7 +37,7 @@ LIDAR = {
 }
 
 
-def way(first_m, speed_mps, y_m):
+def build_trajectory_text(first_m, speed_mps, y_m):
     """Write a trajectory along x, on the slope."""
     rows = [
         (t, first_m + speed_mps * t, y_m, np.tan(np.deg2rad(1.0)) * (first_m + speed_mps * t)) for t in (0, SECONDS)
@@ -49,8 +49,8 @@ def way(first_m, speed_mps, y_m):
 def drive(tmp_path_factory):
     folder = tmp_path_factory.mktemp("street")
     (folder / "street.yaml").write_text(SCENARIO)
-    (folder / "ego.csv").write_text(way(-12.0, SPEED_MPS, 0.0))
-    (folder / "car.csv").write_text(way(16.0, CAR_MPS, 4.0))
+    (folder / "ego.csv").write_text(build_trajectory_text(-12.0, SPEED_MPS, 0.0))
+    (folder / "car.csv").write_text(build_trajectory_text(16.0, CAR_MPS, 4.0))
     frames = SimulatedFrames(
         Scenario.load(folder / "street.yaml"),
         Rig(name="one", sensors=[LIDAR]),
@@ -125,12 +125,15 @@ def test_cell_mesh_is_closed_with_correct_volume():
     edges = np.concatenate([mesh.faces[:, [one, (one + 1) % 3]] for one in range(3)])
     np.testing.assert_array_equal(np.unique(edges, axis=0), np.unique(edges[:, ::-1], axis=0))
 
-    def area_and_volume(vertices, faces):
+    def compute_area_and_volume(vertices, faces):
         a, b, c = vertices[faces].transpose(1, 0, 2)
         crossed = np.cross(b - a, c - a)
         return np.linalg.norm(crossed, axis=1).sum() / 2, (a * crossed).sum() / 6
 
-    own, whole = area_and_volume(mesh.vertices_m / CELL_M, mesh.faces), area_and_volume(block.vertices_m, block.faces)
+    own, whole = (
+        compute_area_and_volume(mesh.vertices_m / CELL_M, mesh.faces),
+        compute_area_and_volume(block.vertices_m, block.faces),
+    )
     np.testing.assert_allclose(own, whole)  # the volume is positive if faces point outwards
 
 
