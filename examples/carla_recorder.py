@@ -1,14 +1,14 @@
 """Record a drive in a running CARLA with a random reference LiDAR: `python examples/carla_recorder.py out/town`.
 
-Needs CARLA's server (0.9.12 or later) and its Python package `carla`; traffic is yours to add, as with CARLA's own
-`generate_traffic.py`. Then: `torchcover evaluate --frames out/town`. No server was at hand when this was written: it is
-tested against a small imitation of the package, which does what CARLA's documentation says.
+Needs a CARLA server (0.9.12 or later) and its Python package `carla`. Traffic can be added with CARLA's own
+`generate_traffic.py`. Evaluate the recording with `torchcover evaluate --frames out/town`. The example was tested with
+an imitation of the package, not with a server.
 
-The simulation is synchronous, and every LiDAR makes a whole turn in a tick. The reference is the paper's: in each frame
-another LiDAR, at a random pose in the shell around the vehicle, that looks down from its horizon.
+The simulation is synchronous, and every LiDAR makes one revolution per tick. The reference is that of the paper: in
+each frame a new LiDAR at a random pose in the shell around the vehicle, with channels below its horizon.
 
-`--sensors FILE` takes a list as agents of CARLA's leaderboard return it from `sensors()`: id, type, x, y, z, roll,
-pitch, yaw, and attributes of the blueprint. LiDARs and depth cameras are recorded. Written are `sensors.json`,
+`--sensors FILE` reads a list as returned by `sensors()` of agents of the CARLA leaderboard: id, type, x, y, z, roll,
+pitch, yaw, and attributes of the blueprint. LiDARs and depth cameras are recorded. Output files are `sensors.json`,
 `vehicle.json`, `ID/FRAME.npy` or `.png`, `reference/poses.csv`, `boxes/FRAME.csv` and `poses.csv`.
 """
 
@@ -34,70 +34,71 @@ from torchcover.recordings.formats.carla import (
 )
 from torchcover.simulation import PaperReference
 
-LOOKS = {"front": 0.0, "right": 90.0, "rear": 180.0, "left": 270.0}
+YAWS_DEG = {"front": 0.0, "right": 90.0, "rear": 180.0, "left": 270.0}
 SENSORS = [
     {"id": "roof", "type": LIDAR_TYPES[0], "z": 1.9, "channels": 64, "range": 120.0}
     | {"upper_fov": 10.0, "lower_fov": -30.0, "points_per_second": 1_500_000},
     *(
         {"id": name, "type": DEPTH_TYPE, "z": 1.9, "yaw": yaw, "image_size_x": 800, "image_size_y": 600, "fov": 90.0}
-        for name, yaw in LOOKS.items()
+        for name, yaw in YAWS_DEG.items()
     ),
 ]
-# Nothing is dropped and nothing is noisy.
+# No noise and no drop-out.
 EXACT = {"noise_stddev": 0.0, "dropoff_general_rate": 0.0, "dropoff_zero_intensity": 0.0}
-# What an agent's list calls them, and a blueprint.
+# Keys of the sensor list and attributes of the blueprint.
 ATTRIBUTES = {"width": "image_size_x", "height": "image_size_y"}
-OBJECTS, OBJECTS_WITHIN_M = ("vehicle.*", "walker.pedestrian.*"), 150.0
+OBJECT_FILTERS = ("vehicle.*", "walker.pedestrian.*")
+MAX_OBJECT_DISTANCE_M = 150.0
 WAIT_S = 30.0
 
 
 class Sensor:
-    """A sensor on the vehicle, and what it has sent."""
+    """Sensor on the vehicle with a queue of its measurements."""
 
-    def __init__(self, world, vehicle, listed):
-        blueprint = world.get_blueprint_library().find(listed["type"])
-        for name, value in listed.items():
+    def __init__(self, world, vehicle, entry):
+        blueprint = world.get_blueprint_library().find(entry["type"])
+        for name, value in entry.items():
             if name not in ("id", "type", *POSE_COLUMNS):
                 blueprint.set_attribute(ATTRIBUTES.get(name, name), str(value))
-        self.name = listed["id"]
-        self._sent = queue.Queue()
-        pose = placed([listed.get(name, 0.0) for name in POSE_COLUMNS])
+        self.name = entry["id"]
+        self._measurements = queue.Queue()
+        pose = build_transform([entry.get(name, 0.0) for name in POSE_COLUMNS])
         self._actor = world.spawn_actor(blueprint, pose, attach_to=vehicle)
-        self._actor.listen(self._sent.put)
+        self._actor.listen(self._measurements.put)
 
-    def data(self, frame):
-        """What it measured in a tick; what it sent before is forgotten."""
+    def get_measurement(self, frame):
+        """Wait for the measurement of a tick; earlier ones are discarded."""
         while True:
             try:
-                measured = self._sent.get(timeout=WAIT_S)
+                measurement = self._measurements.get(timeout=WAIT_S)
             except queue.Empty:
                 raise SystemExit(f"{self.name} sent nothing for tick {frame} within {WAIT_S:g} s") from None
-            if measured.frame == frame:
-                return measured
+            if measurement.frame == frame:
+                return measurement
 
     def remove(self):
-        """Take it off the vehicle."""
+        """Remove the sensor from the simulation."""
         self._actor.stop()
         self._actor.destroy()
 
 
 class Folder:
-    """The recording on disk; the row of a frame in `poses.csv` comes last."""
+    """Folder of the recording; the row of a frame in `poses.csv` is written last."""
 
-    def __init__(self, path, listed, vehicle):
+    def __init__(self, path, entries, vehicle):
         self.path = path
-        for one in [*listed, {"id": REFERENCE}, {"id": "boxes"}]:
-            (path / one["id"]).mkdir(parents=True)
+        for name in [*(entry["id"] for entry in entries), REFERENCE, "boxes"]:
+            (path / name).mkdir(parents=True)
         reference = {"id": REFERENCE, "type": LIDAR_TYPES[0]}
-        (path / "sensors.json").write_text(json.dumps([*listed, reference], indent=1))
+        (path / "sensors.json").write_text(json.dumps([*entries, reference], indent=1))
         (path / "vehicle.json").write_text(vehicle.model_dump_json())
         self._append(path / "poses.csv", ["frame", "time_s", *POSE_COLUMNS])
         self._append(path / REFERENCE / "poses.csv", ["frame", *POSE_COLUMNS])
 
-    def write(self, name, measured, reference_pose, objects, vehicle_row):
+    def write(self, name, measurements, reference_pose, objects, vehicle_row):
         """Write a frame."""
-        for sensor, data in measured.items():
-            save(self.path / sensor / name, data)
+        for sensor, measurement in measurements.items():
+            save_measurement(self.path / sensor / name, measurement)
         self._append(self.path / REFERENCE / "poses.csv", [name, *reference_pose])
         for row in [["id", "category", *POSE_COLUMNS, *EXTENT_COLUMNS, *VELOCITY_COLUMNS], *objects]:
             self._append(self.path / "boxes" / f"{name}.csv", row)
@@ -108,60 +109,64 @@ class Folder:
             csv.writer(file).writerow(row)
 
 
-def save(path, measured):
-    """A cloud, x y z intensity, or the red, green and blue of a depth image; both in CARLA's axes."""
-    if hasattr(measured, "height"):
-        bgra = np.frombuffer(measured.raw_data, np.uint8).reshape(measured.height, measured.width, 4)
+def save_measurement(path, measurement):
+    """Save a point cloud (x, y, z, intensity) or the RGB values of a depth image, in CARLA's axes."""
+    if hasattr(measurement, "height"):
+        bgra = np.frombuffer(measurement.raw_data, np.uint8).reshape(measurement.height, measurement.width, 4)
         Image.fromarray(np.ascontiguousarray(bgra[..., 2::-1])).save(path.with_suffix(".png"))
     else:
-        np.save(path.with_suffix(".npy"), np.frombuffer(measured.raw_data, np.float32).reshape(-1, 4))
+        np.save(path.with_suffix(".npy"), np.frombuffer(measurement.raw_data, np.float32).reshape(-1, 4))
 
 
-def placed(pose):
-    """`carla.Transform` of x, y, z, roll, pitch, yaw."""
+def build_transform(pose):
+    """Build the `carla.Transform` of x, y, z, roll, pitch, yaw."""
     x, y, z, roll, pitch, yaw = map(float, pose)
     return carla.Transform(carla.Location(x=x, y=y, z=z), carla.Rotation(roll=roll, pitch=pitch, yaw=yaw))
 
 
-def pose_of(transform):
-    """x, y, z, roll, pitch, yaw of a `carla.Transform`."""
-    place, turn = transform.location, transform.rotation
-    return [place.x, place.y, place.z, turn.roll, turn.pitch, turn.yaw]
+def get_pose(transform):
+    """Get x, y, z, roll, pitch, yaw of a `carla.Transform`."""
+    location, rotation = transform.location, transform.rotation
+    return [location.x, location.y, location.z, rotation.roll, rotation.pitch, rotation.yaw]
 
 
-def random_pose(vehicle, generator):
-    """x, y, z, roll, pitch, yaw of the paper's reference sensor on the actor, in CARLA's axes."""
-    drawn = PaperReference().sample_pose(vehicle.ego_box, generator)
-    actor_T_reference = invert(vehicle.vehicle_T_actor) @ drawn
+def sample_reference_pose(vehicle, generator):
+    """Sample x, y, z, roll, pitch, yaw of the paper's reference sensor relative to the actor, in CARLA's axes."""
+    vehicle_T_reference = PaperReference().sample_pose(vehicle.ego_box, generator)
+    actor_T_reference = invert(vehicle.vehicle_T_actor) @ vehicle_T_reference
     yaw, pitch, roll = convert_rotation_to_euler(actor_T_reference[:3, :3])
     x, y, z = actor_T_reference[:3, 3]
-    return [float(number) for number in (x, -y, z, roll, -pitch, -yaw)]
+    return [float(value) for value in (x, -y, z, roll, -pitch, -yaw)]
 
 
-def objects_in(world, ego):
-    """Rows of the vehicles and walkers around, as the reader has them."""
+def build_object_rows(world, ego):
+    """Build the rows of `boxes/FRAME.csv` for the vehicles and pedestrians around the ego vehicle."""
     rows = []
-    here = ego.get_transform().location
-    for actor in (actor for kind in OBJECTS for actor in world.get_actors().filter(kind)):
-        box, pose, speed = actor.bounding_box, actor.get_transform(), actor.get_velocity()
-        half = [box.extent.x, box.extent.y, box.extent.z]
-        near = np.hypot(pose.location.x - here.x, pose.location.y - here.y) < OBJECTS_WITHIN_M
-        if actor.id == ego.id or not near or min(half) <= 0:  # two-wheelers of old versions have boxes without size
+    ego_location = ego.get_transform().location
+    actors = [actor for pattern in OBJECT_FILTERS for actor in world.get_actors().filter(pattern)]
+    for actor in actors:
+        box, transform, velocity = actor.bounding_box, actor.get_transform(), actor.get_velocity()
+        extent = [box.extent.x, box.extent.y, box.extent.z]
+        distance_m = np.hypot(transform.location.x - ego_location.x, transform.location.y - ego_location.y)
+        is_near = distance_m < MAX_OBJECT_DISTANCE_M
+        if actor.id == ego.id or not is_near or min(extent) <= 0:  # old versions give two-wheelers empty boxes
             continue
-        centre = np.array(pose.get_matrix()) @ [box.location.x, box.location.y, box.location.z, 1.0]
-        rows.append([actor.id, actor.type_id, *centre[:3], *pose_of(pose)[3:], *half, speed.x, speed.y])
+        center = np.array(transform.get_matrix()) @ [box.location.x, box.location.y, box.location.z, 1.0]
+        angles = get_pose(transform)[3:]
+        rows.append([actor.id, actor.type_id, *center[:3], *angles, *extent, velocity.x, velocity.y])
     return rows
 
 
-def record(client, options, listed):
-    """Drive, and write what the sensors see."""
+def record(client, options, entries):
+    """Drive with autopilot and write the measurements of the sensors."""
     world = client.get_world()
     traffic = client.get_trafficmanager()
-    before, settings = world.get_settings(), world.get_settings()
+    original_settings, settings = world.get_settings(), world.get_settings()
     settings.synchronous_mode, settings.fixed_delta_seconds = True, options.tick_s
     generator = np.random.default_rng(options.seed)
-    listed = [at_each_tick(one, options.tick_s) for one in listed if one["type"] in (*LIDAR_TYPES, DEPTH_TYPE)]
-    best_case = {
+    supported = [entry for entry in entries if entry["type"] in (*LIDAR_TYPES, DEPTH_TYPE)]
+    entries = [set_rotation_frequency(entry, options.tick_s) for entry in supported]
+    reference_attributes = {
         "type": LIDAR_TYPES[0],
         "channels": options.num_rays,
         "upper_fov": 0.0,
@@ -169,57 +174,57 @@ def record(client, options, listed):
         "range": 250.0,
         **EXACT,
     }
-    best_case["points_per_second"] = round(options.num_rays**2 / options.tick_s)
+    reference_attributes["points_per_second"] = round(options.num_rays**2 / options.tick_s)
     ego, sensors = None, []
     try:
         world.apply_settings(settings)
         traffic.set_synchronous_mode(True)
         blueprint = world.get_blueprint_library().find(options.vehicle)
-        places = world.get_map().get_spawn_points()
-        ego = world.spawn_actor(blueprint, places[generator.integers(len(places))])
+        spawn_points = world.get_map().get_spawn_points()
+        ego = world.spawn_actor(blueprint, spawn_points[generator.integers(len(spawn_points))])
         ego.set_autopilot(True, traffic.get_port())
         box = ego.bounding_box
-        point = {"x": box.location.x, "y": box.location.y, "z": box.location.z}
-        half = {"x": box.extent.x, "y": box.extent.y, "z": box.extent.z}
-        vehicle = CarlaVehicle.model_validate({"location": point, "extent": half})
-        folder = Folder(options.out, listed, vehicle)
-        sensors += [Sensor(world, ego, one) for one in listed]
-        for number in range(options.frames):
-            # Another sensor every time: where a new one is attached counts from the vehicle in every version.
-            pose = random_pose(vehicle, generator)
-            reference = {"id": REFERENCE, **dict(zip(POSE_COLUMNS, pose, strict=True)), **best_case}
-            sensors.append(Sensor(world, ego, at_each_tick(reference, options.tick_s)))
+        location = {"x": box.location.x, "y": box.location.y, "z": box.location.z}
+        extent = {"x": box.extent.x, "y": box.extent.y, "z": box.extent.z}
+        vehicle = CarlaVehicle.model_validate({"location": location, "extent": extent})
+        folder = Folder(options.out, entries, vehicle)
+        sensors += [Sensor(world, ego, entry) for entry in entries]
+        for index in range(options.frames):
+            # A new sensor per frame: the pose of a new sensor is relative to the vehicle in every version of CARLA.
+            pose = sample_reference_pose(vehicle, generator)
+            reference = {"id": REFERENCE, **dict(zip(POSE_COLUMNS, pose, strict=True)), **reference_attributes}
+            sensors.append(Sensor(world, ego, set_rotation_frequency(reference, options.tick_s)))
             for _ in range(options.every):
                 tick = world.tick()
-            measured = {sensor.name: sensor.data(tick) for sensor in sensors}
+            measurements = {sensor.name: sensor.get_measurement(tick) for sensor in sensors}
             time_s = world.get_snapshot().timestamp.elapsed_seconds
-            driven = [time_s, *pose_of(ego.get_transform())]
-            folder.write(f"{number:06d}", measured, pose, objects_in(world, ego), driven)
+            vehicle_row = [time_s, *get_pose(ego.get_transform())]
+            folder.write(f"{index:06d}", measurements, pose, build_object_rows(world, ego), vehicle_row)
             sensors.pop().remove()
-            print(f"{number + 1} of {options.frames}", end="\r", flush=True)
+            print(f"{index + 1} of {options.frames}", end="\r", flush=True)
     finally:
         for sensor in sensors:
             sensor.remove()
         if ego is not None:
             ego.destroy()
         traffic.set_synchronous_mode(False)
-        world.apply_settings(before)
+        world.apply_settings(original_settings)
 
 
-def at_each_tick(listed, tick_s):
-    """A LiDAR that makes a whole turn in a tick."""
-    return {**listed, "rotation_frequency": 1 / tick_s} if listed["type"] in LIDAR_TYPES else listed
+def set_rotation_frequency(entry, tick_s):
+    """Set the rotation frequency of a LiDAR to one revolution per tick; other sensors are unchanged."""
+    return {**entry, "rotation_frequency": 1 / tick_s} if entry["type"] in LIDAR_TYPES else entry
 
 
 def main(arguments=None):
-    """Connect and record."""
+    """Connect to the server and record."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path, help="a new folder")
-    parser.add_argument("--sensors", type=Path, help="JSON; a LiDAR and four depth cameras on the roof if not given")
+    parser.add_argument("--sensors", type=Path, help="JSON list; default: a LiDAR and four depth cameras on the roof")
     parser.add_argument("--frames", type=int, default=100)
-    parser.add_argument("--every", type=int, default=20, help="ticks from a frame to the next, at least 2")
+    parser.add_argument("--every", type=int, default=20, help="ticks between frames, at least 2")
     parser.add_argument("--tick-s", type=float, default=0.05)
-    parser.add_argument("--num-rays", type=int, default=1024, help="rows, and columns, of the reference LiDAR")
+    parser.add_argument("--num-rays", type=int, default=1024, help="channels and columns of the reference LiDAR")
     parser.add_argument("--vehicle", default="vehicle.tesla.model3")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--host", default="localhost")
@@ -228,11 +233,11 @@ def main(arguments=None):
     if options.every < 2:  # a new sensor may miss its first tick
         parser.error(f"--every: at least 2 ticks are needed; got {options.every}")
     if options.out.exists():
-        parser.error(f"{options.out} is there already; a new folder is needed")
+        parser.error(f"{options.out} exists; choose a new folder")
     client = carla.Client(options.host, options.port)
     client.set_timeout(WAIT_S)
     record(client, options, json.loads(options.sensors.read_text()) if options.sensors else SENSORS)
-    print(f"Wrote {options.frames} frames; read them with: torchcover evaluate --frames {options.out}")
+    print(f"Wrote {options.frames} frames; evaluate them: torchcover evaluate --frames {options.out}")
 
 
 if __name__ == "__main__":
