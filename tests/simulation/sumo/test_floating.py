@@ -96,7 +96,7 @@ def test_standing_vehicles_near_the_origin_are_accepted():
     [
         (fcd({0.0: [vehicle("a", 0, 0, angle=None)]}), "t = 0 s: a vehicle or person without angle; id, x, y"),
         (fcd({0.0: [], 0.2: [], 0.1: []}), r"must ascend; 0.1 s follows 0.2 s"),
-        (fcd({0.0: [vehicle("a", 0, 0)], 0.2: [vehicle("a", 0, 0), vehicle("a", 9, 9)]}), "'a' is there twice at t = "),
+        (fcd({0.0: [vehicle("a", 0, 0)], 0.2: [vehicle("a", 0, 0), vehicle("a", 9, 9)]}), "'a' appears twice at t = "),
         (fcd({0.0: [vehicle("a", "nan", 0)]}), "1 of 1 positions are NaN or infinite"),
         (fcd({0.0: [vehicle("a", "east", 0)]}), "east"),
         (

@@ -207,7 +207,7 @@ def test_cars_park_only_in_bays(tmp_path):
     ("options", "message"),
     [
         ({"ego_id": "nobody"}, "ego_id: no vehicle 'nobody' up to t = 4 s, where the data end"),
-        ({"ego_id": "ego", "duration_s": 9.0}, r"ego_id: 'ego' is not there all the time from t = 0 to 9 s"),
+        ({"ego_id": "ego", "duration_s": 9.0}, r"ego_id: 'ego' is not present from t = 0 to 9 s"),
         (
             {"ego_id": "ego", "steps": together({t: row for t, row in drive().items() if not 1.1 < t < 2.1})},
             r"it leaves the network, teleports or has a gap after t = 1 s; shorten duration_s to 1",
@@ -219,9 +219,9 @@ def test_cars_park_only_in_bays(tmp_path):
             },
             r"teleports or has a gap after t = 2 s",
         ),
-        ({"duration_s": 9.0}, r"no car that could be the ego .* the longest drives for 4 s \(data end at t = 4 s\)"),
-        ({"ego_type": "bus"}, "no vehicle of type 'bus' that could be the ego"),
-        ({"begin_s": 3.0}, "no car that could be the ego"),
+        ({"duration_s": 9.0}, r"no car for the ego vehicle .* the longest of . drives for 4 s \(data end at t = 4 s\)"),
+        ({"ego_type": "bus"}, "no vehicle of type 'bus' for the ego vehicle"),
+        ({"begin_s": 3.0}, "no car for the ego vehicle"),
         (
             {"ego_id": "ego", "begin_s": 2.0, "duration_s": 2.0, "steps": together(drive(start=335.0, speed=30.0))},
             r"the ego vehicle is farther than 10 m from all streets of the network at t = 2\.6 s: it leaves them",

@@ -254,7 +254,7 @@ def test_impossible_parameters_are_rejected(model, options):
 
 def test_missing_bodies_are_named(bodies):
     few = {kind: mesh for kind, mesh in bodies.items() if kind not in ("bus", "adult")}
-    with pytest.raises(ValueError, match="none for adult, bus"):
+    with pytest.raises(ValueError, match="no body for adult, bus"):
         UrbanTraffic().build_scene(0, bodies=few)
 
 

@@ -138,9 +138,9 @@ def _find_ego(users: Sequence[RoadUser], data: FloatingCarData, ego_id: str, dur
     present_s = float(tracks[0].track.times_s[-1])
     end_s = data.begin_s + present_s
     raise ValueError(
-        f"ego_id: {ego_id!r} is not there all the time {_format_window(data, duration_s)}: it leaves the network, "
-        f"teleports or has a gap after t = {end_s:g} s; shorten duration_s to {max(end_s - data.begin_s, 0.0):g}, or "
-        "take another ego"
+        f"ego_id: {ego_id!r} is not present {_format_window(data, duration_s)}: it leaves the network, teleports or "
+        f"has a gap after t = {end_s:g} s; shorten duration_s to {max(end_s - data.begin_s, 0.0):g}, or choose another ego "
+        "vehicle"
     )
 
 
@@ -162,8 +162,8 @@ def _sample_ego(
         longest_s = max((float(np.ptp(user.track.times_s)) for user in vehicles), default=0.0)
         description = "car" if ego_type is None else f"vehicle of type {ego_type!r}"
         raise ValueError(
-            f"no {description} that could be the ego is there all the time {_format_window(data, duration_s)}: of "
-            f"{len(vehicles)}, the longest drives for {longest_s:g} s (data end at t = {data.last_time_s:g} s); change "
+            f"no {description} for the ego vehicle is present {_format_window(data, duration_s)}: the longest of "
+            f"{len(vehicles)} drives for {longest_s:g} s (data end at t = {data.last_time_s:g} s); change "
             "duration_s or begin_s"
         )
     weights = []

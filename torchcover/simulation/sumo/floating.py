@@ -110,7 +110,7 @@ class FloatingCarDataParser:
             self.end_time_step()
             time_s = float(attributes[attributes.index("time") + 1])
             if time_s <= self.last_s:
-                raise ValueError(f"the times of its steps must ascend; {time_s:g} s follows {self.last_s:g} s")
+                raise ValueError(f"times of <timestep> must ascend; {time_s:g} s follows {self.last_s:g} s")
             if time_s > self._end_s + TIME_SLACK_S:
                 raise _WindowEndError
             self.last_s = time_s
@@ -293,7 +293,7 @@ def _iterate_tracks(parser: FloatingCarDataParser) -> Iterator[SumoTrack]:
         steps_m = np.linalg.norm(np.diff(rows[selection, :2], axis=0), axis=1)
         if (steps_s <= 0).any():
             time_s = parser.begin_s + track_times_s[steps_s.argmin()]
-            raise ValueError(f"{name!r} is there twice at t = {time_s:g} s")
+            raise ValueError(f"{name!r} appears twice at t = {time_s:g} s")
         is_gap = steps_s > max_missing_steps * median_step_s + TIME_SLACK_S
         breaks = np.flatnonzero(is_gap | (steps_m > max_speed_mps * steps_s)) + 1
         for first, end in pairwise([0, *breaks.tolist(), len(selection)]):

@@ -125,7 +125,7 @@ class Fleet:
     def __init__(self, body_meshes: Mapping[str, Mesh], ego_mesh: Mesh | None, generator: np.random.Generator) -> None:
         missing = sorted(CATEGORIES.keys() - body_meshes.keys())
         if missing:
-            raise ValueError(f"traffic needs a body for each kind; there is none for {', '.join(missing)}")
+            raise ValueError(f"no body for {', '.join(missing)}; traffic needs a mesh for each kind")
         self.meshes = {EGO: body_meshes["suv"] if ego_mesh is None else ego_mesh}
         self.meshes |= {kind: body_meshes[kind] for kind in CATEGORIES}
         self._sizes_m = {kind: BoundingBox.from_points(mesh.vertices_m).size_m for kind, mesh in self.meshes.items()}

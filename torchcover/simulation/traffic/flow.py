@@ -273,7 +273,7 @@ def check_traffic_memory(num_agents: float, num_frames: int) -> None:
     check_memory_fits(
         f"traffic of about {num_agents:,.0f} for {num_frames:,} time steps",
         bytes_per_state * num_agents * num_frames,
-        "shorten the duration, or let there be fewer to a kilometer",
+        "shorten the duration, or lower the density of the traffic",
     )
 
 
