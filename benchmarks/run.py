@@ -32,7 +32,7 @@ WATCHED = {
     "torchcover.neighbors.query:_search_nearest": SEARCH,
     "torchcover.coverage.sums:CoverageSums.compute_sums": SUMS,
     "torchcover.coverage.sums:CoverageSums.add_sums": SUMS,
-    "torchcover.targets.probing:NearFieldObserver.compute_sums": BODIES,
+    "torchcover.targets.near_field:NearFieldObserver.compute_sums": BODIES,
     "torchcover.report.maps:plot_side_by_side": MAPS,
     "torchcover.files.atomic:AtomicOutput.add_figure": MAPS,
     "torchcover.evaluation.result:Result.save": FILES,

@@ -10,7 +10,7 @@ from torchcover.simulation.scene import SceneGeometry
 from torchcover.targets.placing import Raster, compute_ground_heights_m
 from torchcover.targets.result import FREE, OUTSIDE
 from torchcover.targets.surface import Target
-from torchcover.targets.survey import measure_target_visibility
+from torchcover.targets.visibility import measure_target_visibility
 
 EGO = {"shape": {"type": "box", "size_m": [4, 2, 1.5]}}
 FLOOR = {"name": "floor", "shape": {"type": "plane", "size_m": [60, 60]}, "ground": True}

@@ -390,12 +390,12 @@ class EncounterPointCounter:
         """Compute the ray ends without the road user: all rays of a sensor with beams, else only those with hits."""
         mounted_sensor = self._mounted_sensors[sensor_index]
         # Moving bodies are not needed: the maximum ranges consider the ego vehicle.
-        instant = self._scene.get_snapshot(frame_index, max_distance_m=-math.inf)
+        snapshot = self._scene.get_snapshot(frame_index, max_distance_m=-math.inf)
         if self._rig.beams[sensor_index] is not None:
-            return mounted_sensor.compute_ray_ends(instant)
+            return mounted_sensor.compute_ray_ends(snapshot)
         origin_m = mounted_sensor.vehicle_T_sensor[:3, 3]
         points_m = (origin_m + hits.directions * hits.ranges_m[:, None]).astype(np.float32)
-        is_visible = compute_visibility(instant, origin_m, points_m).is_visible
+        is_visible = compute_visibility(snapshot, origin_m, points_m).is_visible
         range_m = np.full(num_rays, np.inf, dtype=np.float32)
         range_m[hits.ray_indices[~is_visible]] = 0.0
         return RayEnds(range_m, np.zeros(num_rays, dtype=bool))

@@ -44,7 +44,7 @@ from torchcover.simulation.documents import (
 )
 from torchcover.simulation.kinds import SENSORS
 from torchcover.targets import TARGETS
-from torchcover.targets.survey import DETECTION_POINTS, THRESHOLD_M
+from torchcover.targets.visibility import DETECTION_POINTS, THRESHOLD_M
 
 Names = Annotated[tuple[str, ...], SEVERAL]
 

@@ -25,7 +25,7 @@ from torchcover.simulation.camera_sensor import CameraSensor
 from torchcover.simulation.moving import BodyGeometry
 from torchcover.targets import Target, measure_visibility_at_positions
 from torchcover.targets.result import PositionVisibility
-from torchcover.targets.survey import THRESHOLD_M
+from torchcover.targets.visibility import THRESHOLD_M
 
 SensorModel: TypeAlias = Literal["ideal", "real"] | None
 

@@ -1,7 +1,7 @@
+from .near_field import NearFieldObserver as NearFieldObserver
 from .placing import SIDES as SIDES
 from .placing import Heading as Heading
 from .placing import Raster as Raster
-from .probing import NearFieldObserver as NearFieldObserver
 from .result import STATES as STATES
 from .result import PositionVisibility as PositionVisibility
 from .result import SideShare as SideShare
@@ -9,7 +9,7 @@ from .result import TargetMap as TargetMap
 from .result import TargetPosition as TargetPosition
 from .surface import TARGETS as TARGETS
 from .surface import Target as Target
-from .survey import measure_target_visibility as measure_target_visibility
-from .survey import measure_visibility_at_positions as measure_visibility_at_positions
+from .visibility import measure_target_visibility as measure_target_visibility
+from .visibility import measure_visibility_at_positions as measure_visibility_at_positions
 from .writing import write_arrays as write_arrays
 from .writing import write_csv as write_csv

@@ -11,7 +11,7 @@ from torchcover.geometry.arrays import Bools, Float64, Int64
 from torchcover.simulation.instant import SceneSnapshot
 
 SIDES = ("front", "rear", "left", "right")
-# "narrow" turns the narrower side of the target's box to the vehicle, "wide" the wider one; a number is a yaw in deg.
+# "narrow" turns the narrower side of a target's box to the vehicle, "wide" the wider one; numbers are yaws in degrees.
 Heading = Literal["narrow", "wide"] | float
 
 # Default side of a cell: less than half of the width of a person.
@@ -232,14 +232,14 @@ def set_pose_heights(vehicle_T_target: Float64, z_m: Float64) -> Float64:
     return poses
 
 
-def compute_ground_heights_m(instant: SceneSnapshot, positions_m: Float64) -> Float64:
+def compute_ground_heights_m(snapshot: SceneSnapshot, positions_m: Float64) -> Float64:
     """Compute the height of the ground at positions around the vehicle.
 
     Where several road levels lie above each other, the level is used that can be reached on foot from the vehicle: the
     highest that is at most 1 m plus 15 % of the distance above the plane of the vehicle.
 
     Args:
-        instant: Scene at one time.
+        snapshot: Scene at one time.
         positions_m: (P, 2) positions in the vehicle frame.
 
     Returns:
@@ -249,7 +249,7 @@ def compute_ground_heights_m(instant: SceneSnapshot, positions_m: Float64) -> Fl
     z_m = 1.0 + 0.15 * distance_m
     # The vertical axes of the world and of the vehicle differ: the second iteration starts where the first one ended.
     for _ in range(2):
-        z_m = z_m - instant.compute_heights_m(np.column_stack([positions_m, z_m]))
+        z_m = z_m - snapshot.compute_heights_m(np.column_stack([positions_m, z_m]))
     return np.where(np.abs(z_m) < 1e-3, 0.0, z_m)  # rounding is no slope
 
 
@@ -269,7 +269,7 @@ def is_point_inside(box: BoundingBox, vehicle_T_target: Float64, point_m: Float6
 
 
 def is_blocked(
-    instant: SceneSnapshot,
+    snapshot: SceneSnapshot,
     box: BoundingBox,
     surface_points_m: Float64,
     vehicle_T_target: Float64,
@@ -281,7 +281,7 @@ def is_blocked(
     between its center and a point of its surface, or if its center is inside one of them.
 
     Args:
-        instant: Scene at one time, without the target.
+        snapshot: Scene at one time, without the target.
         box: Bounding box of the target in its own frame.
         surface_points_m: (M, 3) points of the target's surface in its own frame.
         vehicle_T_target: (P, 4, 4) poses of the target.
@@ -290,11 +290,11 @@ def is_blocked(
     Returns:
         (P,) True where the target has no room.
     """
-    is_occupied = find_static_collisions(instant, box, surface_points_m, vehicle_T_target, params)
-    moving = instant.moving_bodies
+    is_occupied = find_static_collisions(snapshot, box, surface_points_m, vehicle_T_target, params)
+    moving = snapshot.moving_bodies
     radius_m = float(np.linalg.norm(box.corners_m, axis=1).max())
     distance_m = np.linalg.norm(vehicle_T_target[:, None, :3, 3] - moving.center_m, axis=2)
-    is_near = (distance_m <= moving.radius_m + radius_m) & (moving.body_indices != instant.ego_index)
+    is_near = (distance_m <= moving.radius_m + radius_m) & (moving.body_indices != snapshot.ego_index)
     for index in np.flatnonzero(is_near.any(axis=0)).tolist():
         nearby = is_near[:, index]
         is_occupied[nearby] |= find_overlaps(box, vehicle_T_target[nearby], moving.box_corners_m[index])
@@ -302,7 +302,7 @@ def is_blocked(
 
 
 def find_static_collisions(
-    instant: SceneSnapshot,
+    snapshot: SceneSnapshot,
     box: BoundingBox,
     surface_points_m: Float64,
     vehicle_T_target: Float64,
@@ -314,24 +314,24 @@ def find_static_collisions(
     ends_m = np.column_stack([surface_points_m[:, :2], np.maximum(surface_points_m[:, 2], min_height_m)])
     rays_m = (ends_m - center_m) * (1 - params.contact_share)
     rays_m = rays_m[np.linalg.norm(rays_m, axis=1) > 0]
-    static_T_target = instant.static_T_vehicle @ vehicle_T_target
+    static_T_target = snapshot.static_T_vehicle @ vehicle_T_target
     centers_m = static_T_target[:, :3, :3] @ center_m + static_T_target[:, :3, 3]
     static_rays_m = np.einsum("pij,mj->pmi", static_T_target[:, :3, :3], rays_m).reshape(-1, 3)
     length_m = np.tile(np.linalg.norm(rays_m, axis=1), len(centers_m))
-    hits = instant.static_caster.cast_from_each(
+    hits = snapshot.static_caster.cast_from_each(
         centers_m.astype(np.float32).repeat(len(rays_m), axis=0),
         (static_rays_m / length_m[:, None]).T.astype(np.float32),
         length_m.astype(np.float32),
     )
-    is_hit: Bools = (hits.body_indices >= 0) & (hits.body_indices != instant.ego_index)
+    is_hit: Bools = (hits.body_indices >= 0) & (hits.body_indices != snapshot.ego_index)
     up = np.zeros((3, len(centers_m)), dtype=np.float32)
-    up[:] = (instant.static_T_vehicle[:3, 2])[:, None]
-    hits_above = instant.static_caster.cast_from_each(
+    up[:] = (snapshot.static_T_vehicle[:3, 2])[:, None]
+    hits_above = snapshot.static_caster.cast_from_each(
         centers_m.astype(np.float32), up, np.full(len(centers_m), np.inf, dtype=np.float32)
     )
     # Only a center with a face above it can be inside a body; the exact test is slow.
     is_inside = hits_above.body_indices >= 0
     for index in np.flatnonzero(is_inside).tolist():
-        enclosing = instant.static_caster.find_enclosing_bodies(centers_m[index])
-        is_inside[index] = (enclosing != instant.ego_index).any()
+        enclosing = snapshot.static_caster.find_enclosing_bodies(centers_m[index])
+        is_inside[index] = (enclosing != snapshot.ego_index).any()
     return np.asarray(is_hit.reshape(len(centers_m), -1).any(axis=1) | is_inside)

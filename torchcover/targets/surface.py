@@ -128,7 +128,7 @@ class TargetSurface(NamedTuple):
         viewpoint_m: Float64,
         target: Target,
         vehicle_T_target: Float64,
-        instant: SceneSnapshot,
+        snapshot: SceneSnapshot,
         *,
         num_threads: int = 1,
     ) -> PackedBits:
@@ -138,7 +138,7 @@ class TargetSurface(NamedTuple):
             viewpoint_m: (3,) viewpoint in the vehicle frame.
             target: The target.
             vehicle_T_target: (P, 4, 4) poses of the target; each is tested alone.
-            instant: Scene without the target.
+            snapshot: Scene without the target.
             num_threads: Threads that may cast rays; the result does not depend on it.
 
         Returns:
@@ -163,7 +163,7 @@ class TargetSurface(NamedTuple):
         points_in_vehicle_m += vehicle_T_target[position, :3, 3]
         is_visible = np.zeros((len(vehicle_T_target), NUM_SAMPLES), dtype=bool)
         is_visible[position, sample] = compute_visibility(
-            instant, viewpoint_m, points_in_vehicle_m.astype(np.float32), num_threads=num_threads
+            snapshot, viewpoint_m, points_in_vehicle_m.astype(np.float32), num_threads=num_threads
         ).is_visible
         return np.packbits(is_visible, axis=1)
 

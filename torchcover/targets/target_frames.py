@@ -123,44 +123,44 @@ class TargetFrames:
         for frame_index in range(self._num_frames):
             run, step = self._scenario.locate(frame_index * self._frame_stride)
             stage = self._stages.get_mounted_rigs(run)
-            instant = stage.scene_geometry.get_snapshot(step, max_distance_m=self._max_distance_m)
-            stage.check_mounts(instant)
+            snapshot = stage.scene_geometry.get_snapshot(step, max_distance_m=self._max_distance_m)
+            stage.check_mounts(snapshot)
             if static_result is None:
-                ray_ends = [mounted.compute_ray_ends(instant) for mounted in stage.sensors_by_rig[self._rig_name]]
-                ground_z_m, is_free = find_free_positions(instant, self._target, self._surface, self._poses)
+                ray_ends = [mounted.compute_ray_ends(snapshot) for mounted in stage.sensors_by_rig[self._rig_name]]
+                ground_z_m, is_free = find_free_positions(snapshot, self._target, self._surface, self._poses)
             else:  # nothing has moved since the first frame
                 ray_ends, ground_z_m, is_free = static_result
             if not stage.scene_geometry.has_motion and self._scenario.is_repeating:
                 static_result = ray_ends, ground_z_m, is_free
             poses = set_pose_heights(self._poses, ground_z_m)
-            visible_bits = self._find_visible_samples(stage.scene_geometry, instant, poses, frame_index)
+            visible_bits = self._find_visible_samples(stage.scene_geometry, snapshot, poses, frame_index)
             sensor_frames = SensorFrame.from_ray_ends(ray_ends, self._seed, frame_index)
             yield TargetFrame(sensor_frames, ground_z_m, is_free, visible_bits)
 
     def _find_visible_samples(
-        self, scene: SceneGeometry, instant: SceneSnapshot, vehicle_T_target: Float64, frame_index: int
+        self, scene: SceneGeometry, snapshot: SceneSnapshot, vehicle_T_target: Float64, frame_index: int
     ) -> PackedBits:
         """Find the surface samples that are visible from each sampled viewpoint: (V, P, M / 8) packed bits."""
         rng = np.random.default_rng([self._seed, frame_index])
         frame_name = f"{self._scenario.name} frame {frame_index}"
-        context = ReferenceContext(scene, instant, rng, frame_name, torch.get_num_threads())
+        context = ReferenceContext(scene, snapshot, rng, frame_name, torch.get_num_threads())
         visible_bits = np.empty((self.viewpoints_per_frame, len(vehicle_T_target), NUM_SAMPLES // 8), dtype=np.uint8)
         for viewpoint_bits in visible_bits:
             viewpoint, _ = context.sample_free_pose(sample_reference_pose)
             for chunk in split_into_chunks(len(vehicle_T_target)):
                 viewpoint_bits[chunk] = self._surface.find_visible_samples(
-                    viewpoint[:3, 3], self._target, vehicle_T_target[chunk], instant, num_threads=context.num_threads
+                    viewpoint[:3, 3], self._target, vehicle_T_target[chunk], snapshot, num_threads=context.num_threads
                 )
         return visible_bits
 
 
 def find_free_positions(
-    instant: SceneSnapshot, target: Target, surface: TargetSurface, vehicle_T_target: Float64
+    snapshot: SceneSnapshot, target: Target, surface: TargetSurface, vehicle_T_target: Float64
 ) -> tuple[Float64, Bools]:
     """Find the ground below target positions, and the positions with room for the target.
 
     Args:
-        instant: Scene without the target.
+        snapshot: Scene without the target.
         target: The test target.
         surface: Sample points of its surface.
         vehicle_T_target: (P, 4, 4) poses; their heights are replaced by that of the ground.
@@ -169,11 +169,11 @@ def find_free_positions(
         (P,) height of the ground in the vehicle frame, 0 where there is none; (P,) True where there is ground and the
         target has room on it.
     """
-    z_m = compute_ground_heights_m(instant, vehicle_T_target[:, :2, 3])
+    z_m = compute_ground_heights_m(snapshot, vehicle_T_target[:, :2, 3])
     is_free, z_m = np.isfinite(z_m), np.nan_to_num(z_m)
     poses = set_pose_heights(vehicle_T_target, z_m)
     for chunk in split_into_chunks(len(poses)):
-        is_free[chunk] &= ~is_blocked(instant, target.solid.bounding_box, surface.points_m, poses[chunk])
+        is_free[chunk] &= ~is_blocked(snapshot, target.solid.bounding_box, surface.points_m, poses[chunk])
     return z_m, is_free
 
 

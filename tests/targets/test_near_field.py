@@ -12,8 +12,8 @@ from torchcover.data import SimulatedFrames
 from torchcover.geometry import build_transform
 from torchcover.simulation import PaperReference
 from torchcover.simulation.regions_of_interest import build_near_field
-from torchcover.targets import NearFieldObserver, Raster, Target, measure_target_visibility, probing, target_frames
-from torchcover.targets.probing import NearFieldTarget
+from torchcover.targets import NearFieldObserver, Raster, Target, measure_target_visibility, near_field, target_frames
+from torchcover.targets.near_field import NearFieldTarget
 
 from .scenes import WALL, build_lidar, build_rig, build_scenario, write_trajectory
 
@@ -31,36 +31,36 @@ def simulate_frames(scenario, num_frames=8, rigs=TOP, seed=0):
 
 
 def observe_targets(frames, indices=None, body="pole", **budget):
-    probes = NearFieldObserver(frames.simulator, [Target.load(body)], num_blocks=8, **({"frame_stride": 1} | budget))
+    observer = NearFieldObserver(frames.simulator, [Target.load(body)], num_blocks=8, **({"frame_stride": 1} | budget))
     for index in range(len(frames)) if indices is None else indices:
-        probes.update(frames[index])
-    return probes
+        observer.update(frames[index])
+    return observer
 
 
-def get_numbers(probes, region, rig="small"):
-    bodies = probes.get_target_sums(rig)
+def get_numbers(observer, region, rig="small"):
+    bodies = observer.get_target_sums(rig)
     return list(bodies.estimate(bodies.regions[region], bodies.target_names[0]).to_numbers().values())
 
 
 @pytest.mark.parametrize(("name", "bodies"), [("child", ()), ("pole", (WALL,))], ids=["free space", "a wall"])
 def test_near_field_numbers_equal_those_of_target_maps(name, bodies, monkeypatch):
     scenario, target = build_scenario(*bodies), Target.load(name)
-    for module in (target_frames, probing):  # the surface is visible from random viewpoints otherwise
+    for module in (target_frames, near_field):  # the surface is visible from random viewpoints otherwise
         monkeypatch.setattr(
             module, "sample_reference_pose", lambda *_: build_transform(np.eye(3), np.array([0.3, 0.2, 1.3]))
         )
     found = measure_target_visibility(TOP, scenario, target, Raster.from_vehicle(scenario.compute_ego_box(), 3.0))
-    probes = observe_targets(simulate_frames(scenario, num_frames=1), body=name, positions_per_region=ALL)
+    observer = observe_targets(simulate_frames(scenario, num_frames=1), body=name, positions_per_region=ALL)
     x, y = (torch.from_numpy(each) for each in found.raster.positions_m.T)
-    for number, region in enumerate(probes.regions):
+    for number, region in enumerate(observer.regions):
         cells = region.mask_points(x, y).numpy().reshape(found.raster.shape)
         free = cells & found.free_mask
         visible_m2 = found.visible_m2[free]
         expected = [cells.sum(), free.sum(), found.detected_share[free].sum(), visible_m2.sum()]
-        assert probes.compute()[0, 0, number, :-1].tolist() == pytest.approx(expected)
+        assert observer.compute()[0, 0, number, :-1].tolist() == pytest.approx(expected)
         share = np.nansum(found.surface_share[free] * visible_m2) / visible_m2.sum()
-        assert get_numbers(probes, number)[1].value == pytest.approx(share)
-    assert 0.1 < get_numbers(probes, LEFT)[0].value < 1
+        assert get_numbers(observer, number)[1].value == pytest.approx(share)
+    assert 0.1 < get_numbers(observer, LEFT)[0].value < 1
 
 
 def test_positions_of_a_region_are_sampled_uniformly():
@@ -115,8 +115,10 @@ def test_merged_parts_equal_the_whole(tmp_path):
 
 
 def test_numbers_are_nan_without_free_positions():
-    probes = observe_targets(simulate_frames(build_scenario(BLOCK), num_frames=8), body="child", positions_per_region=3)
-    left, right = probes.get_target_sums("small").summarize()[LEFT:]
+    observer = observe_targets(
+        simulate_frames(build_scenario(BLOCK), num_frames=8), body="child", positions_per_region=3
+    )
+    left, right = observer.get_target_sums("small").summarize()[LEFT:]
     assert (left.num_cells, left.observed_cells, left.visible_m2) == (24, 0, pytest.approx(np.nan, nan_ok=True))
     assert all(np.isnan([one.value, one.error]).all() and one.count == 0 for one in left.numbers.values())
     assert 0 < right.observed_cells == next(iter(right.numbers.values())).count
@@ -127,8 +129,8 @@ def test_reused_ray_ends_equal_new_ones(tmp_path, monkeypatch):
     ego = {"shape": {"type": "box", "size_m": [4, 2, 1]}, "trajectory": str(path)}
     frames = simulate_frames(build_scenario(WALL, ego=ego), rigs=build_rig(build_lidar(mount={"z_m": 1.1})))
     frame = frames[3]
-    probes = NearFieldObserver(frames.simulator, [Target.load("pole")], frame_stride=1)
-    kept = probes.compute_sums(frame)
+    observer = NearFieldObserver(frames.simulator, [Target.load("pole")], frame_stride=1)
+    kept = observer.compute_sums(frame)
     stage, instant = frames.simulator.prepare_frame(3)
     (mounted,) = stage.sensors_by_rig["small"]
     known = mounted.compute_ray_ends(instant)
@@ -137,4 +139,4 @@ def test_reused_ray_ends_equal_new_ones(tmp_path, monkeypatch):
     assert np.array_equal(known.range_m, anew.range_m)
     assert np.array_equal(known.is_hit, anew.is_hit)
     assert 0 < known.is_hit.sum() < len(known.is_hit)
-    assert all(map(torch.equal, kept[1:], probes.compute_sums(frame)[1:]))
+    assert all(map(torch.equal, kept[1:], observer.compute_sums(frame)[1:]))

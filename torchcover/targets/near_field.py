@@ -19,8 +19,8 @@ from torchcover.simulation.simulator import Simulator
 from torchcover.targets.counting import count_target_points
 from torchcover.targets.placing import Raster, build_poses, compute_yaws_rad, is_point_inside, set_pose_heights
 from torchcover.targets.surface import Target, TargetSurface
-from torchcover.targets.survey import DETECTION_POINTS, THRESHOLD_M
 from torchcover.targets.target_frames import SensorFrame, TargetFrame, find_free_positions, sample_reference_pose
+from torchcover.targets.visibility import DETECTION_POINTS, THRESHOLD_M
 
 
 class NearFieldTarget(NamedTuple):
@@ -170,24 +170,24 @@ class NearFieldObserver(BlockedSums):
         simulator, index, seed = self.simulator, frame.index, self.simulator.seed
         # A separate stream of random numbers: the streams of the sensors have smaller numbers.
         generator = np.random.default_rng([seed, index, 2**31])
-        stage, instant = simulator.prepare_frame(index)
-        context = ReferenceContext(stage.scene_geometry, instant, generator, frame.name)
+        stage, snapshot = simulator.prepare_frame(index)
+        context = ReferenceContext(stage.scene_geometry, snapshot, generator, frame.name)
         viewpoint_pose, _ = context.sample_free_pose(sample_reference_pose)
         sums, position_counts = np.zeros(self.sums.shape[1:]), np.zeros(self.position_counts.shape)
         rig_sensor_frames = []
         for mounted_sensors in stage.sensors_by_rig.values():
-            ray_ends = [mounted.compute_ray_ends(instant) for mounted in mounted_sensors]
+            ray_ends = [mounted.compute_ray_ends(snapshot) for mounted in mounted_sensors]
             rig_sensor_frames.append(SensorFrame.from_ray_ends(ray_ends, seed, index))
         for target_index, near_field in enumerate(self.near_field_targets):
             target, surface = near_field.target, near_field.surface
             samples = near_field.sample_positions(self.positions_per_region, generator)
             poses = near_field.vehicle_T_target[samples]
-            z_m, is_free = find_free_positions(instant, target, surface, poses)
+            z_m, is_free = find_free_positions(snapshot, target, surface, poses)
             np.add.at(sums[:, target_index, :, TargetColumn.TRIED].T, near_field.region_indices[samples], 1.0)
             is_free &= near_field.has_room[samples]
             samples, poses, z_m = samples[is_free], poses[is_free], z_m[is_free]
             visible_bits = surface.find_visible_samples(
-                viewpoint_pose[:3, 3], target, set_pose_heights(poses, z_m), instant
+                viewpoint_pose[:3, 3], target, set_pose_heights(poses, z_m), snapshot
             )
             for rig_index, mounted_sensors in enumerate(stage.sensors_by_rig.values()):
                 has_sensor_inside = np.zeros(len(poses), dtype=bool)
