@@ -54,3 +54,13 @@ def test_two_placements_and_unknown_metrics_are_refused():
         score_placements({"a": "kitti", "b": "waymo"})
     with pytest.raises(ValueError, match="s_mag"):
         score_placements(RIGS, metrics=["s_mag"])
+
+
+def test_metrics_can_be_combined_with_aggregations():
+    """Aggregated numbers have no bootstrap values, and no ranking."""
+    settings = {"metrics": "point_density", "aggregations": "maximum", "num_frames": 8, "num_rays": 2000}
+    comparison = evaluate(list(RIGS.values()), "courtyard", **settings).metrics
+    names = [ranking.name for ranking in comparison.coverage_rankings]
+    assert "detection_0.4m 20m ground" in names
+    assert not any("maximum" in name for name in names)
+    assert all(ranking.samples is not None for ranking in comparison.coverage_rankings)

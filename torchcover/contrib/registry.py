@@ -269,7 +269,9 @@ def _rank_by_coverage(coverages: Sequence[Coverage], region: Region, band: str, 
     for coverage in coverages:
         (row,) = (row for row in coverage.summary([region]) if row.band == band)
         parameters = {"measure": row.average, "cell_m": coverage.grid.cell_m}
-        numbers.append([number._replace(parameters=parameters) for number in row.numbers.values()])
+        # The row also has the numbers of other aggregations, which the estimate does not resample.
+        coverage_numbers = [row.numbers[quantity.key] for quantity in coverage.quantities]
+        numbers.append([number._replace(parameters=parameters) for number in coverage_numbers])
     estimates = [coverage.estimate(region, band) for coverage in coverages]
     ranked = build_rankings(OWN, numbers, estimates, seed)
     return [ranking._replace(name=f"{ranking.name} {region.name} {band}") for ranking in ranked]

@@ -171,11 +171,12 @@ def _parse_numbers(name: str, texts: Sequence[str], lines: Sequence[int]) -> NDA
         if np.isfinite(values).all():
             return values
     for line, text in zip(lines, texts, strict=True):
+        is_finite = False
         with suppress(ValueError):
-            if math.isfinite(float(text)):
-                continue
-        break
-    raise ValueError(f"line {line}: {name}: a finite number is needed; got {text[:80]!r}")
+            is_finite = math.isfinite(float(text))
+        if not is_finite:
+            raise ValueError(f"line {line}: {name}: a finite number is needed; got {text[:80]!r}")
+    raise ValueError(f"{name}: finite numbers are needed")
 
 
 class JsonTable(NamedTuple):
