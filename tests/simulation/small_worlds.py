@@ -20,7 +20,7 @@ def scenario(*bodies, ego=EGO, **keys):
     return Scenario.model_validate({"name": "s", "ego": ego, "bodies": bodies, **keys})
 
 
-def sums(built_scenario, sensor, value=lambda points: np.ones(len(points)), num_frames=40, first_index=0):
+def sum_weights(built_scenario, sensor, value=lambda points: np.ones(len(points)), num_frames=40, first_index=0):
     """Sum area weight times a value over the reference points of each frame; (steps,)."""
     simulator = Simulator(built_scenario, {}, sensor)
     observations = [simulator.simulate_frame(index) for index in range(first_index, first_index + num_frames)]
@@ -31,7 +31,7 @@ def sums(built_scenario, sensor, value=lambda points: np.ones(len(points)), num_
     return np.array(sums_m2)
 
 
-def agrees(samples, exact, max_relative_error=0.02):
+def assert_agrees(samples, exact, max_relative_error=0.02):
     """Assert that the mean is exact within 4 standard errors, and that these are small."""
     error = samples.std(ddof=1) / math.sqrt(len(samples))
     assert error <= max_relative_error * abs(exact)

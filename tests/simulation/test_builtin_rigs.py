@@ -89,7 +89,7 @@ ROLLS = {
 IN_DEGREES = [name for name in ROLLS if name.startswith("place3d2024")]
 
 
-def mounted(rig, sensor):
+def get_mount_matrix(rig, sensor):
     (matched,) = [candidate for candidate in Rig.load(rig).sensors if candidate.name == sensor]
     return matched.mount.to_matrix()
 
@@ -128,7 +128,9 @@ def test_sensors_lie_outside_the_vehicle_and_above_ground(name):
 @pytest.mark.parametrize(("rig", "sensor", "frame", "published"), REAR_AXLE)
 def test_positions_match_the_source(rig, sensor, frame, published):
     before_axle, axle_height = frame
-    np.testing.assert_allclose(mounted(rig, sensor)[:3, 3] + [before_axle, 0.0, -axle_height], published, atol=6e-4)
+    np.testing.assert_allclose(
+        get_mount_matrix(rig, sensor)[:3, 3] + [before_axle, 0.0, -axle_height], published, atol=6e-4
+    )
 
 
 @pytest.mark.parametrize("rig", CARLA)
@@ -187,7 +189,7 @@ def test_the_pitched_placement_looks_down():
     ],
 )
 def test_sensor_directions_match_the_source(rig, sensor, azimuth, elevation):
-    direction_deg = compute_direction_deg(mounted(rig, sensor))
+    direction_deg = compute_direction_deg(get_mount_matrix(rig, sensor))
     assert (direction_deg[0] - azimuth + 180) % 360 - 180 == pytest.approx(0.0, abs=1e-3)
     assert direction_deg[1] == pytest.approx(elevation, abs=1e-3)
 
@@ -216,7 +218,7 @@ def test_sensor_directions_match_the_source(rig, sensor, azimuth, elevation):
     ],
 )
 def test_camera_directions_match_the_source_and_are_upright(rig, sensor, azimuth):
-    matrix = mounted(rig, sensor)
+    matrix = get_mount_matrix(rig, sensor)
     direction_deg = compute_direction_deg(matrix)
     assert direction_deg[0] == pytest.approx(azimuth, abs=0.1)
     assert abs(direction_deg[1]) < 3.5
@@ -248,11 +250,11 @@ def test_edgar_lidars_have_the_rotation_of_the_urdf():
         about_x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
         about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
         about_z = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
-        np.testing.assert_allclose(mounted("edgar", sensor)[:3, :3], about_z @ about_y @ about_x, atol=2e-5)
+        np.testing.assert_allclose(get_mount_matrix("edgar", sensor)[:3, :3], about_z @ about_y @ about_x, atol=2e-5)
 
 
 def test_argoverses_lower_lidar_hangs_upside_down():
-    matrix = mounted("argoverse2", "down_lidar")
+    matrix = get_mount_matrix("argoverse2", "down_lidar")
     np.testing.assert_allclose(matrix[:3, :3] @ [0, 0, 1], [0, 0, -1], atol=1e-12)
     assert compute_direction_deg(matrix)[0] == pytest.approx(-11.6)
 

@@ -99,7 +99,7 @@ def test_grouped_casting_starts_correctly_on_a_body():
     assert hits.body_indices == snapshot.moving_bodies.body_indices[2]
 
 
-def boxes_around(generator, count):
+def sample_boxes(generator, count):
     """Sample boxes of all sizes and orientations, some around the origin: (count, 8, 3) corners, sizes, poses."""
     corners = BoundingBox((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)).corners_m
     sizes = generator.uniform(0.05, 1.0, size=(count, 3)) * 10 ** generator.uniform(-1, 1.3, size=(count, 1))
@@ -120,7 +120,7 @@ def test_empty_tiles_have_no_candidate_blocks():
 def test_no_ray_that_hits_a_box_is_culled():
     """Directions to points inside boxes, including corners, pass every test for these boxes."""
     generator = np.random.default_rng(0)
-    corners_m, sizes, poses = boxes_around(generator, 300)
+    corners_m, sizes, poses = sample_boxes(generator, 300)
     origin_m = np.array([0.3, -0.2, 0.1])
     outlines = compute_outlines(corners_m, origin_m)
     turned = convert_euler_to_rotation(30, 20, 10)

@@ -18,12 +18,12 @@ L_SHAPE = [(1.5, -0.5), (-0.5, -0.5), (-0.5, 1.5), (-1.5, 1.5), (-1.5, -1.5), (1
 DART = [(0.0, 0.0), (2.0, 1.0), (0.5, 1.0), (1.0, 2.0)]
 
 
-def shoelace(points):
+def compute_polygon_area(points):
     x, y = np.array(points).T
     return abs((x * np.roll(y, -1) - np.roll(x, -1) * y).sum()) / 2
 
 
-def as_obj(points):
+def format_obj(points):
     """Format two copies as OBJ; the second has negative indices, and another vertex follows it."""
     low, high = ("".join(f"v {x} {y} {z}\n" for x, y in points) for z in (0, 1))
     back = " ".join(f"{k}//-1" for k in range(-len(points), 0))
@@ -31,7 +31,7 @@ def as_obj(points):
     return f"{low}f {ahead}\nvn 0 0 1\n{high}f {back} # a comment\nv 9 9 9\n".encode(), 2
 
 
-def as_ply(points, ending):
+def format_ply(points, ending):
     header = (
         f"ply\nformat {ending} 1.0\nelement vertex {len(points)}\nproperty float x\nproperty float y\n"
         "property float z\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
@@ -43,12 +43,12 @@ def as_ply(points, ending):
     return header + data + struct.pack(f"<B{len(points)}i", len(points), *range(len(points))), 1
 
 
-def as_off(points):
+def format_off(points):
     rows = [f"{x} {y} 0" for x, y in points] + [" ".join(map(str, [len(points), *range(len(points))]))]
     return (f"OFF # a comment\n{len(points)} 1 0\n" + "\n".join(rows)).encode(), 1
 
 
-def as_dae(points):
+def format_dae(points):
     numbers = " ".join(f"{x} {y} 0" for x, y in points)
     order = " ".join(map(str, range(len(points))))
     accessor = "".join(f"<param name='{axis}' type='float'/>" for axis in "XYZ")
@@ -65,7 +65,7 @@ def as_dae(points):
     ).encode(), 1
 
 
-def areas(mesh):
+def compute_areas(mesh):
     a, b, c = (mesh.vertices_m[mesh.faces[:, k]] for k in range(3))
     return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
 
@@ -74,18 +74,18 @@ def areas(mesh):
 @pytest.mark.parametrize(
     ("name", "write"),
     [
-        ("a.obj", as_obj),
-        ("ascii.ply", lambda points: as_ply(points, "ascii")),
-        ("binary.ply", lambda points: as_ply(points, "binary_little_endian")),
-        ("a.off", as_off),
-        ("a.dae", as_dae),
+        ("a.obj", format_obj),
+        ("ascii.ply", lambda points: format_ply(points, "ascii")),
+        ("binary.ply", lambda points: format_ply(points, "binary_little_endian")),
+        ("a.off", format_off),
+        ("a.dae", format_dae),
     ],
 )
 def test_concave_polygons_keep_their_area(tmp_path, name, write, points):
     content, copies = write(points)
     (tmp_path / name).write_bytes(content)
     mesh = MeshFile(type="mesh", path=tmp_path / name).build_mesh()
-    assert areas(mesh).sum() == pytest.approx(copies * shoelace(points), rel=1e-6)
+    assert compute_areas(mesh).sum() == pytest.approx(copies * compute_polygon_area(points), rel=1e-6)
     assert len(mesh.faces) == copies * (len(points) - 2)
 
 
@@ -104,10 +104,12 @@ def test_polygons_keep_their_area_in_any_plane():
     a, b, c = vertices[triangles].swapaxes(0, 1)
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
     of_shape = np.searchsorted(ends, triangles[:, 0], side="right") - 1
-    np.testing.assert_allclose(np.bincount(of_shape, area), [shoelace(shape) for shape in shapes], rtol=1e-9)
+    np.testing.assert_allclose(
+        np.bincount(of_shape, area), [compute_polygon_area(shape) for shape in shapes], rtol=1e-9
+    )
 
 
-def as_glb(meshes):
+def build_glb(meshes):
     """Build a GLB of triangles: name -> (three corners, material number); material 1 is called glass and blends."""
     data, document = b"", {"asset": {"version": "2.0"}, "scene": 0, "nodes": [], "meshes": [], "accessors": []}
     document["materials"] = [{"name": "paint"}, {"name": "glass", "alphaMode": "BLEND"}]
@@ -132,14 +134,14 @@ def as_glb(meshes):
 def test_rays_pass_transparent_objects_and_materials(tmp_path):
     corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]])
     parts = {"body": (corners, 0), "door": (2 * corners, 0), "windscreen": (4 * corners, 1), "rear": (8 * corners, 1)}
-    (tmp_path / "car.glb").write_bytes(as_glb(parts))
+    (tmp_path / "car.glb").write_bytes(build_glb(parts))
 
     def read(*names):
         return MeshFile(type="mesh", path=tmp_path / "car.glb", transparent=names)
 
-    assert sorted(areas(read().build_mesh())) == [0.5, 2.0, 8.0, 32.0]
-    assert sorted(areas(read("glass").build_mesh())) == [0.5, 2.0]
-    assert sorted(areas(read("rear", "body").build_mesh())) == [2.0, 8.0]
+    assert sorted(compute_areas(read().build_mesh())) == [0.5, 2.0, 8.0, 32.0]
+    assert sorted(compute_areas(read("glass").build_mesh())) == [0.5, 2.0]
+    assert sorted(compute_areas(read("rear", "body").build_mesh())) == [2.0, 8.0]
     assert np.ptp(read("glass").build_mesh().vertices_m, axis=0)[0] == 8.0  # the frame remains
     assert (read().list_transparent_materials(), read("glass").list_transparent_materials()) == (["glass"], [])
     with pytest.raises(ValueError, match="no object or material is called 'window'; it has 'body', 'door', 'glass'"):
@@ -162,7 +164,7 @@ def test_blocked_cameras_are_told_about_transparent_windows(tmp_path):
     """In a closed car with glass sides the message names material and key; with the key the camera sees through."""
     box = Box(type="box", size_m=(4.0, 2.0, 1.5)).build_mesh()
     sides = {f"side {k}": (box.vertices_m[face], 0 if k < 2 else 1) for k, face in enumerate(box.faces)}
-    (tmp_path / "car.glb").write_bytes(as_glb(sides))
+    (tmp_path / "car.glb").write_bytes(build_glb(sides))
     camera = CameraSensor(name="cam", mount=Pose(z_m=1.0), width=64, height=48, fov_deg=90.0, max_range_m=50.0)
     rig, courtyard = Rig(name="inside", sensors=(camera,)), Scenario.load("courtyard")
     for key, message in (
@@ -218,7 +220,7 @@ def test_missing_packages_are_not_reported_as_damage(tmp_path, name, content, er
 
 @pytest.mark.parametrize(("stated", "side_m"), [("", 2.0), ("<unit name='centimeter' meter='0.01'/>", 0.02)])
 def test_the_unit_of_a_collada_file_is_applied(tmp_path, stated, side_m):
-    text, _ = as_dae([(0, 0), (2, 0), (2, 2), (0, 2)])
+    text, _ = format_dae([(0, 0), (2, 0), (2, 2), (0, 2)])
     text = text if isinstance(text, str) else text.decode()
     path = tmp_path / "m.dae"
     path.write_text(text.replace("<library_geometries>", f"<asset>{stated}</asset><library_geometries>", 1))

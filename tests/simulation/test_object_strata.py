@@ -16,7 +16,7 @@ from torchcover.simulation.sight import compute_visibility
 from torchcover.simulation.surface_strata import SurfaceStrata
 from torchcover.simulation.world import Actor, Scene
 
-from .small_worlds import AHEAD, FLOOR, agrees, box, scenario
+from .small_worlds import AHEAD, FLOOR, assert_agrees, box, scenario
 
 BEHIND = (((-20.0, -10.0), (-5.0, 5.0)),)
 GROUND = Plane(type="plane", size_m=(400.0, 400.0)).build_mesh()
@@ -45,7 +45,7 @@ def build_scene(actors=(), parked=(), static=()):
     return Scene((GROUND, *static), EGO, tuple(actors), 1.0, 3.0, tuple(parked))
 
 
-def scans(made, sensor, steps=40, time_step_index=1):
+def scan_repeatedly(made, sensor, steps=40, time_step_index=1):
     scene = SceneGeometry(made)
     surroundings = (
         ReferenceContext(scene, scene.get_snapshot(time_step_index), np.random.default_rng([3, index]), "test")
@@ -59,7 +59,7 @@ def sum_areas_m2(scans_, which=lambda x, y, z: x > 5.0):
     return np.array([scan.weights.astype(np.float64)[which(*scan.points.T)].sum() for scan in scans_])
 
 
-def worlds_with(actor_of):
+def build_scenes_with(actor_of):
     """Build the same box as an actor at rest, a moving actor, and a static actor."""
     return [
         build_scene([actor_of(moves=False)]),
@@ -69,27 +69,29 @@ def worlds_with(actor_of):
 
 
 @pytest.mark.parametrize(
-    "made", worlds_with(lambda moves: place_box(10.0, moves=moves)), ids=["rests", "moves", "parked"]
+    "made", build_scenes_with(lambda moves: place_box(10.0, moves=moves)), ids=["rests", "moves", "parked"]
 )
 def test_visible_object_surface_is_sampled_outside_areas_too(fix_position, made):
     fix_position([2.5, 3.0, 2.5])
-    object_scans = scans(made, SurfaceReference(BEHIND, num_rays=100, num_poses=1, points_per_object=64))
+    object_scans = scan_repeatedly(made, SurfaceReference(BEHIND, num_rays=100, num_poses=1, points_per_object=64))
     assert all(scan.sampled_point_counts.tolist() == [64] for scan in object_scans)
     # One point in each of 64 equal parts of three visible faces: no scan deviates by more than a part.
     np.testing.assert_allclose(sum_areas_m2(object_scans), 3.0 + 3.0 + 4.0, rtol=1e-5)
-    agrees(sum_areas_m2(object_scans, lambda x, y, z: (x > 5.0) & (z > 1.49999)), 4.0)
-    agrees(sum_areas_m2(object_scans, lambda x, y, z: (x > 5.0) & (z < 0.75)), 3.0)
+    assert_agrees(sum_areas_m2(object_scans, lambda x, y, z: (x > 5.0) & (z > 1.49999)), 4.0)
+    assert_agrees(sum_areas_m2(object_scans, lambda x, y, z: (x > 5.0) & (z < 0.75)), 3.0)
 
 
 @pytest.mark.parametrize(
-    "made", worlds_with(lambda moves: place_box(10.0, moves=moves)), ids=["rests", "moves", "parked"]
+    "made", build_scenes_with(lambda moves: place_box(10.0, moves=moves)), ids=["rests", "moves", "parked"]
 )
 def test_object_strata_do_not_change_the_areas(fix_position, made):
     fix_position([2.5, 3.0, 2.5])
     # The area holds a quarter of the box in x, and the upper band half of it.
     areas, bands = (((4.0, 9.5), (-5.0, 5.0)),), ((-0.5, 0.5), (0.75, 2.0))
     object_scans = [
-        scans(made, SurfaceReference(areas, num_rays=1200, num_poses=2, bands_m=bands, points_per_object=points))
+        scan_repeatedly(
+            made, SurfaceReference(areas, num_rays=1200, num_poses=2, bands_m=bands, points_per_object=points)
+        )
         for points in (0, 40)
     ]
     parts = {
@@ -100,18 +102,18 @@ def test_object_strata_do_not_change_the_areas(fix_position, made):
     }
     for which, exact in parts.values():
         without, with_ = (sum_areas_m2(scan, which) for scan in object_scans)
-        agrees(without, exact or with_.mean(), max_relative_error=0.05)
-        agrees(with_, exact or without.mean(), max_relative_error=0.05)
+        assert_agrees(without, exact or with_.mean(), max_relative_error=0.05)
+        assert_agrees(with_, exact or without.mean(), max_relative_error=0.05)
 
 
 def test_each_object_has_the_requested_points(fix_position):
     fix_position([2.5, 3.0, 2.5])
     made = build_scene([place_box(10.0), place_box(30.0, moves=True)], parked=[place_box(90.0)])
-    (scan,) = scans(made, SurfaceReference(BEHIND, num_rays=100, num_poses=4, points_per_object=10), steps=1)
+    (scan,) = scan_repeatedly(made, SurfaceReference(BEHIND, num_rays=100, num_poses=4, points_per_object=10), steps=1)
     assert scan.sampled_point_counts.tolist() == [12, 12, 12]
     # Added to the other points, half of which found no surface.
     assert 36 + 40 < scan.num_rays < 36 + 60
-    (scan,) = scans(made, SurfaceReference((AHEAD,), num_rays=400, num_poses=4), steps=1)
+    (scan,) = scan_repeatedly(made, SurfaceReference((AHEAD,), num_rays=400, num_poses=4), steps=1)
     # Without object strata, objects have their share of the points of the areas.
     assert scan.sampled_point_counts[0] > 0
     assert scan.sampled_point_counts[1:].tolist() == [0, 0]
@@ -120,32 +122,35 @@ def test_each_object_has_the_requested_points(fix_position):
 def test_the_inside_of_overlapping_objects_is_hidden(fix_position):
     fix_position([2.5, 0.0, 1.0])
     made = build_scene([place_box(10.0), place_box(12.0, size_m=(4.0, 1.0, 3.0))])
-    object_scans = scans(made, SurfaceReference(BEHIND, num_rays=10, num_poses=1, points_per_object=128))
-    agrees(sum_areas_m2(object_scans, lambda x, y, z: np.abs(x - 9.0) < 1e-3), 3.0)
-    agrees(sum_areas_m2(object_scans, lambda x, y, z: np.abs(x - 10.0) < 1e-3), 3.0 - (1.0 + 0.5 * 7.5 / 6.5))
-    agrees(sum_areas_m2(object_scans), 6.0 - (1.0 + 0.5 * 7.5 / 6.5))
+    object_scans = scan_repeatedly(made, SurfaceReference(BEHIND, num_rays=10, num_poses=1, points_per_object=128))
+    assert_agrees(sum_areas_m2(object_scans, lambda x, y, z: np.abs(x - 9.0) < 1e-3), 3.0)
+    assert_agrees(sum_areas_m2(object_scans, lambda x, y, z: np.abs(x - 10.0) < 1e-3), 3.0 - (1.0 + 0.5 * 7.5 / 6.5))
+    assert_agrees(sum_areas_m2(object_scans), 6.0 - (1.0 + 0.5 * 7.5 / 6.5))
     assert all(scan.sampled_point_counts.tolist() == [128, 128] for scan in object_scans)
 
 
 def test_surface_below_ground_is_sampled_and_invisible(fix_position):
     fix_position([2.5, 0.0, 0.9])
     made = build_scene(parked=[place_box(10.0, z_m=-0.5)])
-    agrees(sum_areas_m2(scans(made, SurfaceReference(BEHIND, num_rays=10, num_poses=1, points_per_object=128))), 2.0)
+    assert_agrees(
+        sum_areas_m2(scan_repeatedly(made, SurfaceReference(BEHIND, num_rays=10, num_poses=1, points_per_object=128))),
+        2.0,
+    )
 
 
 def test_one_position_and_point_are_unbiased():
-    object_scans = scans(
+    object_scans = scan_repeatedly(
         build_scene([place_box(10.0)]),
         SurfaceReference(BEHIND, num_rays=1, num_poses=1, points_per_object=1),
         steps=150,
     )
-    exact = scans(
+    exact = scan_repeatedly(
         build_scene([place_box(10.0)]),
         SurfaceReference(BEHIND, num_rays=1, num_poses=8, points_per_object=512),
         steps=30,
     )
     assert all(scan.sampled_point_counts.tolist() == [1] for scan in object_scans)
-    agrees(sum_areas_m2(object_scans), sum_areas_m2(exact).mean(), max_relative_error=0.1)
+    assert_agrees(sum_areas_m2(object_scans), sum_areas_m2(exact).mean(), max_relative_error=0.1)
 
 
 def test_without_an_object_nothing_changes():
@@ -165,8 +170,8 @@ def test_absent_and_distant_objects_are_not_sampled(fix_position):
     fix_position([-2.5, 0.0, 1.0])
     made = build_scene([place_box(10.0, moves=True, until_s=1.5), place_box(37.0), place_box(40.0)])
     sensor = SurfaceReference(BEHIND, num_rays=100, num_poses=2, points_per_object=20, max_range_m=39.0)
-    (while_there,) = scans(made, sensor, steps=1, time_step_index=1)
-    (afterwards,) = scans(made, sensor, steps=1, time_step_index=2)
+    (while_there,) = scan_repeatedly(made, sensor, steps=1, time_step_index=1)
+    (afterwards,) = scan_repeatedly(made, sensor, steps=1, time_step_index=2)
     assert while_there.sampled_point_counts.tolist() == [20, 20, 0]
     assert afterwards.sampled_point_counts.tolist() == [0, 20, 0]
 

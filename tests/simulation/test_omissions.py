@@ -19,7 +19,7 @@ def simulator(scenario, keys=None, max_range_m=60.0):
     return Simulator(Scenario.load(scenario), {"r": rig(max_range_m, **(keys or {}))}, reference, seed=1)
 
 
-def same_points(a, b):
+def has_same_points(a, b):
     return np.array_equal(a.clouds["r"], b.clouds["r"]) and np.array_equal(a.reference, b.reference)
 
 
@@ -50,7 +50,7 @@ def test_reused_scans_equal_new_scans(keys):
     used = simulator("courtyard", keys)
     for index in (4, 2, 3):
         reused, fresh = used.simulate_frame(index), simulator("courtyard", keys).simulate_frame(index)
-        assert same_points(reused, fresh)
+        assert has_same_points(reused, fresh)
         assert reused.counts == fresh.counts
     assert np.array_equal(used.simulate_frame(2).clouds["r"], used.simulate_frame(3).clouds["r"]) == (not keys)
 
@@ -76,7 +76,7 @@ def test_bodies_out_of_range_change_nothing(monkeypatch):
     ]
     absent = sum(not np.isfinite(trajectory.interpolate_positions_m(time_s)).all() for trajectory in moves)
     assert unlimited.counts["moving_bodies_out_of_range"] == absent < limited.counts["moving_bodies_out_of_range"]
-    assert same_points(limited, unlimited)
+    assert has_same_points(limited, unlimited)
 
 
 def test_ranges_start_at_the_sensor(tmp_path):

@@ -136,14 +136,14 @@ def test_fields_of_view_contain_all_rays(sensor):
     assert 0 < np.nanmax(azimuth_deg) - np.nanmin(azimuth_deg) <= sensor.horizontal_fov_deg + 1e-9 <= 360 + 1e-9
 
 
-def hits_of(sensor, range_m, ray=None):
+def create_hits(sensor, range_m, ray=None):
     """Create hits of all or some rays at given ranges."""
     pixel_of_ray = np.flatnonzero(~np.isnan(sensor.compute_directions()[0]))
     ray = np.arange(len(pixel_of_ray)) if ray is None else ray
     return RayHits(ray, np.broadcast_to(range_m, len(ray)).astype(np.float32), pixel_of_ray)
 
 
-def hit_by(returns, count):
+def list_hits(returns, count):
     """List the hits that give a point."""
     return np.arange(count) if returns.hit_indices is None else returns.hit_indices
 
@@ -152,19 +152,19 @@ def test_only_hits_within_range_limits_give_points(sensor):
     exact = sensor.model_copy(update={"range_noise_m": 0.0, "dropout": 0.0})
     assert exact.is_exact
     assert not sensor.is_exact
-    near_hits, far_hits = hits_of(exact, 0.99), hits_of(exact, 1.0)
-    assert len(hit_by(exact.measure(near_hits, SensorNoise(None)), len(near_hits.ray_indices))) == 0
-    hit = hit_by(exact.measure(far_hits, SensorNoise(None)), len(far_hits.ray_indices))
+    near_hits, far_hits = create_hits(exact, 0.99), create_hits(exact, 1.0)
+    assert len(list_hits(exact.measure(near_hits, SensorNoise(None)), len(near_hits.ray_indices))) == 0
+    hit = list_hits(exact.measure(far_hits, SensorNoise(None)), len(far_hits.ray_indices))
     assert len(hit) > 0
     assert (np.diff(hit) > 0).all()
-    none = hits_of(exact, 5.0, np.empty(0, dtype=np.int64))
-    assert len(hit_by(exact.measure(none, SensorNoise(None)), 0)) == 0
+    none = create_hits(exact, 5.0, np.empty(0, dtype=np.int64))
+    assert len(list_hits(exact.measure(none, SensorNoise(None)), 0)) == 0
 
 
 def test_beams_are_measured_independently(sensor):
     """Removing hits of some beams does not change the points of other beams, for any number of positions."""
     beams, random = sensor.compute_beam_indices(), np.random.default_rng(5)
-    all_hits = hits_of(sensor, random.uniform(0.5, 9.0, len(hits_of(sensor, 1.0).ray_indices)))
+    all_hits = create_hits(sensor, random.uniform(0.5, 9.0, len(create_hits(sensor, 1.0).ray_indices)))
     of_ray = all_hits.ray_indices if beams is None else beams.ravel()[all_hits.pixel_indices]
     measured = sensor.measure(all_hits, SensorNoise(np.random.default_rng(0), num_rays=len(all_hits.ray_indices)))
     remaining = np.flatnonzero(of_ray % 3 != 1)
@@ -192,10 +192,10 @@ def test_beams_are_measured_independently(sensor):
 
 def test_random_numbers_do_not_depend_on_the_hits(sensor):
     """Otherwise the hits of one thread would affect the random numbers of another."""
-    rays = len(hits_of(sensor, 1.0).ray_indices)
+    rays = len(create_hits(sensor, 1.0).ray_indices)
     used, fresh = (SensorNoise(np.random.default_rng(2), num_rays=rays) for _ in range(2))
-    sensor.measure(hits_of(sensor, 1.0, np.empty(0, dtype=np.int64)), used)
-    first, second = (sensor.measure(hits_of(sensor, 5.0), draws) for draws in (used, fresh))
+    sensor.measure(create_hits(sensor, 1.0, np.empty(0, dtype=np.int64)), used)
+    first, second = (sensor.measure(create_hits(sensor, 5.0), draws) for draws in (used, fresh))
     np.testing.assert_array_equal(first.hit_indices, second.hit_indices)
     np.testing.assert_array_equal(first.range_error_m, second.range_error_m)
 

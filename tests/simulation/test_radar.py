@@ -19,7 +19,7 @@ def radar(**keys):
     return Radar.model_validate(KEYS | keys)
 
 
-def points_of(sensor, *bodies):
+def compute_points(sensor, *bodies):
     """Compute the points in the radar frame."""
     scenario = Scenario.model_validate({"name": "s", "ego": EGO, "bodies": [WALL, *bodies]})
     rig = Rig(name="r", sensors=(sensor,))
@@ -27,7 +27,7 @@ def points_of(sensor, *bodies):
     return (scan.points if scan.measured_points is None else scan.measured_points).astype(np.float64) - [2.1, 0.0, 1.0]
 
 
-def cells_of(sensor, points_m):
+def compute_cells(sensor, points_m):
     """Compute the (N, 2) azimuth and range cells of points."""
     azimuth_deg = np.rad2deg(np.arctan2(points_m[:, 1], points_m[:, 0]))
     across = (azimuth_deg + sensor.horizontal_fov_deg / 2) / sensor.horizontal_fov_deg * sensor.num_azimuth_cells
@@ -35,21 +35,21 @@ def cells_of(sensor, points_m):
     return np.floor(np.column_stack([across, along]) + 1e-6).astype(int)
 
 
-def by_cell(sensor, *bodies):
+def group_by_cell(sensor, *bodies):
     """Get the point of each occupied cell."""
-    points_m = points_of(sensor, *bodies)
-    return dict(zip(map(tuple, cells_of(sensor, points_m).tolist()), points_m, strict=True))
+    points_m = compute_points(sensor, *bodies)
+    return dict(zip(map(tuple, compute_cells(sensor, points_m).tolist()), points_m, strict=True))
 
 
 def test_walls_fill_the_cells_they_cross():
     """At azimuth a, the wall is 20 m / cos(a) away on the horizon, and slightly more above and below."""
     sensor = radar(vertical_fov_deg=[0, 0], ray_spacing_m=0.02)
-    points_m = points_of(sensor)
+    points_m = compute_points(sensor)
     edges = np.deg2rad(np.linspace(-30, 30, 13))
     low, high = np.sort(20 / np.cos([edges[:-1], edges[1:]]), axis=0)
     nearest = np.floor(low / 0.5)  # 20 m is in the lower of the two central cells
     expected = {(k, n) for k in range(12) for n in np.arange(nearest[k], np.floor(high[k] / 0.5) + 1).astype(int)}
-    assert set(map(tuple, cells_of(sensor, points_m).tolist())) == expected
+    assert set(map(tuple, compute_cells(sensor, points_m).tolist())) == expected
     assert len(points_m) == len(expected)
 
 
@@ -77,10 +77,10 @@ def test_points_are_central_hits_of_cells():
 def test_more_rays_per_cell_find_the_same_surfaces():
     """With more rays, a box ahead of a wall occupies no more cells, and ranges converge."""
     box = {"name": "box", "shape": {"type": "box", "size_m": [2, 2, 3]}, "poses": [{"x_m": 12.0, "y_m": 2.0}]}
-    finest = by_cell(radar(ray_spacing_m=0.05), box)
+    finest = group_by_cell(radar(ray_spacing_m=0.05), box)
     missing, moved_m = [], []
     for spacing_m in (2.0, 0.5, 0.1):
-        points = by_cell(radar(ray_spacing_m=spacing_m), box)
+        points = group_by_cell(radar(ray_spacing_m=spacing_m), box)
         common_cells = sorted(points.keys() & finest.keys())
         missing.append(len(finest) - len(common_cells))
         moved_m.append(
@@ -97,20 +97,20 @@ def test_road_hits_do_not_replace_body_points():
     floor = {"name": "floor", "shape": {"type": "plane", "size_m": [200, 200]}}
     body = {"name": "body", "shape": {"type": "box", "size_m": [0.4, 3, 1.8]}, "poses": [{"x_m": 7.55}]}
     sensor = radar(horizontal_fov_deg=10, azimuth_cell_deg=5, vertical_fov_deg=[-15, 15])
-    points_m = points_of(sensor, floor, body)
+    points_m = compute_points(sensor, floor, body)
     # The face is 5.25 m ahead; the floor from 5.0 m on is in the same cell.
-    in_its_cell = points_m[cells_of(sensor, points_m)[:, 1] == 10]
+    in_its_cell = points_m[compute_cells(sensor, points_m)[:, 1] == 10]
     assert len(in_its_cell) == 2
     np.testing.assert_allclose(in_its_cell[:, 0], 5.25, atol=1e-4)
 
 
 def test_noise_and_dropout_apply_per_cell():
-    exact = points_of(radar())
-    noisy = points_of(radar(range_noise_m=0.05))
+    exact = compute_points(radar())
+    noisy = compute_points(radar(range_noise_m=0.05))
     error_m = np.linalg.norm(noisy, axis=1) - np.linalg.norm(exact, axis=1)
     np.testing.assert_allclose(np.cross(noisy, exact), 0.0, atol=1e-4)
     assert 0.035 < error_m.std() < 0.07
-    left = points_of(radar(dropout=0.5))
+    left = compute_points(radar(dropout=0.5))
     assert 0.3 < len(left) / len(exact) < 0.7
     assert set(map(tuple, left)) < set(map(tuple, exact))
 

@@ -46,7 +46,7 @@ def scan(made, time_step_index=0, pose=ABOVE, **options):
     return SceneGeometry(made).get_snapshot(time_step_index).scan(pose, SPHERE, **options)
 
 
-def as_set(points):
+def to_set(points):
     return points[np.lexsort(points.round(3).T)]
 
 
@@ -69,7 +69,7 @@ def test_moving_and_resting_egos_have_equal_scans():
     resting = scan(build_scene(moving=False))
     moving = scan(build_scene(moving=False, ego_moves=True))
     assert moving.self_hits == resting.self_hits
-    np.testing.assert_allclose(as_set(moving.points), as_set(resting.points), atol=1e-4)
+    np.testing.assert_allclose(to_set(moving.points), to_set(resting.points), atol=1e-4)
 
 
 def test_actors_follow_trajectories_and_occlude():
@@ -87,7 +87,7 @@ def test_distant_world_coordinates_give_the_same_points(ego_moves):
     near_points = scan(build_scene(ego_moves=ego_moves), 2)
     distant_points = scan(build_scene(UTM, 37.0, ego_moves=ego_moves), 2)
     assert len(near_points.points) == len(distant_points.points)
-    np.testing.assert_allclose(as_set(distant_points.points), as_set(near_points.points), atol=1e-3)
+    np.testing.assert_allclose(to_set(distant_points.points), to_set(near_points.points), atol=1e-3)
 
 
 def test_overlapping_actors_are_reported_with_the_time():

@@ -21,7 +21,7 @@ EGO = {"shape": {"type": "box", "size_m": [4, 2, 1.5]}}
 LOT = {"type": "parking", "duration_s": 1.0, "time_step_s": 0.2, "crossings_per_aisle": 0, "parked_share": 0.1}
 
 
-def lot(ego=EGO, **keys):
+def create_lot(ego=EGO, **keys):
     return Scenario.model_validate({"name": "lot", "ego": ego, "traffic": {**LOT, **keys}})
 
 
@@ -92,7 +92,8 @@ def test_actors_that_share_a_mesh_share_it_again(tmp_path):
 def test_frames_are_the_same_to_the_bit(disk):
     rigs, reference = {"roof": Rig.load("front_roof_128")}, PaperReference(64, 64)
     observations = [
-        Simulator(lot(), rigs, reference, no_cache=no_cache).simulate_frame(8) for no_cache in (True, False, False)
+        Simulator(create_lot(), rigs, reference, no_cache=no_cache).simulate_frame(8)
+        for no_cache in (True, False, False)
     ]
     assert disk[1] == [1, 1]
     for other in observations[1:]:
@@ -107,33 +108,33 @@ def test_cache_keys_depend_on_all_inputs_only(disk, tmp_path):
     body.write_text(parts.format(height=1.5))
     ego_keys = {"shape": {"type": "vehicle", "vehicle": str(body)}}
     makes = [
-        lambda: world_of(lot()),
-        lambda: world_of(lot(), run=1),
-        lambda: world_of(lot(), seed=1),
-        lambda: world_of(lot(parked_share=0.2)),
-        lambda: world_of(lot(ego=ego_keys)),
-        lambda: (body.write_text(parts.format(height=1.6)), world_of(lot(ego=ego_keys))),
+        lambda: world_of(create_lot()),
+        lambda: world_of(create_lot(), run=1),
+        lambda: world_of(create_lot(), seed=1),
+        lambda: world_of(create_lot(parked_share=0.2)),
+        lambda: world_of(create_lot(ego=ego_keys)),
+        lambda: (body.write_text(parts.format(height=1.6)), world_of(create_lot(ego=ego_keys))),
     ]
     for count, make in enumerate(makes, 1):
         make()
         assert len(files()) == count
-    foggy = lot().model_copy(update={"name": "other", "description": "words"})
+    foggy = create_lot().model_copy(update={"name": "other", "description": "words"})
     world_of(foggy)
     assert len(files()) == len(makes)
 
 
 @pytest.mark.parametrize("change", ["code", "library"])
 def test_other_code_or_libraries_invalidate_the_cache(disk, monkeypatch, change):
-    world_of(lot())
+    world_of(create_lot())
     if change == "code":
         monkeypatch.setattr(scene_cache, "_hash_code", lambda: "other")
     else:
         monkeypatch.setattr(np, "__version__", "0")
-    world_of(lot())
+    world_of(create_lot())
     assert disk[1] == [0, 0]
 
 
-def harm(content, how):
+def write_damage(content, how):
     if how == "cut short":
         return content[: len(content) // 2]
     if how == "empty":
@@ -147,18 +148,18 @@ def harm(content, how):
 @pytest.mark.parametrize("how", ["a number", "a word", "cut short", "empty", "not ours", "another scene"])
 def test_damaged_scenes_are_rebuilt_with_a_warning(disk, how):
     files, built = disk
-    scene = world_of(lot())
+    scene = world_of(create_lot())
     [path] = files()
     if how == "another scene":
-        world_of(lot(), 1)
+        world_of(create_lot(), 1)
         [other] = set(files()) - {path}
         path.write_bytes(other.read_bytes())
     else:
-        path.write_bytes(harm(path.read_bytes(), how))
+        path.write_bytes(write_damage(path.read_bytes(), how))
     built.clear()
     with pytest.warns(UserWarning, match=r"a cached scene is not used \(.*\.npz: "):
-        assert same(world_of(lot()), scene)
-    world_of(lot())
+        assert same(world_of(create_lot()), scene)
+    world_of(create_lot())
     assert built == [0]
 
 
@@ -170,7 +171,7 @@ def test_a_scene_file_runs_no_code(disk, tmp_path):
             read_scene(tmp_path / "a.npz", {})
 
 
-def special(path, kind, target):
+def create_special_file(path, kind, target):
     """Create a foreign file, link or folder at a path of the cache."""
     if kind == "link":
         path.symlink_to(target)
@@ -190,12 +191,12 @@ NAMES = {"link": "a" * 64 + ".npz", "hard link": "b" * 64 + ".npz", "FIFO": "c" 
 
 def test_foreign_files_stay_and_do_not_interfere(disk, monkeypatch, tmp_path):
     files, built = disk
-    world_of(lot())
+    world_of(create_lot())
     [path] = files()
     target = tmp_path / "target"
     target.write_bytes(bytes(10_000_000))
     for kind, name in NAMES.items():
-        special(path.with_name(name), kind, target)
+        create_special_file(path.with_name(name), kind, target)
         os.utime(path.with_name(name), (0, 0), follow_symlinks=False)
     before = [
         (file_path.lstat().st_ino, file_path.lstat().st_mtime)
@@ -204,7 +205,7 @@ def test_foreign_files_stay_and_do_not_interfere(disk, monkeypatch, tmp_path):
     ]
     monkeypatch.setenv("TORCHCOVER_CACHE_GB", str(2.5 * path.stat().st_size / 1e9))
     for run in range(4):
-        world_of(lot(), run)
+        world_of(create_lot(), run)
     after = [(file_path.lstat().st_ino, file_path.lstat().st_mtime) for file_path in sorted(path.parent.glob("*"))]
     assert set(before) <= set(after)
     assert len(after) == len(before) + 2
@@ -214,14 +215,14 @@ def test_foreign_files_stay_and_do_not_interfere(disk, monkeypatch, tmp_path):
 @pytest.mark.parametrize("kind", ["link", "hard link", "FIFO", "folder"])
 def test_links_in_place_of_scenes_are_ignored(disk, tmp_path, kind):
     files, built = disk
-    scene = world_of(lot())
+    scene = world_of(create_lot())
     [path] = files()
     path.rename(tmp_path / "target")
-    special(path, kind, tmp_path / "target")
+    create_special_file(path, kind, tmp_path / "target")
     content, stamp = (tmp_path / "target").read_bytes(), (tmp_path / "target").stat().st_mtime_ns
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a folder cannot be replaced
-        assert same(world_of(lot()), scene)
+        assert same(world_of(create_lot()), scene)
     assert built == [0, 0]
     assert ((tmp_path / "target").read_bytes(), (tmp_path / "target").stat().st_mtime_ns) == (content, stamp)
 
@@ -234,31 +235,31 @@ def _age(files):
 def test_the_oldest_scenes_are_deleted_for_new_ones(disk, monkeypatch):
     files, built = disk
     for run in range(4):
-        world_of(lot(), run)
+        world_of(create_lot(), run)
     size = max(path.stat().st_size for path in files())
     _age(files())
-    world_of(lot(), 0)  # now it is the newest file
+    world_of(create_lot(), 0)  # now it is the newest file
     built.clear()
     monkeypatch.setenv("TORCHCOVER_CACHE_GB", str(3.1 * size / 1e9))
-    world_of(lot(), 4)
+    world_of(create_lot(), 4)
     assert len(files()) == 3
     for run in (0, 3, 4):
-        world_of(lot(), run)
+        world_of(create_lot(), run)
     assert built == [4]
     monkeypatch.setenv("TORCHCOVER_CACHE_GB", str(0.5 * size / 1e9))
-    world_of(lot(), 5)
+    world_of(create_lot(), 5)
     assert len(files()) == 3  # it does not fit, and nothing is deleted for it
 
 
 def test_without_a_budget_nothing_is_written(disk, monkeypatch):
-    world_of(lot(), no_cache=True)
+    world_of(create_lot(), no_cache=True)
     monkeypatch.setenv("TORCHCOVER_CACHE_GB", "0")
-    world_of(lot())
+    world_of(create_lot())
     assert disk[0]() == []
     for wrong in ("much", "-1", "nan"):
         monkeypatch.setenv("TORCHCOVER_CACHE_GB", wrong)
         with pytest.raises(ValueError, match="TORCHCOVER_CACHE_GB"):
-            world_of(lot())
+            world_of(create_lot())
 
 
 def no_home(monkeypatch, tmp_path):
@@ -302,10 +303,10 @@ def test_without_a_disk_runs_continue_with_one_warning(disk, monkeypatch, tmp_pa
     lacks(monkeypatch, tmp_path)
 
     def run():
-        cache = SceneCache(lot(), 0)
+        cache = SceneCache(create_lot(), 0)
         for number in (0, 1, 0):
-            cache.build(number, lot().build_ego_mesh())
-        world_of(lot())
+            cache.build(number, create_lot().build_ego_mesh())
+        world_of(create_lot())
 
     with pytest.warns(UserWarning, match=r"scenes are not cached .* --set no_cache=true") as caught:
         run()
@@ -320,14 +321,14 @@ def test_concurrent_runs_write_the_same_scene(disk, monkeypatch):
 
     def late(source, target):
         monkeypatch.setattr(scene_cache.os, "replace", replace)
-        meanwhile.append(world_of(lot()))
+        meanwhile.append(world_of(create_lot()))
         replace(source, target)
 
     monkeypatch.setattr(scene_cache.os, "replace", late)
-    world_of(lot())
+    world_of(create_lot())
     assert built == [0, 0]
     assert len(files()) == 1
-    assert same(world_of(lot()), meanwhile[0])
+    assert same(world_of(create_lot()), meanwhile[0])
     assert built == [0, 0]
 
 
@@ -341,7 +342,7 @@ def test_scenes_with_warnings_are_not_cached(disk, monkeypatch):
     monkeypatch.setattr(Scenario, "build_scene", doubtful)
     for _ in range(2):
         with pytest.warns(UserWarning, match="three lorries"):
-            world_of(lot())
+            world_of(create_lot())
     assert disk[0]() == []
 
 
@@ -349,5 +350,5 @@ def test_traffic_of_other_packages_is_not_cached(disk):
     class Elsewhere(ParkingTraffic):
         """Traffic whose code is not hashed."""
 
-    world_of(lot().model_copy(update={"traffic": Elsewhere(**LOT)}))
+    world_of(create_lot().model_copy(update={"traffic": Elsewhere(**LOT)}))
     assert disk[0]() == []

@@ -21,19 +21,19 @@ def lidar(**changes):
     return Lidar(**{**content, **changes})
 
 
-def angles(directions):
+def compute_angles(directions):
     x, y, z = directions.reshape(3, -1)
     return np.rad2deg(np.arcsin(z)), np.rad2deg(np.arctan2(y, x))
 
 
 def test_rows_span_the_fov_and_columns_equal_sectors():
-    elevation, azimuth = angles(lidar().compute_directions())
+    elevation, azimuth = compute_angles(lidar().compute_directions())
     np.testing.assert_allclose(elevation.reshape(5, 6)[:, 0], [-20, -12.5, -5, 2.5, 10], atol=1e-12)
     np.testing.assert_allclose(azimuth.reshape(5, 6)[2], [-37.5, -22.5, -7.5, 7.5, 22.5, 37.5], atol=1e-12)
 
 
 def test_a_full_turn_has_no_ray_twice():
-    _, azimuth = angles(
+    _, azimuth = compute_angles(
         lidar(horizontal_fov_deg=360, columns=8, channels=1, vertical_fov_deg=(0, 0)).compute_directions()
     )
     np.testing.assert_allclose(np.diff(np.sort(azimuth)), 45.0, atol=1e-12)
@@ -43,13 +43,13 @@ def test_row_tables_with_offsets_are_used_unchanged():
     table = lidar(
         channels=None, vertical_fov_deg=None, elevations_deg=(5, -3, 1), azimuth_offsets_deg=(0, 2, -4), columns=1
     )
-    elevation, azimuth = angles(table.compute_directions())
+    elevation, azimuth = compute_angles(table.compute_directions())
     np.testing.assert_allclose(elevation, [5, -3, 1], atol=1e-12)
     np.testing.assert_allclose(azimuth, [0, 2, -4], atol=1e-12)
 
 
 def test_paper_reference_rays_are_uniform_in_angle():
-    elevation, azimuth = angles(PaperReference(rows=91, columns=36).compute_directions())
+    elevation, azimuth = compute_angles(PaperReference(rows=91, columns=36).compute_directions())
     np.testing.assert_allclose(elevation.reshape(91, 36)[:, 3], np.arange(0, -91, -1), atol=1e-6)
     np.testing.assert_allclose(np.sort(azimuth.reshape(91, 36)[0] % 360), np.arange(0, 360, 10), atol=1e-12)
 
@@ -59,14 +59,14 @@ def test_default_reference_sensor_matches_the_paper():
     assert (sensor.rows, sensor.columns, sensor.shell_m, sensor.max_tilt_deg) == (1024, 1024, 0.5, 45.0)
 
 
-def poses(count):
+def sample_poses(count):
     sensor = PaperReference(rows=1, columns=1)
     generator = np.random.default_rng(7)
     return np.stack([sensor.sample_pose(EGO, generator) for _ in range(count)])
 
 
 def test_positions_are_uniform_in_the_shell():
-    position = poses(4000)[:, :3, 3]
+    position = sample_poses(4000)[:, :3, 3]
     lower, upper = np.array(EGO.lower_m), np.array(EGO.upper_m)
     assert (position >= lower - [0.5, 0.5, 0]).all()
     assert (position <= upper + 0.5).all()
@@ -82,7 +82,7 @@ def test_positions_are_uniform_in_the_shell():
 
 
 def test_orientations_are_uniform_in_their_ranges():
-    rotation = poses(4000)[:, :3, :3]
+    rotation = sample_poses(4000)[:, :3, :3]
     yaw = np.rad2deg(np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0]))
     pitch = np.rad2deg(np.arcsin(-rotation[:, 2, 0]))
     roll = np.rad2deg(np.arctan2(rotation[:, 2, 1], rotation[:, 2, 2]))

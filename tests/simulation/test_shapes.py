@@ -35,12 +35,12 @@ RADII, HEIGHTS = np.cos(np.deg2rad(np.arange(-90, 91, 30))), np.sin(np.deg2rad(n
 BANDED_SPHERE = float((np.diff(HEIGHTS) * (RADII[:-1] ** 2 + RADII[:-1] * RADII[1:] + RADII[1:] ** 2)).sum())
 
 
-def signed_volume(mesh):
+def compute_signed_volume(mesh):
     a, b, c = (mesh.vertices_m[mesh.faces[:, k]] for k in range(3))
     return float((a * np.cross(b, c)).sum() / 6)
 
 
-def edge_counts(mesh):
+def count_edges(mesh):
     """Count directed edges; in a closed mesh with consistent normals each has exactly one opposite."""
     directed = np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]], mesh.faces[:, [2, 0]]])
     forward = {tuple(edge) for edge in directed.tolist()}
@@ -61,10 +61,10 @@ def edge_counts(mesh):
 )
 def test_solids_are_closed_outward_and_have_their_volume(shape, volume):
     mesh = shape.build_mesh()
-    edges, distinct, paired = edge_counts(mesh)
+    edges, distinct, paired = count_edges(mesh)
     assert edges == distinct
     assert paired
-    assert signed_volume(mesh) == pytest.approx(volume, rel=1e-12)
+    assert compute_signed_volume(mesh) == pytest.approx(volume, rel=1e-12)
     assert mesh.vertices_m[:, 2].min() == 0.0
 
 
@@ -92,7 +92,7 @@ def test_invalid_mesh_files_are_named(tmp_path, content, message):
         MeshFile(type="mesh", path=path).build_mesh()
 
 
-def ply_of(mesh, faces=slice(None)):
+def format_ply(mesh, faces=slice(None)):
     """Format some faces of a mesh as an ASCII PLY file."""
     corners = [" ".join(f"{value:.9g}" for value in vertex) for vertex in mesh.vertices_m]
     triangles = [f"3 {a} {b} {c}" for a, b, c in mesh.faces[faces].tolist()]
@@ -102,7 +102,7 @@ def ply_of(mesh, faces=slice(None)):
     return "\n".join([*header, *corners, *triangles, ""])
 
 
-def mesh_file(folder, text, **options):
+def write_mesh_file(folder, text, **options):
     path = folder / "body.ply"
     path.write_text(text)
     return MeshFile(type="mesh", path=path, **options)
@@ -115,32 +115,32 @@ CAR = Box(type="box", size_m=(4.9, 1.94, 1.63))
 def test_closed_meshes_cause_no_warning_in_any_format(tmp_path, shape):
     mesh = shape.build_mesh()
     # Warnings are errors in tests: a mesh that is read without a warning is complete.
-    assert len(mesh_file(tmp_path, ply_of(mesh)).build_mesh().faces) == len(mesh.faces)
+    assert len(write_mesh_file(tmp_path, format_ply(mesh)).build_mesh().faces) == len(mesh.faces)
     # Each face has separate corners, as in STL; then half of the faces are flipped.
     apart = mesh._replace(
         vertices_m=mesh.vertices_m[mesh.faces.ravel()], faces=np.arange(mesh.faces.size).reshape(-1, 3)
     )
-    assert len(mesh_file(tmp_path, ply_of(apart)).build_mesh().faces) == len(mesh.faces)
+    assert len(write_mesh_file(tmp_path, format_ply(apart)).build_mesh().faces) == len(mesh.faces)
     flipped = mesh.faces.copy()
     flipped[::2] = flipped[::2, ::-1]
-    mesh_file(tmp_path, ply_of(mesh._replace(faces=flipped))).build_mesh()
+    write_mesh_file(tmp_path, format_ply(mesh._replace(faces=flipped))).build_mesh()
     # A face without area does not make a hole.
-    mesh_file(tmp_path, ply_of(mesh._replace(faces=np.vstack([mesh.faces, [[0, 0, 1]]])))).build_mesh()
+    write_mesh_file(tmp_path, format_ply(mesh._replace(faces=np.vstack([mesh.faces, [[0, 0, 1]]])))).build_mesh()
 
 
 def format_in_millimeters(size_m):
-    return ply_of(Box(type="box", size_m=tuple(1000 * length for length in size_m)).build_mesh())
+    return format_ply(Box(type="box", size_m=tuple(1000 * length for length in size_m)).build_mesh())
 
 
 @pytest.mark.parametrize("unit", [1000.0, 100.0, 1 / 0.0254, 84 / 4.9])
 def test_wrong_units_of_actors_are_reported(tmp_path, unit):
-    shape = mesh_file(tmp_path, ply_of(CAR.build_mesh()), meters_per_unit=unit)
+    shape = write_mesh_file(tmp_path, format_ply(CAR.build_mesh()), meters_per_unit=unit)
     with pytest.warns(UserWarning, match=r"ego: its body is .* far too large for .*; .*`meters_per_unit: 0\.001`"):
         ActorDescription(shape=shape).build_actor("ego", "ego")
 
 
 def test_bodies_in_millimeters_are_reported(tmp_path):
-    shape = mesh_file(tmp_path, format_in_millimeters((4.9, 1.94, 1.63)))
+    shape = write_mesh_file(tmp_path, format_in_millimeters((4.9, 1.94, 1.63)))
     with pytest.warns(UserWarning, match=r"body 'parked car': its body is 4,900 x 1,940 x 1,630 m"):
         Body(name="parked car", shape=shape).build_meshes()
     # With the remedy there is no warning, nor for a city of 5 km or a train.
@@ -204,20 +204,20 @@ def test_built_in_vehicles_cause_no_warning(name):
 PART = "{{name: {0}, shape: {{type: box, size_m: {1}}}, poses: [{2}]}}"
 
 
-def vehicle_of(folder, name, *parts, extends=""):
+def write_vehicle(folder, name, *parts, extends=""):
     (folder / f"{name}.yaml").write_text(f"name: {name}\nextends: {extends or 'null'}\nparts: [{', '.join(parts)}]\n")
     return folder / f"{name}.yaml"
 
 
 def test_vehicles_inherit_parts_and_mount_regions(tmp_path):
     roof_box = PART.format("box", "[1.2, 0.9, 0.4]", "{x_m: -0.5, z_m: 1.7}")
-    suv, extended = Vehicle.load("suv"), Vehicle.load(vehicle_of(tmp_path, "suv_box", roof_box, extends="suv"))
+    suv, extended = Vehicle.load("suv"), Vehicle.load(write_vehicle(tmp_path, "suv_box", roof_box, extends="suv"))
     assert extended.parts[:-1] == suv.parts
     assert extended.parts[-1].name == "box"
     assert extended.mount_regions == suv.mount_regions
     assert np.ptp(extended.build_mesh().vertices_m, axis=0)[2] == pytest.approx(2.1)
-    cart = vehicle_of(tmp_path, "cart", PART.format("body", "[2, 1, 1]", "{}"))
-    pulled = vehicle_of(tmp_path, "pulled", PART.format("bar", "[0.5, 0.1, 0.1]", "{x_m: 1.25}"), extends=cart.name)
+    cart = write_vehicle(tmp_path, "cart", PART.format("body", "[2, 1, 1]", "{}"))
+    pulled = write_vehicle(tmp_path, "pulled", PART.format("bar", "[0.5, 0.1, 0.1]", "{x_m: 1.25}"), extends=cart.name)
     with pytest.warns(UserWarning, match=r"shift the center of its bounding box.* by x \+0.25, y \+0.00 m"):
         assert np.ptp(Vehicle.load(pulled).build_mesh().vertices_m, axis=0)[0] == 2.5
     for name, base, message in (
@@ -225,7 +225,7 @@ def test_vehicles_inherit_parts_and_mount_regions(tmp_path):
         ("b", "b.yaml", "extends 'b.yaml' itself"),
     ):
         with pytest.raises(ValueError, match=message):
-            Vehicle.load(vehicle_of(tmp_path, name, PART.format("x", "[1, 1, 1]", "{}"), extends=base))
+            Vehicle.load(write_vehicle(tmp_path, name, PART.format("x", "[1, 1, 1]", "{}"), extends=base))
 
 
 def test_rig_bodies_occlude_like_vehicle_parts(tmp_path):
@@ -234,7 +234,7 @@ def test_rig_bodies_occlude_like_vehicle_parts(tmp_path):
     plain = Rig.load("front_roof_32").model_dump(mode="json", exclude_unset=True)
     pose, shape = {"x_m": 1.0, "z_m": 1.5}, {"type": "box", "size_m": [0.1, 1.0, 0.3]}
     loaded = Rig.model_validate({**plain, "bodies": [{"name": "box", "shape": shape, "poses": [pose]}]})
-    extended = vehicle_of(tmp_path, "suv_box", box, extends="suv")
+    extended = write_vehicle(tmp_path, "suv_box", box, extends="suv")
     frames = SimulatedFrames("courtyard", rigs={"plain": Rig.load("front_roof_32"), "loaded": loaded}, num_frames=1)
     vehicle_frame = SimulatedFrames("courtyard", "front_roof_32", num_frames=1, vehicle=extended)[0]
     np.testing.assert_array_equal(frames[0].clouds["loaded"], vehicle_frame.sensor)
@@ -244,6 +244,6 @@ def test_rig_bodies_occlude_like_vehicle_parts(tmp_path):
 
 
 def test_floating_actors_are_lowered_with_a_warning(tmp_path):
-    floats = vehicle_of(tmp_path, "floats", PART.format("body", "[2, 1, 1]", "{z_m: 0.2}"))
+    floats = write_vehicle(tmp_path, "floats", PART.format("body", "[2, 1, 1]", "{z_m: 0.2}"))
     with pytest.warns(UserWarning, match=r"all parts of floats.yaml are 0.2 m or more above z = 0"):
         build_actor_mesh("actor", VehicleShape(type="vehicle", vehicle=str(floats)), "cart")

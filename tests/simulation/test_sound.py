@@ -15,12 +15,12 @@ from torchcover.simulation.scene import SceneGeometry
 from torchcover.simulation.shapes import Box, Ellipsoid, Mesh, Plane
 from torchcover.simulation.sound import check_mesh, find_coincident_faces
 
-from .small_worlds import AHEAD, ALL_HEIGHTS, FLOOR, agrees, box, scenario, sums
+from .small_worlds import AHEAD, ALL_HEIGHTS, FLOOR, assert_agrees, box, scenario, sum_weights
 
 CUBE = Box(type="box", size_m=(2, 2, 2)).build_mesh()
 
 
-def file_body(folder, mesh, name="body"):
+def write_body_file(folder, mesh, name="body"):
     path = folder / f"{name}.ply"
     trimesh.Trimesh(mesh.vertices_m, mesh.faces, process=False).export(path)
     return {"name": name, "shape": {"type": "mesh", "path": str(path)}}
@@ -117,20 +117,21 @@ def test_decals_on_the_road_count_once(fix_position, raised_m, rays, steps):
     fix_position([2.5, 0.3, 1.0])
     decal = {"name": "decal", "shape": {"type": "plane", "size_m": [8, 6]}, "poses": [{"x_m": 12, "z_m": raised_m}]}
     sensor = SurfaceReference((AHEAD,), num_rays=rays, num_poses=1, bands_m=ALL_HEIGHTS)
-    agrees(sums(scenario(FLOOR, decal), sensor, num_frames=steps), 200.0)
-    agrees(
-        sums(scenario(FLOOR, decal), sensor, lambda points: points[:, 0].astype(float), num_frames=steps), 200.0 * 14
+    assert_agrees(sum_weights(scenario(FLOOR, decal), sensor, num_frames=steps), 200.0)
+    assert_agrees(
+        sum_weights(scenario(FLOOR, decal), sensor, lambda points: points[:, 0].astype(float), num_frames=steps),
+        200.0 * 14,
     )
 
 
 def test_repeated_faces_count_once(fix_position, tmp_path):
     fix_position([2.5, 3.0, 2.5])
     cube = Mesh(CUBE.vertices_m * [1, 1, 0.75] + [10, 0, 0], CUBE.faces)
-    twice = file_body(tmp_path, Mesh(cube.vertices_m, np.tile(cube.faces, (2, 1))))
+    twice = write_body_file(tmp_path, Mesh(cube.vertices_m, np.tile(cube.faces, (2, 1))))
     sensor = SurfaceReference((AHEAD,), num_rays=1000, num_poses=1, bands_m=((0.5, 2.0),))
     with pytest.warns(UserWarning, match=r"body 'body': 12 of 24 of its faces are there more than once"):
-        areas_m2 = sums(scenario(twice, FLOOR), sensor)
-    agrees(areas_m2, 2.0 + 2.0 + 4.0)
+        areas_m2 = sum_weights(scenario(twice, FLOOR), sensor)
+    assert_agrees(areas_m2, 2.0 + 2.0 + 4.0)
 
 
 def test_coincident_bodies_count_once_and_are_named(fix_position):
@@ -141,13 +142,13 @@ def test_coincident_bodies_count_once_and_are_named(fix_position):
     with pytest.warns(
         UserWarning, match=r"'box' \(10 of 12 of the faces\), 'again' \(10 of 12 of the faces\): faces lie"
     ):
-        areas_m2 = sums(scenario(first_box, second_box, FLOOR), sensor)
-    agrees(areas_m2, 2.0 + 2.0 + 4.0)
+        areas_m2 = sum_weights(scenario(first_box, second_box, FLOOR), sensor)
+    assert_agrees(areas_m2, 2.0 + 2.0 + 4.0)
 
 
 @pytest.mark.parametrize("flipped", [slice(0, 0), slice(None, None, 2)])
 def test_mesh_warnings_name_the_body(tmp_path, flipped):
-    lying = file_body(tmp_path, turned(Mesh(CUBE.vertices_m, CUBE.faces[2:]), flipped))
+    lying = write_body_file(tmp_path, turned(Mesh(CUBE.vertices_m, CUBE.faces[2:]), flipped))
     finding = "normals of neighbors disagree" if flipped.step else "6 of 18 of its edges"
     with pytest.warns(UserWarning, match=f"body 'body': .*{finding}"):
         scenario({**lying, "poses": [{"z_m": 0.5}]}, FLOOR).build_scene()
@@ -162,8 +163,8 @@ def test_terrain_area_is_independent_of_face_orientation(fix_position, tmp_path,
     which = {"up": [], "down": slice(None), "mixed": slice(None, None, 2)}[kind]
     fix_position([2.5, 0.3, 1.0])
     sensor = SurfaceReference((AHEAD,), num_rays=400, num_poses=1, bands_m=ALL_HEIGHTS)
-    body = file_body(tmp_path, turned(mesh, which))
-    agrees(sums(scenario(body), sensor), 200.0)
+    body = write_body_file(tmp_path, turned(mesh, which))
+    assert_agrees(sum_weights(scenario(body), sensor), 200.0)
     snapshot = SceneGeometry(scenario(body).build_scene()).get_snapshot(0)
     assert not snapshot.is_occupied(np.array([3.0, 0.0, 0.4]))
     assert snapshot.is_occupied(np.array([3.0, 0.0, -0.4]))

@@ -14,10 +14,10 @@ from torchcover.coverage import BevGrid, CoverageMetric
 from torchcover.data import SimulatedFrames, collate_frames
 from torchcover.simulation import PaperReference, Rig, Scenario, Simulator, SurfaceReference
 
-from .small_worlds import AHEAD, ALL_HEIGHTS, EGO, FLOOR, agrees, box, scenario, sums
+from .small_worlds import AHEAD, ALL_HEIGHTS, EGO, FLOOR, assert_agrees, box, scenario, sum_weights
 
 
-def sheet_file(folder, triangles, name="sheet.ply"):
+def write_sheet(folder, triangles, name="sheet.ply"):
     triangles = np.asarray(triangles, dtype=np.float64)
     path = folder / name
     mesh = trimesh.Trimesh(triangles.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3), process=False)
@@ -30,17 +30,17 @@ def rectangle(x, y, z=0.0):
     return [[[x0, y0, z], [x1, y0, z], [x1, y1, z]], [[x0, y0, z], [x1, y1, z], [x0, y1, z]]]
 
 
-def along_x(points):
+def get_x(points):
     return points[:, 0].astype(np.float64)
 
 
 def test_holes_reduce_the_visible_area(fix_position, tmp_path):
     parts = [((-50, 10), (-50, 50)), ((12, 50), (-50, 50)), ((10, 12), (-50, -1)), ((10, 12), (1, 50))]
-    floor = sheet_file(tmp_path, [triangle for part in parts for triangle in rectangle(*part)])
+    floor = write_sheet(tmp_path, [triangle for part in parts for triangle in rectangle(*part)])
     fix_position([2.5, 0.3, 1.0])
     sensor = SurfaceReference((AHEAD,), num_rays=400, num_poses=1, bands_m=ALL_HEIGHTS)
-    agrees(sums(scenario(floor), sensor), 200.0 - 4.0)
-    agrees(sums(scenario(floor), sensor, along_x), 200.0 * 14.0 - 4.0 * 11.0)
+    assert_agrees(sum_weights(scenario(floor), sensor), 200.0 - 4.0)
+    assert_agrees(sum_weights(scenario(floor), sensor, get_x), 200.0 * 14.0 - 4.0 * 11.0)
 
 
 @pytest.mark.parametrize(
@@ -53,14 +53,14 @@ def test_holes_reduce_the_visible_area(fix_position, tmp_path):
 )
 def test_surface_without_ground_changes_no_number(fix_position, tmp_path, pit, m2):
     parts = [((-50, 10), (-50, 50)), ((12, 50), (-50, 50)), ((10, 12), (-50, -1)), ((10, 12), (1, 50))]
-    floor = sheet_file(tmp_path, [triangle for part in parts for triangle in rectangle(*part)])
+    floor = write_sheet(tmp_path, [triangle for part in parts for triangle in rectangle(*part)])
     fix_position([11.0, 0.0, 2.0])
     sensor = SurfaceReference((AHEAD,), num_rays=2000, num_poses=2, bands_m=ALL_HEIGHTS)
-    simulator = Simulator(scenario(floor, sheet_file(tmp_path, pit, "pit.ply")), {}, sensor)
+    simulator = Simulator(scenario(floor, write_sheet(tmp_path, pit, "pit.ply")), {}, sensor)
     observations = [simulator.simulate_frame(index) for index in range(20)]
     in_no_band = [np.isnan(observation.reference_heights_m) for observation in observations]
     pairs = list(zip(observations, in_no_band, strict=True))
-    agrees(
+    assert_agrees(
         np.array([observation.reference_weights[mask].astype(np.float64).sum() for observation, mask in pairs]),
         m2,
         max_relative_error=0.05,
@@ -82,25 +82,25 @@ def test_surface_without_ground_changes_no_number(fix_position, tmp_path, pit, m
 def test_sheets_are_visible_from_both_sides(fix_position, tmp_path, turned):
     parts = [((-4, -1), (0, 4)), ((1, 4), (0, 4)), ((-1, 1), (0, 1)), ((-1, 1), (2, 4))]
     upright = np.array([triangle for part in parts for triangle in rectangle(*part)])[..., [2, 0, 1]] + [12, 0, 0]
-    sheet = sheet_file(tmp_path, upright[:, ::-1] if turned else upright)
+    sheet = write_sheet(tmp_path, upright[:, ::-1] if turned else upright)
     fix_position([2.5, 0.3, 1.0])
     sensor = SurfaceReference((AHEAD,), num_rays=400, num_poses=1, bands_m=((0.5, 2.0),))
-    agrees(sums(scenario(sheet, FLOOR), sensor), 8 * 1.5 - 2 * 1)
+    assert_agrees(sum_weights(scenario(sheet, FLOOR), sensor), 8 * 1.5 - 2 * 1)
 
 
 def test_faces_seen_edge_on_give_no_points(fix_position, tmp_path):
     upright = np.array(rectangle((-2, 2), (0, 3)))[..., [2, 0, 1]] + [12, 0, 0]
     fix_position([12.0, -5.0, 1.0])
     sensor = SurfaceReference((AHEAD,), num_rays=400, num_poses=1, bands_m=((0.5, 2.0),))
-    assert not sums(scenario(sheet_file(tmp_path, upright), FLOOR), sensor).any()
+    assert not sum_weights(scenario(write_sheet(tmp_path, upright), FLOOR), sensor).any()
 
 
 def test_two_sided_sheets_count_once(fix_position, tmp_path):
     one = np.array(rectangle((-2, 2), (0, 3)))[..., [2, 0, 1]] + [12, 0, 0]
     fix_position([2.5, 0.3, 1.0])
     sensor = SurfaceReference((AHEAD,), num_rays=400, num_poses=1, bands_m=((0.5, 2.0),))
-    both = sheet_file(tmp_path, np.concatenate([one, one[:, ::-1]]))
-    agrees(sums(scenario(both, FLOOR), sensor), 4 * 1.5)
+    both = write_sheet(tmp_path, np.concatenate([one, one[:, ::-1]]))
+    assert_agrees(sum_weights(scenario(both, FLOOR), sensor), 4 * 1.5)
 
 
 @pytest.mark.filterwarnings("ignore:.*faces lie within 1 mm")  # inside out, the bottom points up like the floor
@@ -109,12 +109,12 @@ def test_only_facing_sides_of_a_box_count(fix_position, tmp_path, inside_out):
     made = trimesh.creation.box(extents=[2, 2, 1.5])
     made.apply_translation([10, 0, 0.75])
     faces = made.vertices[made.faces]
-    body = sheet_file(tmp_path, faces[:, ::-1] if inside_out else faces)
+    body = write_sheet(tmp_path, faces[:, ::-1] if inside_out else faces)
     fix_position([2.5, 3.0, 2.5])
     sensor = SurfaceReference((AHEAD,), num_rays=1000, num_poses=1, bands_m=((0.5, 2.0),))
-    agrees(sums(scenario(body, FLOOR), sensor), 2.0 + 2.0 + 4.0)
-    on_top = sums(scenario(body, FLOOR), sensor, lambda points: points[:, 2] > 1.49999)
-    agrees(on_top, 4.0)
+    assert_agrees(sum_weights(scenario(body, FLOOR), sensor), 2.0 + 2.0 + 4.0)
+    on_top = sum_weights(scenario(body, FLOOR), sensor, lambda points: points[:, 2] > 1.49999)
+    assert_agrees(on_top, 4.0)
 
 
 def test_half_occluded_walls_have_half_the_area(fix_position):
@@ -122,16 +122,16 @@ def test_half_occluded_walls_have_half_the_area(fix_position):
     fix_position([2.6, 0.0, 1.0])
     sensor = SurfaceReference((((15.0, 25.0), (-6.0, 6.0)),), num_rays=1000, num_poses=1, bands_m=((0.5, 2.0),))
     hidden_m = 2.0 * (19.9 - 2.6) / (9.9 - 2.6)
-    agrees(sums(scenario(wall, screen, FLOOR), sensor), 1.5 * (10 - hidden_m))
-    heights = sums(scenario(wall, screen, FLOOR), sensor, lambda points: points[:, 2].astype(np.float64))
-    agrees(heights, 1.5 * 1.25 * (10 - hidden_m))
+    assert_agrees(sum_weights(scenario(wall, screen, FLOOR), sensor), 1.5 * (10 - hidden_m))
+    heights = sum_weights(scenario(wall, screen, FLOOR), sensor, lambda points: points[:, 2].astype(np.float64))
+    assert_agrees(heights, 1.5 * 1.25 * (10 - hidden_m))
 
 
 def test_the_ego_occludes_without_being_sampled(fix_position):
     fix_position([0.0, 0.0, 2.0])  # half a metre above the roof
     around = SurfaceReference((((-5.0, 5.0), (-5.0, 5.0)),), num_rays=2000, num_poses=1, bands_m=ALL_HEIGHTS)
     # The shadow of the roof, at four times the distance of the roof.
-    agrees(sums(scenario(box([1, 1, 1], x_m=90), FLOOR), around), 100.0 - 10.0 * 8.0)
+    assert_agrees(sum_weights(scenario(box([1, 1, 1], x_m=90), FLOOR), around), 100.0 - 10.0 * 8.0)
     observation = Simulator(scenario(FLOOR), {}, around).simulate_frame(0)
     assert np.abs(observation.reference[:, 2]).max() < 1e-4
     assert observation.counts["reference_self_hits"] == observation.counts["reference_rays"] - len(
@@ -143,16 +143,16 @@ def test_regions_pitch_with_the_vehicle(fix_position):
     fix_position([2.6, 0.0, 1.0])
     ego = {**EGO, "pose": {"z_m": 3.0, "pitch_deg": 5.0}}
     sensor = SurfaceReference((AHEAD,), num_rays=1000, num_poses=2, bands_m=((-6.0, 0.0),), band_frame="vehicle")
-    agrees(sums(scenario(FLOOR, ego=ego), sensor), 200.0 / math.cos(math.radians(5)))
+    assert_agrees(sum_weights(scenario(FLOOR, ego=ego), sensor), 200.0 / math.cos(math.radians(5)))
 
 
 def test_the_mean_is_independent_of_sample_sizes():
     made = Scenario.load("courtyard")
     areas = (((0.0, 20.0), (-5.0, 5.0)), ((-10.0, 40.0), (-10.0, 10.0)))
-    exact = sums(made, SurfaceReference(areas, num_rays=8192, num_poses=4), num_frames=12)
+    exact = sum_weights(made, SurfaceReference(areas, num_rays=8192, num_poses=4), num_frames=12)
     spread = {}
     for rays, num_poses, steps in [(1024, 1, 64), (1024, 4, 32), (64, 4, 32), (1, 1, 64)]:
-        sums_ = sums(
+        sums_ = sum_weights(
             made, SurfaceReference(areas, num_rays=rays, num_poses=num_poses), num_frames=steps, first_index=100
         )
         error = math.hypot(*(kind.std(ddof=1) / math.sqrt(len(kind)) for kind in (sums_, exact)))
@@ -167,8 +167,8 @@ def test_overlapping_strata_share_their_points(fix_position):
     fix_position([2.6, 0.0, 1.0])
     inner = ((6.0, 9.0), (-2.0, 3.0))
     sensor = SurfaceReference((AHEAD, inner, AHEAD), num_rays=900, num_poses=1, bands_m=((-0.5, 0.5), (-0.2, 0.1)))
-    agrees(sums(scenario(FLOOR), sensor), 200.0)
-    agrees(sums(scenario(FLOOR), sensor, lambda points: (points[:, 0] >= 6) & (points[:, 0] < 9)), 30.0)
+    assert_agrees(sum_weights(scenario(FLOOR), sensor), 200.0)
+    assert_agrees(sum_weights(scenario(FLOOR), sensor, lambda points: (points[:, 0] >= 6) & (points[:, 0] < 9)), 30.0)
     observation = Simulator(scenario(FLOOR), {}, sensor).simulate_frame(0)
     inside = (np.abs(observation.reference[:, 1] - 0.5) < 2.5) & (np.abs(observation.reference[:, 0] - 7.5) < 1.5)
     assert len(np.unique(observation.reference_weights.round(4))) == 2
@@ -194,7 +194,7 @@ def test_faces_of_any_proportion_are_sampled_correctly(fix_position, tmp_path):
     needle = [[[5, 0, 0.6], [1e5, 0, 0.6], [5, 1e-7, 0.6]]]
     nothing = [[[6, 0, 1], [6, 0, 1], [6, 0, 1]], [[6, 0, 1], [7, 0, 1], [8, 0, 1]]]
     sensor = SurfaceReference((AHEAD,), num_rays=400, num_poses=1, bands_m=ALL_HEIGHTS)
-    agrees(sums(scenario(sheet_file(tmp_path, [*huge, *needle, *nothing])), sensor), 200.0)
+    assert_agrees(sum_weights(scenario(write_sheet(tmp_path, [*huge, *needle, *nothing])), sensor), 200.0)
 
 
 def test_threads_workers_and_pickling_change_nothing():

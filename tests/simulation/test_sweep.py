@@ -28,7 +28,7 @@ def box(*size_m):
     return move_to_vehicle_frame(Box(type="box", size_m=size_m).build_mesh())
 
 
-def driving(start, way, turn_deg=0.0):
+def build_trajectory(start, way, turn_deg=0.0):
     """Build a trajectory of ten seconds that begins before the scene."""
     return Trajectory.from_arrays(
         [-5.0, 5.0], [np.subtract(start, way), np.add(start, way)], [[-turn_deg, 0, 0], [turn_deg, 0, 0]]
@@ -39,13 +39,13 @@ def build_scene(ego_mps=0.0, cars_mps=0.0, turn_deg=0.0, step_s=PERIOD_S):
     """Build an ego between two walls, an approaching car next to it, and a car that crosses far ahead."""
     ground, wall = Plane(type="plane", size_m=(400, 400)).build_mesh(), box(60, 0.5, 4)
     walls = [wall.transform(Pose(y_m=y_m).to_matrix()) for y_m in (-9.0, 12.0)]
-    ego = Actor("ego", "ego", box(4, 2, 1), driving((0, 0, 0), (5 * ego_mps, 0, 0), turn_deg))
-    near_car = Actor("beside", "car", box(4, 2, 1.5), driving((6, 5, 0), (-5 * cars_mps, 0, 0)))
-    ahead = Actor("ahead", "car", box(4, 2, 1.5), driving((15, -2, 0), (0, 5 * cars_mps, 0), 2 * turn_deg))
+    ego = Actor("ego", "ego", box(4, 2, 1), build_trajectory((0, 0, 0), (5 * ego_mps, 0, 0), turn_deg))
+    near_car = Actor("beside", "car", box(4, 2, 1.5), build_trajectory((6, 5, 0), (-5 * cars_mps, 0, 0)))
+    ahead = Actor("ahead", "car", box(4, 2, 1.5), build_trajectory((15, -2, 0), (0, 5 * cars_mps, 0), 2 * turn_deg))
     return Scene((ground, *walls), ego, (near_car, ahead), time_step_s=step_s, duration_s=1.0)
 
 
-def swept(made, time_s=0.5, lidar=LIDAR, draws=EXACT):
+def scan_sweep(made, time_s=0.5, lidar=LIDAR, draws=EXACT):
     scene = SceneGeometry(made)
     mounted = MountedSensor(lidar, scene, lidar.max_range_m)
     return mounted, mounted.scan(scene.get_snapshot(round(time_s / made.time_step_s)), draws)
@@ -57,8 +57,8 @@ def swept(made, time_s=0.5, lidar=LIDAR, draws=EXACT):
 def test_columns_equal_scans_at_their_own_time(ego_mps, cars_mps, turn_deg):
     """Compared with a slow implementation that places the whole scene for each column."""
     made = build_scene(ego_mps, cars_mps, turn_deg)
-    mounted, sweep = swept(made)
-    _, raw = swept(made, lidar=LIDAR.model_copy(update={"scan": ScanTimes(period_s=PERIOD_S, deskewed=False)}))
+    mounted, sweep = scan_sweep(made)
+    _, raw = scan_sweep(made, lidar=LIDAR.model_copy(update={"scan": ScanTimes(period_s=PERIOD_S, deskewed=False)}))
     np.testing.assert_array_equal(raw.points, sweep.points)
     fine = SceneGeometry(build_scene(ego_mps, cars_mps, turn_deg, step_s=STEP_S))
     now, at_once = round(0.5 / STEP_S), LIDAR.model_copy(update={"scan": None})
@@ -99,14 +99,14 @@ def test_columns_equal_scans_at_their_own_time(ego_mps, cars_mps, turn_deg):
 
 
 def test_static_scenes_give_identical_bits():
-    _, still = swept(build_scene())
-    _, at_once = swept(build_scene(), lidar=LIDAR.model_copy(update={"scan": None}))
+    _, still = scan_sweep(build_scene())
+    _, at_once = scan_sweep(build_scene(), lidar=LIDAR.model_copy(update={"scan": None}))
     np.testing.assert_array_equal(still.points.view(np.int32), at_once.points.view(np.int32))
     assert still.measured_points is None
     # An ego at rest among moving actors: hits on static bodies are the same, and their measured points are exact.
     moving = build_scene(cars_mps=15.0)
-    _, sweep = swept(moving)
-    _, at_once = swept(moving, lidar=LIDAR.model_copy(update={"scan": None}))
+    _, sweep = scan_sweep(moving)
+    _, at_once = scan_sweep(moving, lidar=LIDAR.model_copy(update={"scan": None}))
     common_rays = np.intersect1d(sweep.ray_indices, at_once.ray_indices)
     same = (
         sweep.points[np.isin(sweep.ray_indices, common_rays)]
@@ -119,8 +119,8 @@ def test_static_scenes_give_identical_bits():
 def test_motion_distortion_is_speed_times_time(car_mps):
     """The rear of a car 8 m ahead of an ego at 20 m/s: three clouds in closed form."""
     made = build_scene(ego_mps=20.0)
-    car = Actor("car", "car", box(4, 6, 1.5), driving((20.0 - car_mps / 2, 0, 0), (5 * car_mps, 0, 0)))
-    mounted, sweep = swept(replace(made, static_meshes=made.static_meshes[:1], actors=(car,)))
+    car = Actor("car", "car", box(4, 6, 1.5), build_trajectory((20.0 - car_mps / 2, 0, 0), (5 * car_mps, 0, 0)))
+    mounted, sweep = scan_sweep(replace(made, static_meshes=made.static_meshes[:1], actors=(car,)))
     pixel = mounted.ray_pixel_indices[sweep.ray_indices]
     time_s = LIDAR.compute_ray_times_s().reshape(-1)[pixel]
     directions = LIDAR.mount.to_matrix()[:3, :3] @ LIDAR.compute_directions().reshape(3, -1)[:, pixel]
@@ -140,7 +140,7 @@ def test_first_frames_are_simulated_like_later_frames():
     made = build_scene(ego_mps=20.0)
     made = replace(made, static_meshes=made.static_meshes[:1], actors=())
     (_, first), (_, later), (_, at_once) = (
-        swept(made, time_s, lidar)
+        scan_sweep(made, time_s, lidar)
         for time_s, lidar in ((0.0, LIDAR), (0.5, LIDAR), (0.0, LIDAR.model_copy(update={"scan": None})))
     )
     np.testing.assert_allclose(first.points, later.points, atol=2e-3)
@@ -169,7 +169,7 @@ def test_range_errors_are_along_the_distorted_ray():
     """Errors are along the ray as it was cast, from the sensor position at that time."""
     made = build_scene(ego_mps=20.0)
     exact, erring = (
-        swept(made, lidar=LIDAR.model_copy(update={"range_noise_m": sigma_m}), draws=draws)[1]
+        scan_sweep(made, lidar=LIDAR.model_copy(update={"range_noise_m": sigma_m}), draws=draws)[1]
         for sigma_m, draws in ((0.0, EXACT), (0.5, SensorNoise(np.random.default_rng(1))))
     )
     np.testing.assert_array_equal(erring.points, exact.points)
@@ -187,6 +187,6 @@ def test_scans_longer_than_time_steps_are_refused():
         with pytest.raises(
             ValueError, match=r"'roof': a scan of period_s 0\.1 is longer than the time step .* 0\.05 s"
         ):
-            swept(build_scene(ego_mps=ego_mps, step_s=0.05))
+            scan_sweep(build_scene(ego_mps=ego_mps, step_s=0.05))
     with pytest.raises(ValueError, match=r"scan\.period_s: a number above 0"):
         Lidar(**{**LIDAR.model_dump(), "scan": {"period_s": 0.0}})

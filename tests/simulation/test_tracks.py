@@ -90,7 +90,7 @@ def test_a_bad_trajectory_names_the_file(tmp_path, content, message):
 UNIX_S = 1_700_000_000
 
 
-def scenario_at(folder, ego_s, actor_s, boxes_s):
+def create_scenario_at(folder, ego_s, actor_s, boxes_s):
     """Build a run of 4 s of an ego, an actor and a box at 2, 3 and 4 m/s, each with a different start time."""
     for name, start_s, speed in (("ego", ego_s, 2), ("actor", actor_s, 3)):
         rows = "".join(f"{start_s + k / 4:.6f},{speed * k / 4},{10 * speed},0,0,0,0\n" for k in range(17))
@@ -107,7 +107,7 @@ def scenario_at(folder, ego_s, actor_s, boxes_s):
 
 @pytest.mark.parametrize("start_s", [0, UNIX_S, 1e5])
 def test_trajectories_of_another_clock_move_alike(tmp_path, start_s):
-    scene = scenario_at(tmp_path, start_s, start_s + 1, start_s).build_scene()
+    scene = create_scenario_at(tmp_path, start_s, start_s + 1, start_s).build_scene()
     places_m = [
         actor.trajectory.interpolate_positions_m(np.array([0.0, 1.5, 3.0]))[:, 0]
         for actor in (scene.ego, *scene.actors)
@@ -117,7 +117,7 @@ def test_trajectories_of_another_clock_move_alike(tmp_path, start_s):
 
 def test_trajectories_of_different_clocks_are_named(tmp_path):
     with pytest.warns(UserWarning, match="give all trajectories one clock") as warned:
-        scenario_at(tmp_path, UNIX_S, 0, UNIX_S).build_scene()
+        create_scenario_at(tmp_path, UNIX_S, 0, UNIX_S).build_scene()
     first, second = (str(warning.message) for warning in warned)
     assert first.startswith(
         "ego rests: its times, 1700000000.000 to 1700000004.000 s, lie outside of the run, 0.000 to"

@@ -48,7 +48,7 @@ def load(name):
     return Vehicle.load(name)
 
 
-def height_at(mesh, x_m, y_m):
+def compute_height(mesh, x_m, y_m):
     """Compute the height of the highest surface over a ground position; -inf without surface."""
     a, b, c = (mesh.vertices_m[mesh.faces[:, corner]] for corner in range(3))
 
@@ -63,9 +63,9 @@ def height_at(mesh, x_m, y_m):
     return max(heights, default=-np.inf)
 
 
-def profile(mesh, x_m):
+def compute_profile(mesh, x_m):
     """Compute the height profile of a vehicle along its center line."""
-    return np.array([height_at(mesh, x, 0.013) for x in x_m])
+    return np.array([compute_height(mesh, x, 0.013) for x in x_m])
 
 
 def test_all_built_in_vehicles_are_tested():
@@ -121,7 +121,7 @@ def test_axles_of_published_vehicles_match_their_rigs(name):
 def test_cars_have_hood_windscreen_and_roof(name):
     mesh = load(name).build_mesh()
     x = np.linspace(-0.98, 0.98, 197) * SIZES_M[name][0] / 2
-    outline = profile(mesh, x)
+    outline = compute_profile(mesh, x)
     roof = SIZES_M[name][2]
     hood = outline[x > 0.6 * x.max()].max()
     assert 0.4 * roof < hood < 0.72 * roof

@@ -11,7 +11,7 @@ from torchcover.geometry import invert
 from torchcover.simulation import Scenario, Simulator, SurfaceReference, sample_position_in_shell
 
 
-def visible_area(scene, place_m, box_m, rays, seed, max_range_m=250.0):
+def compute_visible_area(scene, place_m, box_m, rays, seed, max_range_m=250.0):
     """Compute visible surface points within a box from a position, with the area in m² of each.
 
     Rays aim at points sampled uniformly in the box, so that their density per solid angle is
@@ -37,7 +37,7 @@ def visible_area(scene, place_m, box_m, rays, seed, max_range_m=250.0):
     return points_m[is_visible], range_m[is_visible] ** 2 / (cosine * per_angle[is_visible])
 
 
-def _scene(world, step):
+def _build_scene(world, step):
     """Build the scene at one time in the vehicle frame, the ego first."""
     time_s = step * world.time_step_s
     vehicle_T_world = invert(world.ego.trajectory.interpolate(time_s))
@@ -71,17 +71,17 @@ def test_both_references_measure_the_same_visible_area(made, seed, monkeypatch):
         step = simulator.simulate_frame(index)
         points.append((step.reference, step.reference_weights))
         scene, time_step = simulator.get_scene_geometry(index)
-        twin = _scene(scene.scene, time_step)
+        twin = _build_scene(scene.scene, time_step)
         for place_m in positions[-4:]:
-            points_m, m2 = visible_area(twin, place_m, (*AREA, (-0.6, 2.1)), 2**15, seed=index)
+            points_m, m2 = compute_visible_area(twin, place_m, (*AREA, (-0.6, 2.1)), 2**15, seed=index)
             twins.append((points_m, m2 / 4))
     for low, high in BANDS:
-        ours, theirs = (_sums(found, low, high) for found in (points, twins))
+        ours, theirs = (_compute_sums(found, low, high) for found in (points, twins))
         assert ours[0] == pytest.approx(theirs[0], rel=0.01)
         assert ours[1:] / ours[0] == pytest.approx(theirs[1:] / theirs[0], rel=0.01, abs=0.15)
 
 
-def _sums(points, low, high):
+def _compute_sums(points, low, high):
     """Compute the area in a band, and the area-weighted sums of the distance from the vehicle and of y."""
     points_m, m2 = (np.concatenate(part).astype(np.float64) for part in zip(*points, strict=True))
     m2 = m2 * (points_m[:, 2] >= low) * (points_m[:, 2] < high)

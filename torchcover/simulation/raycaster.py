@@ -65,13 +65,6 @@ def _convert_faces_for_embreex(faces: NDArray[np.integer]) -> NDArray[Any]:
     return np.fromiter(faces.tolist(), dtype=object, count=len(faces))
 
 
-def _build_warp_scene(bodies: Sequence[Mesh], device: str) -> Any:  # noqa: ANN401  (same interface as EmbreeScene)
-    """Build a Warp scene of the bodies on a device; Warp is imported on first use."""
-    from torchcover.simulation.warp_scene import WarpScene
-
-    return WarpScene(bodies, device)
-
-
 class Hits(NamedTuple):
     """Hits of N rays.
 
@@ -128,7 +121,12 @@ class RayCaster:
         self._bodies = bodies
         self._outward_masks: dict[int, Bools] = {}  # by body; needed for few, since rays hardly ever start inside
         self._last_touched: tuple[bytes, Int64] = b"", np.empty(0, dtype=np.int64)
-        self._scene = _build_embree_scene(bodies) if device is None else _build_warp_scene(bodies, device)
+        if device is None:
+            self._scene = _build_embree_scene(bodies)
+        else:
+            from torchcover.simulation.warp_scene import WarpScene  # Warp is imported on first use
+
+            self._scene = WarpScene(bodies, device)
 
     @cached_property
     def _faces(self) -> FaceGeometry:

@@ -134,25 +134,21 @@ def compute_labels(scene: Scene, time_step_index: int, max_distance_m: float) ->
     for object_index, actor in enumerate(scene.objects):
         position_m = actor.trajectory.interpolate_positions_m(np.array([time_s]))[0]
         # The position of an absent object is NaN, hence not near.
-        if np.hypot(*(position_m - world_T_vehicle[:3, 3])[:2]) <= max_distance_m:
-            if id(actor.mesh) not in boxes:
-                boxes[id(actor.mesh)] = BoundingBox.from_points(actor.mesh.vertices_m)
-            labels.append(_create_label(object_index, actor, boxes[id(actor.mesh)], vehicle_T_world, time_s))
+        if not np.hypot(*(position_m - world_T_vehicle[:3, 3])[:2]) <= max_distance_m:
+            continue
+        if id(actor.mesh) not in boxes:
+            boxes[id(actor.mesh)] = BoundingBox.from_points(actor.mesh.vertices_m)
+        box = boxes[id(actor.mesh)]
+        vehicle_T_actor = vehicle_T_world @ actor.trajectory.interpolate(time_s)
+        box_center_m = (np.array(box.lower_m) + np.array(box.upper_m)) / 2
+        label = ObjectLabel(
+            object_index,
+            actor.name,
+            actor.category,
+            center_m=transform_points(vehicle_T_actor, box_center_m[None])[0],
+            size_m=box.size_m,
+            yaw_rad=float(np.deg2rad(convert_rotation_to_euler(vehicle_T_actor[:3, :3])[0])),
+            velocity_mps=(vehicle_T_world[:3, :3] @ actor.trajectory.compute_velocity_mps(time_s))[:2],
+        )
+        labels.append(label)
     return labels
-
-
-def _create_label(
-    object_index: int, actor: Actor, box: BoundingBox, vehicle_T_world: Matrix, time_s: float
-) -> ObjectLabel:
-    """Create the label of an object from its pose at a time."""
-    vehicle_T_actor = vehicle_T_world @ actor.trajectory.interpolate(time_s)
-    center_m = (np.array(box.lower_m) + np.array(box.upper_m)) / 2
-    return ObjectLabel(
-        object_index,
-        actor.name,
-        actor.category,
-        center_m=transform_points(vehicle_T_actor, center_m[None])[0],
-        size_m=box.size_m,
-        yaw_rad=float(np.deg2rad(convert_rotation_to_euler(vehicle_T_actor[:3, :3])[0])),
-        velocity_mps=(vehicle_T_world[:3, :3] @ actor.trajectory.compute_velocity_mps(time_s))[:2],
-    )
