@@ -138,15 +138,12 @@ def compare(
             f"{files[0]} is measured already: compare coverage files with each other, without "
             f"{', '.join(changed) or 'rigs'}; or `evaluate` rigs in the same frames first"
         )
-    _compare_files(files, values["out"], file_kinds=values["files"], explain=values["explain"])
-
-
-def _compare_files(files: list[str], out: Path, *, file_kinds: str, explain: bool) -> None:
-    """Compare coverage files."""
     from torchcover import evaluation
 
+    out = values["out"]
     with join_run(out) as ranks:
-        save_and_print(evaluation.compare(files), out, ranks, file_kinds=file_kinds, explain=explain)
+        result = evaluation.compare(files)
+        save_and_print(result, out, ranks, file_kinds=values["files"], explain=values["explain"])
 
 
 def open_frames(

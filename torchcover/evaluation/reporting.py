@@ -222,7 +222,7 @@ def report(
     Example:
         >>> result = report("front_roof_128", "courtyard", num_frames=8)
         >>> print(result.verdict[0])
-        A child of 1.10 m is detected (5 points or more) at 35 % of the places within 2 m by front_roof_128.
+        A child of 1.10 m is detected (5 points or more) at 35 % of the positions within 2 m by front_roof_128.
     """
     start_s = time.monotonic()
     inputs = [rigs] if isinstance(rigs, str | Path | Rig) else list(rigs)
