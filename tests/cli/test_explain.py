@@ -15,7 +15,7 @@ def test_static_scene_reuses_its_scan(torchcover, scenes):
     assert code == 0, stderr
     assert "Omissions that cannot change the result" in text
     reused = whats(scenes / "out")["sensor rays in a static scene: cast once for all frames"]
-    assert (reused["count"], reused["total"]) == (2 * 8 * 30, 3 * 8 * 30)  # the first step casts them
+    assert (reused["count"], reused["total"]) == (2 * 8 * 30, 3 * 8 * 30)  # the first frame casts them
     once = [*options[:3], "1", *options[4:]]
     assert torchcover("evaluate", scenes / "low.yaml", *once)[0] == 0
     assert not any("cast once" in what or "first scan" in what for what in whats(scenes / "out"))

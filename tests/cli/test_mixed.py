@@ -28,7 +28,7 @@ def test_several_scenarios_are_evaluated_and_mixed(torchcover, scenes):
     assert titles == ["yard", "plain", "mixture"]
     summary = json.loads((scenes / "out" / "summary.json").read_text())
     assert summary["complete"] is True
-    assert [world["weight"] for world in summary["scenarios"].values()] == [0.75, 0.25]
+    assert [scenario["weight"] for scenario in summary["scenarios"].values()] == [0.75, 0.25]
     assert (scenes / "out" / "plain" / "checkpoint.npz").is_file()
     # What is complete and not to be gone on with takes its checkpoints away.
     assert torchcover("compare", *rigs, *options, "--files", "numbers")[0] == 0

@@ -49,11 +49,11 @@ def test_record_rejects_invalid_options(torchcover, scenes, tmp_path):
 
 
 def test_interrupted_recording_is_resumed_but_not_evaluated(torchcover, scenes, monkeypatch):
-    out, step = scenes / "drive", writing.build_frame_record
+    out, build_frame_record = scenes / "drive", writing.build_frame_record
     command = ("record", scenes / "low.yaml", "--scenario", scenes / "yard.yaml", "--num-frames", 3, "--num-rays", 64)
 
     def interrupt_at_frame_1(*args):
-        return (args[1] == 1 and signal.raise_signal(2)) or step(*args)
+        return (args[1] == 1 and signal.raise_signal(2)) or build_frame_record(*args)
 
     monkeypatch.setattr(writing, "build_frame_record", interrupt_at_frame_1)
     code, _, stderr = torchcover(*command, "--out", out)
@@ -62,7 +62,7 @@ def test_interrupted_recording_is_resumed_but_not_evaluated(torchcover, scenes, 
     code, _, stderr = torchcover("evaluate", "--frames", out, "--set", "cell_m=8", "--out", scenes / "out")
     assert code == 2
     assert f"{out}: an incomplete recording with 1 frames; continue it with `torchcover record" in stderr
-    monkeypatch.setattr(writing, "build_frame_record", step)
+    monkeypatch.setattr(writing, "build_frame_record", build_frame_record)
     code, printed, _ = torchcover(*command, "--out", out, "--resume")
     assert (code, printed.startswith("Wrote 3 frames to ")) == (0, True)
     assert torchcover("evaluate", "--frames", out, "--set", "cell_m=8", "--out", scenes / "out")[0] == 0

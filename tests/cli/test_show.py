@@ -16,7 +16,7 @@ from torchcover.simulation import Rig, Scenario, list_builtin_names
 
 
 @pytest.fixture
-def drawn(monkeypatch):
+def plotted(monkeypatch):
     """Arguments of the last plotting call."""
     calls: dict = {}
     for name in ("plot_rig", "plot_vehicle", "plot_scene", "plot_depth_images"):
@@ -29,14 +29,14 @@ def drawn(monkeypatch):
     return calls
 
 
-def test_rig_is_plotted_on_the_ego_vehicle(torchcover, scenes, drawn):
+def test_rig_is_plotted_on_the_ego_vehicle(torchcover, scenes, plotted):
     code, printed, _ = torchcover(
         "show", scenes / "both.yaml", "--scenario", scenes / "yard.yaml", "--out", scenes / "new" / "out"
     )
     assert code == 0
     assert "both.png" in printed
     assert min(imread(scenes / "new" / "out" / "both.png").shape[:2]) > 500
-    vertices_m, _, sensors = drawn["args"]
+    vertices_m, _, sensors = plotted["args"]
     assert np.ptp(vertices_m, axis=0).tolist() == [4.0, 2.0, 1.0]
     assert [sensor.name for sensor in sensors] == ["front", "rear"]
     assert sensors[1].vertical_fov_deg == pytest.approx((-30.0, 0.0))
@@ -44,24 +44,24 @@ def test_rig_is_plotted_on_the_ego_vehicle(torchcover, scenes, drawn):
     assert sensors[1].mask_directions(np.array([[-1.0, 0.0, -0.1], [1.0, 0.0, -0.1]])).tolist() == [True, False]
 
 
-def test_scenario_is_plotted_in_the_vehicle_frame(torchcover, scenes, drawn):
+def test_scenario_is_plotted_in_the_vehicle_frame(torchcover, scenes, plotted):
     code, _, _ = torchcover(
         "show", scenes / "yard.yaml", "--rig", scenes / "low.yaml", "--frame-index", 3, "--out", scenes
     )
     assert code == 0
     assert min(imread(scenes / "yard.png").shape[:2]) > 500
-    ahead, far = drawn["actors"]
+    ahead, far = plotted["actors"]
     assert (ahead.category, far.category) == ("box", "far")
     np.testing.assert_allclose(sorted(ahead.outline_m[:, 0].round(6)), [18.0, 18.0, 22.0, 22.0])
     np.testing.assert_allclose(sorted(ahead.outline_m[:, 1].round(6)), [4.0, 4.0, 6.0, 6.0])
-    assert drawn["title"] == "yard, frame 3"
+    assert plotted["title"] == "yard, frame 3"
     # Sensor points lie on the plotted actor.
-    sensor = drawn["sensor_points"]
+    sensor = plotted["sensor_points"]
     on_actor = sensor[sensor[:, 2] > 0.1]
     assert len(on_actor)
     assert (np.abs(on_actor[:, 0] - 20.0) < 2.1).all()
     assert (np.abs(on_actor[:, 1] - 5.0) < 1.1).all()
-    assert len(drawn["reference_points"]) > 1000
+    assert len(plotted["reference_points"]) > 1000
 
 
 @pytest.mark.filterwarnings("default")
@@ -149,7 +149,7 @@ def test_roadside_rig_is_plotted(torchcover, tmp_path):
     assert torchcover("show", "courtyard", "--rig", rig, "--out", tmp_path)[0] == 0
 
 
-def test_mount_regions_lie_on_the_vehicle_surface(torchcover, tmp_path, drawn):
+def test_mount_regions_lie_on_the_vehicle_surface(torchcover, tmp_path, plotted):
     (tmp_path / "cart.yaml").write_text(
         """
         name: cart
@@ -164,7 +164,7 @@ def test_mount_regions_lie_on_the_vehicle_surface(torchcover, tmp_path, drawn):
     assert code == 0
     assert "A box on wheels" in printed
     assert min(imread(tmp_path / "cart.png").shape[:2]) > 500
-    _, _, (lid, tail) = drawn["args"]
+    _, _, (lid, tail) = plotted["args"]
     assert (lid.name, lid.side, tail.name, tail.side) == ("lid", "above", "tail", "rear")
     for patch, lowest, highest in (
         (lid, [-1.0, -0.4, 0.8], [1.0, 0.4, 0.8]),
@@ -184,7 +184,7 @@ def test_mount_region_outside_the_body_is_named(torchcover, tmp_path):
     assert "mount region 'lid': at x = 1.545 m" in error
 
 
-def test_depth_images_belong_to_the_chosen_frame(torchcover, scenes, drawn):
+def test_depth_images_belong_to_the_chosen_frame(torchcover, scenes, plotted):
     """A wall fills the left half of the image: 20 m ahead of the bumper in the first frame, 15 m in the chosen one."""
     (scenes / "cameras.yaml").write_text(
         "name: cameras\nsensors:\n"
@@ -207,14 +207,14 @@ def test_depth_images_belong_to_the_chosen_frame(torchcover, scenes, drawn):
     assert code == 0
     assert "cameras_depth.png" in printed
     assert imread(scenes / "cameras_depth.png").shape[1] > 500
-    (images,) = drawn["args"]
+    (images,) = plotted["args"]
     assert {name: image.shape for name, image in images.items()} == {"a": (20, 40), "b": (20, 20)}
     # One row above the middle the rays rise by half a pixel of 20 a metre.
     across = (19.5 - np.arange(20)) / 20
     np.testing.assert_allclose(images["a"][9, :20], 15 * np.sqrt(1 + across**2 + (0.5 / 20) ** 2), rtol=1e-5)
     assert np.isinf(images["a"][9, 20:]).all()
     assert np.isnan(images["b"]).any()
-    assert "t = 1 s" in drawn["subtitle"]
+    assert "t = 1 s" in plotted["subtitle"]
 
 
 @pytest.mark.parametrize("arguments", [["three_cameras", "--scenario"], []])
@@ -364,7 +364,7 @@ def test_invalid_animation_file_is_rejected(options, message, torchcover, scenes
 
 
 @pytest.mark.parametrize("at_m", [50.0, 160.8])
-def test_height_above_ground_follows_a_slope(at_m, torchcover, scenes, drawn):
+def test_height_above_ground_follows_a_slope(at_m, torchcover, scenes, plotted):
     slope = np.deg2rad(4.0)
     # The second part of the slope begins at the edge of the picture, below bodies that reach into the picture.
     grounds, kerb = (
@@ -378,7 +378,7 @@ def test_height_above_ground_follows_a_slope(at_m, torchcover, scenes, drawn):
     )
     code, _, _ = torchcover("show", scenes / "slope.yaml", "--rig", scenes / "low.yaml", "--out", scenes)
     assert code == 0
-    static_faces = drawn["static_faces"]
+    static_faces = plotted["static_faces"]
     assert np.abs(static_faces.triangles_m[..., 0] - at_m).max() < 5.0  # the slope is ground, not scenery
     # The last two faces of a box are its top; the two faces before are its bottom, which lies on the slope.
     np.testing.assert_allclose(static_faces.height_m[-4:], [0, 0, 1.0024, 1.0024], atol=1e-3)

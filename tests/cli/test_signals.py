@@ -79,7 +79,7 @@ def read_progress(out):
 
 
 @pytest.mark.parametrize(
-    ("number", "action", "expected", "steps", "messages"),
+    ("number", "action", "expected", "num_frames", "messages"),
     [
         (signal.SIGINT, signal.default_int_handler, 130, 2, ["torchcover: interrupted"]),
         (signal.SIGINT, signal.SIG_IGN, 0, 3, []),
@@ -89,14 +89,14 @@ def read_progress(out):
     ],
 )
 def test_signal_between_two_rigs_leaves_a_paired_result(
-    torchcover, scenes, at_update, handler, number, action, expected, steps, messages
+    torchcover, scenes, at_update, handler, number, action, expected, num_frames, messages
 ):
     handler(number, action)
     at_update(3, lambda: send(number))
     code, _, stderr = torchcover(*arguments(scenes))
     assert code == expected
     assert [line for line in stderr.splitlines() if line.startswith("torchcover:")] == messages
-    assert read_progress(scenes / "out")[:2] == ([steps, steps], expected == 0)
+    assert read_progress(scenes / "out")[:2] == ([num_frames, num_frames], expected == 0)
     assert signal.getsignal(number) is action
 
 

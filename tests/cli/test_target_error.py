@@ -30,9 +30,9 @@ def test_evaluate_stops_at_the_target_error(torchcover, long_recording, tmp_path
     code, printed, _ = torchcover("evaluate", *arguments, "--target-error", "0.05m", "--target-error", "20%")
     assert code == 0
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
-    steps = summary["counts"]["num_frames"]
-    assert 32 <= steps < 150
-    assert f"Target error reached after {steps} frames." in printed
+    num_frames = summary["counts"]["num_frames"]
+    assert 32 <= num_frames < 150
+    assert f"Target error reached after {num_frames} frames." in printed
     assert (summary["complete"], summary["target_error"]["reached"]) == (True, True)
     assert all(row["radius_m_error"] <= 0.05 for row in summary["rows"] if row["observed_cells"])
     assert re.search(r"0\.\d+  \[0\.\d+, 0\.\d+\]", printed)

@@ -110,7 +110,7 @@ def collect_bits(result):
         "counts": dict(result.run.counts),
     }
     for name, coverage in result.coverages.items():
-        blocks = {"block sums": coverage.block_sums.sums, "block steps": coverage.block_sums.frame_counts}
+        blocks = {"block sums": coverage.block_sums.sums, "block frames": coverage.block_sums.frame_counts}
         layers = {key: layer.values for key, layer in coverage.layers.items()}
         for key, tensor in {
             **blocks,

@@ -45,8 +45,8 @@ def test_error_model_decreases_to_the_bias(coefficient):
     assert ErrorModel(coefficient).estimate_error(400) == pytest.approx(
         0.5 * ErrorModel(coefficient).estimate_error(100), rel=1e-12
     )
-    steps = model.estimate_num_frames(0.01)
-    assert model.estimate_error(steps) <= 0.01 < model.estimate_error(steps - 1) or steps == 1
+    num_frames = model.estimate_num_frames(0.01)
+    assert model.estimate_error(num_frames) <= 0.01 < model.estimate_error(num_frames - 1) or num_frames == 1
     assert model.estimate_num_frames(0.003) is None
     assert ErrorModel(math.nan).estimate_num_frames(0.01) is None
     assert ErrorModel.from_error(ErrorModel(coefficient).estimate_error(77), 77).error_coefficient == pytest.approx(
