@@ -41,7 +41,7 @@ def main():
 
 
 def reading(recording):
-    paths = [Path(recording.scan("velodyne", index).source) for index in range(SWEEPS)]
+    paths = [Path(recording.read_scan("velodyne", index).source) for index in range(SWEEPS)]
 
     def straight():
         for path in paths:
@@ -50,7 +50,7 @@ def reading(recording):
 
     def ours():
         for index in range(SWEEPS):
-            transform_to_vehicle(recording.scan("velodyne", index), recording.body)
+            transform_to_vehicle(recording.read_scan("velodyne", index), recording.ego_box)
 
     seconds, ratios = compare(straight, ours)
     rows = [

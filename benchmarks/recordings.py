@@ -206,7 +206,7 @@ def found_movers(recording, reference, frame):
     """How far off in m/s is each vehicle that moves and has enough points; inf for one that is not found."""
     instant = recording.key_frames[0]
     time_s, loose_m, apart_s = recording.times_s[instant], [], []
-    vehicle_T_local = invert(reference.sweeps.compute_local_T_vehicle(recording, instant))
+    vehicle_T_local = invert(reference.sweep_window.compute_local_T_vehicle(recording, instant))
     for (_, index), (points_m, told) in reference.classify_points(recording, instant).items():
         own_m = transform_points(vehicle_T_local, points_m[told > 0])
         since_s = recording.times_s[index] - time_s

@@ -92,13 +92,19 @@ def test_the_advised_number_of_frames_gives_intervals(points, frames):
     assert summarize_findings(short)[0].endswith("and the source has 3.")
 
 
-@pytest.mark.parametrize(("shares", "best", "sentence"), [
-    ({"many": 0.997}, None, "Free positions within 3 m where a child is detected (detection within 0.4 m): in front 99 % ["),
-    ({"many": 0.0}, None, "Free positions within 3 m where a child is detected (detection within 0.4 m): in front 0 %."),
-    ({"many": 1.0}, None, "Free positions within 3 m where a child is detected (detection within 0.4 m): in front 100 %."),
-    ({"few": 0.004, "many": 1.0}, "many", "a child is detected (detection within 0.4 m): in front many 100 %, few 1 %."),
-    ({"few": 0.5, "many": 0.6}, None, "where a child is detected (detection within 0.4 m): no rig has significantly more than"),
-])  # fmt: skip
+CHILD = "where a child is detected (detection within 0.4 m): "
+
+
+@pytest.mark.parametrize(
+    ("shares", "best", "sentence"),
+    [
+        ({"many": 0.997}, None, f"Free positions within 3 m {CHILD}in front 99 % ["),
+        ({"many": 0.0}, None, f"Free positions within 3 m {CHILD}in front 0 %."),
+        ({"many": 1.0}, None, f"Free positions within 3 m {CHILD}in front 100 %."),
+        ({"few": 0.004, "many": 1.0}, "many", f"{CHILD}in front many 100 %, few 1 %."),
+        ({"few": 0.5, "many": 0.6}, None, f"{CHILD}no rig has significantly more than"),
+    ],
+)
 def test_bodies_come_first(trio, shares, best, sentence):
     table = with_bodies(CoverageTable.from_coverages({name: trio[name] for name in shares}, AHEAD), shares, best)
     first, *_ = summarize_findings(table)
@@ -112,21 +118,28 @@ def test_few_agreeing_positions_are_not_reported(trio):
         assert ("where a child is detected (detection within 0.4 m): in front 100 %" in words) == told
 
 
-@pytest.mark.parametrize(("alone", "blocks", "sentence"), [
-    (lambda index: 30 + index % 2, 16, "Single point of failure: roof; without it, detection within 0.01 m in near ground changes from "),
-    (lambda index: 5 + index % 2, 16, "No single point of failure: no failure of a sensor changes a number significantly by 10 % or more"),
-    (lambda index: 40 * (index < 3), 16, "No single point of failure: no failure of a sensor changes a number significantly by 10 % or more"),
-    (lambda index: 30 + index % 2, 4, "Largest effect of a failure: without roof, detection within 0.01 m in "),
-])  # fmt: skip
-def test_single_point_of_failure_loses_a_tenth_significantly(alone, blocks, sentence):
-    """So many of 100 points does the roof see alone; sixty others are seen by both sensors."""
+INSIGNIFICANT = "No single point of failure: no failure of a sensor changes a number significantly by 10 % or more"
+CHANGE = "detection within 0.01 m in near ground changes from "
+
+
+@pytest.mark.parametrize(
+    ("count_roof_points", "blocks", "sentence"),
+    [
+        (lambda index: 30 + index % 2, 16, f"Single point of failure: roof; without it, {CHANGE}"),
+        (lambda index: 5 + index % 2, 16, INSIGNIFICANT),
+        (lambda index: 40 * (index < 3), 16, INSIGNIFICANT),
+        (lambda index: 30 + index % 2, 4, f"Largest effect of a failure: without roof, {CHANGE}"),
+    ],
+)
+def test_single_point_of_failure_loses_a_tenth_significantly(count_roof_points, blocks, sentence):
+    """Of 100 points, both sensors detect 60, and the roof sensor alone some of the others."""
     grid = BevGrid(x_m=(-8.0, 12.0), y_m=(-5.0, 5.0), cell_m=1.0)
     metric = CoverageMetric(
         grid, (0.01,), num_blocks=16, regions=AHEAD[:1], has_area_weights=True, sensor_names=("roof", "rear")
     )
     for index in range(blocks):
         reference = torch.rand(100, 3, generator=torch.Generator().manual_seed(index)) * torch.tensor([4.0, 4.0, 0.2])
-        seen = {"roof": reference[: 60 + alone(index)], "rear": reference[:60]}
+        seen = {"roof": reference[: 60 + count_roof_points(index)], "rear": reference[:60]}
         metric.update(seen, reference, weights=torch.full((100,), 0.1), block_index=index)
     table = CoverageTable.from_coverages({"rig": metric.compute()}, AHEAD[:1])
     assert describe_single_point_of_failure(table, "rig").startswith(sentence)
