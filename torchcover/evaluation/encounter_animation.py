@@ -58,6 +58,7 @@ def plot_encounter_animation(
     """
     ((name, loaded_rig),) = load_rigs(rig, sensor_model).items()
     detections = [detection for detection in encounter_results.detections if detection.rig == name]
+    # The smallest margin is the worst case: negative if the rig detects the road user too late.
     margins_s = [detection.ttc_s.min() - detection.braking_time_s for detection in detections]
     detection = detections[int(np.argmin(margins_s))]
     encounter = cast(Encounter, detection.encounter)
@@ -68,6 +69,7 @@ def plot_encounter_animation(
     sensors, sensor_names = mounted.get_mounted_sensors(encounter, scene), encounter_results.sensor_names[name]
     subtitle = _describe_detection(detection, encounter, sensor_names, encounter_results.find_max_speeds_kmh())
 
+    # Figures end with the contact; before it, they show the last seconds at a constant rate.
     first_frame = max(int((staged.contact_time_s - params.duration_s) / FRAME_INTERVAL_S), 0)
     frame_indices = np.arange(first_frame, int(staged.contact_time_s / FRAME_INTERVAL_S), params.frame_stride)
     times_s = FRAME_INTERVAL_S * frame_indices.astype(np.float64)
@@ -78,6 +80,7 @@ def plot_encounter_animation(
     for body, vehicle_T_body in bodies:
         body_names.append(get_shape_name(body))
         outlines.append(transform_outline(get_solid(body).bounding_box.outline_m, vehicle_T_body))
+    # All figures have the same bounds, so that the animation does not jump.
     outlines_m = np.stack(outlines, axis=1)  # (frames, bodies, corners, 2)
     ego_outline_m = mounted.ego_solid.bounding_box.outline_m
     corners_m = np.concatenate([outlines_m.reshape(-1, 2), ego_outline_m])
@@ -98,6 +101,7 @@ def plot_encounter_animation(
         yield plot_scene(
             x_bounds_m,
             y_bounds_m,
+            # Obstacles are plotted as actors, and the flat ground is not plotted.
             static_faces=StaticFaces(np.empty((0, 3, 2)), np.empty(0)),
             ego_outline_m=ego_outline_m,
             actors=[ActorMark(*actor) for actor in zip(body_names, frame_outlines_m, strict=True)],

@@ -1,6 +1,6 @@
 """Evaluation of encounters: time to collision at which rigs detect road users, in sets, traffic and recordings."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from io import BytesIO
 from pathlib import Path
 from typing import Literal
@@ -88,7 +88,7 @@ def evaluate_encounters(
                 detect_encounter(mounted, encounter, criterion, num_start_offsets=num_start_offsets, seed=seed)
             )
             bar.advance(len(staged))
-    sensor_names = _get_sensor_names(loaded_rigs)
+    sensor_names = {name: rig.sensor_names for name, rig in loaded_rigs.items()}
     return EncounterResults(encounter_set.name, criterion, num_start_offsets, seed, sensor_names, detections)
 
 
@@ -111,14 +111,6 @@ def load_rigs(rigs: AnyRig | Sequence[AnyRig], sensor_model: Literal["ideal", "r
     if not loaded or len(rig_by_name) < len(loaded):
         raise ValueError(f"rigs with different names are needed; got {', '.join(rig.name for rig in loaded) or 'none'}")
     return rig_by_name
-
-
-def _get_sensor_names(rigs: Mapping[str, Rig]) -> dict[str, tuple[str, ...]]:
-    """Return the names of the sensors of each rig."""
-    sensor_names = {}
-    for name, rig in rigs.items():
-        sensor_names[name] = tuple(sensor.name for sensor in rig.sensors)
-    return sensor_names
 
 
 def evaluate_traffic_encounters(
@@ -160,7 +152,9 @@ def evaluate_traffic_encounters(
     scenario = set_ego(scenario if isinstance(scenario, Scenario) else Scenario.load(scenario), loaded_rigs, vehicle)
     if scenario.num_distinct_time_steps == 1:
         raise ValueError(f"scenario {scenario.name!r}: nothing moves in it, so there are no encounters")
+    # Every further scene of a repeating scenario would be equal to the first one.
     num_scenes = 1 if scenario.is_repeating else num_scenes
+    # This simulator only builds the scenes, which all rigs share; its reference points are never used.
     scene_simulator = Simulator(scenario, {}, PaperReference(rows=2, columns=2), seed=seed)
     simulators = {name: scene_simulator.replace_rigs({name: rig}) for name, rig in loaded_rigs.items()}
     detections = []
@@ -172,12 +166,13 @@ def evaluate_traffic_encounters(
             drive = Drive.from_scene(f"{scenario.name} {scene_index}", scene)
             durations_h[drive.name] = scenario.num_time_steps * scenario.effective_time_step_s / 3600
             approaches = find_approaches(drive, criterion)
+            # All rigs meet the same road users, so that their results are paired.
             for name, simulator in simulators.items():
                 drive_sensors = DriveSensors.from_simulator(simulator, first_frame, criterion)
                 for approach in approaches:
                     detections.append(detect_approach(name, drive, approach, drive_sensors, criterion))
             bar.advance(num_scenes)
-    sensor_names = _get_sensor_names(loaded_rigs)
+    sensor_names = {name: rig.sensor_names for name, rig in loaded_rigs.items()}
     return EncounterResults(scenario.name, criterion, 1, seed, sensor_names, detections, durations_h)
 
 

@@ -93,11 +93,12 @@ def measure_coverage(
     """
     ranks = settings.ranks
     sensors = list(chain.from_iterable(task.sensors.values()))
-    check_drawable(sensors)
+    check_drawable(sensors)  # before the run, which may take hours
     settings = replace(settings, num_workers=_choose_num_workers(task, settings, params))
     metrics = load_contrib().build_metrics(task, settings) if settings.metrics else None
     metric_observers = metrics.observers if metrics else {}
     further_observers = {**settings.observers, **metric_observers, **_build_target_observers(task, settings, params)}
+    # An error of one rank must end the others, which would wait for its part of the sums.
     with ranks.abort_on_error() if ranks else nullcontext():
         observed = _observe_frames(task, settings, further_observers, stopping_rule)
     coverages = {name: observer.compute() for name, observer in observed.coverage.items()}
@@ -199,6 +200,7 @@ def _observe_frames(
     """Pass all frames to the coverage metrics and the other observers, from and to a checkpoint, over all ranks."""
     ranks, checkpoint = settings.ranks, settings.checkpoint
     if ranks:
+        # Each rank of a machine has its own GPU.
         settings = replace(settings, device=ranks.get_device(settings.device))
     coverage = _build_coverage_observers(task, settings)
     target_rule = None

@@ -66,6 +66,7 @@ class MixedResult(Result):
             reference_record=None,
             device=first.device,
             sensors=first.sensors,
+            # Maps only show the ego vehicle if all scenarios have the same one.
             ego_outline_m=first.ego_outline_m if source["vehicle"] == first.source["vehicle"] else None,
             scenario_results=scenario_results,
             weights=weights,
@@ -86,6 +87,7 @@ class MixedResult(Result):
     @cached_property
     def mixtures(self) -> Mapping[str, CoverageMixture]:
         """Name of each rig -> its numbers in the mixture, for any region, with their jackknife values."""
+        # A scenario without weight is measured and shown, but it cannot make a number unknown.
         names = [name for name, weight in self.weights.items() if weight > 0.0]
         mixtures = {}
         for rig in self.scenario_results[names[0]].coverages:

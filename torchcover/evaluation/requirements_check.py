@@ -118,7 +118,7 @@ def _load_targets(requirements: Requirements) -> dict[str, Target]:
 def _check_rigs(rigs: Sequence[Rig], requirements: Requirements, vehicle: str | Path | None) -> None:
     """Raise ValueError if a rig lacks a sensor, or an encounter is shorter than a required time to collision."""
     for rig, requirement in product(rigs, requirements.requirements):
-        requirement.find_failing_sensors([sensor.name for sensor in rig.sensors])
+        requirement.find_failing_sensors(rig.sensor_names)
         if isinstance(requirement, TargetRequirement):
             requirement.group_sensors(rig.sensors)
         if isinstance(requirement, EncounterRequirement):
@@ -144,6 +144,7 @@ def _record_settings(
     requirements: Requirements, rigs: Sequence[Rig], scenario: AnyScenario | None, settings: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Build the settings of `summary.json`: the scenario of each kind of requirement, frames, vehicle, notes."""
+    # Encounters are always staged on flat ground; test targets only without a scenario.
     flat_ground = build_flat_ground().name
     name = scenario.name if isinstance(scenario, Scenario) else str(scenario or "")
     scenarios = {"region": name or DEFAULT_SCENARIO, "target": name or flat_ground, "encounters": flat_ground}
@@ -167,6 +168,7 @@ def _measure_regions(
     region_requirements = [item for item in requirements.requirements if isinstance(item, RegionRequirement)]
     if not region_requirements:
         return None
+    # One run measures the numbers of all requirements, since casting rays takes most of the time.
     keys = {requirement.number for requirement in region_requirements}
     thresholds_m = sorted({item.threshold_m for item in region_requirements if item.threshold_m})
     aggregations = [kind.from_keys(keys) for kind in AGGREGATIONS]
@@ -193,7 +195,7 @@ def _measure_regions(
 def _read_region(requirement: RegionRequirement, coverage: Coverage, rig: Rig) -> Readings:
     """Read the number with all sensors, then without each sensor that may fail."""
     (region,) = (region for region in coverage.regions if region.name == requirement.region)
-    failing_sensors = requirement.find_failing_sensors([sensor.name for sensor in rig.sensors])
+    failing_sensors = requirement.find_failing_sensors(rig.sensor_names)
     rows, locations = [], []
     for suffix in ("", *(f"_without_{name}" for name in failing_sensors)):
         estimate = coverage.estimate_number(requirement.number + suffix, region, requirement.band)
@@ -216,12 +218,11 @@ def _measure_encounters(
     The upper end is inf if the road user was already visible at the start of the encounter.
     """
     results = evaluate_encounters(rig, requirement.encounters, requirement.criterion, **settings)
-    sensor_names = [sensor.name for sensor in rig.sensors]
     rows, locations = [], []
     for encounter, detection in zip(requirement.encounters.encounters, results.detections, strict=True):
         ttc_by_suffix_s = {"": detection.ttc_s.min()}
-        for name in requirement.find_failing_sensors(sensor_names):
-            ttc_by_suffix_s[f", without {name}"] = detection.ttc_without_sensor_s[sensor_names.index(name)].min()
+        for name in requirement.find_failing_sensors(rig.sensor_names):
+            ttc_by_suffix_s[f", without {name}"] = detection.ttc_without_sensor_s[rig.sensor_names.index(name)].min()
         for suffix, ttc_s in ttc_by_suffix_s.items():
             rows.append((ttc_s, detection.braking_time_s, np.inf if ttc_s >= detection.censoring_ttc_s else ttc_s))
             locations.append(f"{encounter.description}{suffix}")
@@ -267,11 +268,13 @@ def _measure_target(
             detection_points=requirement.detection_points,
         )
 
+    # Visual angles and pixels depend on single sensors, which need their own measurement.
     has_angles = bool(requirement.pixels or requirement.visual_angle_deg)
     values: dict[str, list[Float64]] = {bound.key: [] for bound in requirement.bounds}
     locations: list[str] = []
     for suffix, group in groups.items():
         target_map = measure(group)
+        # Free cells of an area are judged; a listed point is judged even if it is occupied, as not decided.
         is_judged = (target_map.state == 0) | (positions.points_m is not None)
         frame_counts = target_map.free_frames[is_judged].tolist()
         for (x_m, y_m), count in zip(positions_m[is_judged].tolist(), frame_counts, strict=True):

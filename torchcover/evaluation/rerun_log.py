@@ -67,6 +67,7 @@ class RerunLog:
             raise ImportError(f"{path}: rerun-sdk is needed: pip install 'torchcover[rerun]'") from error
         reject_links(self._path)
         self._path.parent.mkdir(parents=True, exist_ok=True)
+        # The file gets its name in `finish`: until then an earlier file stays.
         folder = Path(mkdtemp(prefix=TEMPORARY, dir=self._path.parent))
         self._unfinished = folder / self._path.name
         self._clean_up = finalize(self, rmtree, folder, ignore_errors=True)

@@ -275,7 +275,7 @@ class Result:
                 record = self.record
                 output.publish(record)
             self.add_page_and_maps(output, kinds)
-            output.publish(record)
+            output.publish(record)  # again, now with the files of the page and the maps
         return output.paths
 
     def estimate_rendering_cost(self, file_kinds: Container[str]) -> tuple[float, float]:

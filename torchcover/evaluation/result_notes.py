@@ -163,6 +163,7 @@ def describe_scan_periods(sensors: Mapping[str, Sequence[Sensor]]) -> list[str]:
     for rig, rig_sensors in sensors.items():
         if rig_sensors:
             periods_s[rig] = sorted({_get_scan_period_s(sensor) for sensor in rig_sensors})
+    # Rigs with equal sets of periods are distorted by motion in the same way.
     if len({tuple(rig_periods_s) for rig_periods_s in periods_s.values()}) < 2:
         return []
     descriptions = []
@@ -185,8 +186,8 @@ def _describe_test_targets(result: "Result") -> list[str]:
     if target_sums is not None:
         num_frames = int(target_sums.frame_counts.sum())
         return [
-            f"Test targets: in {num_frames:,} frames, one at a time, at random positions whose center is in the "
-            "region; they occlude nothing else."
+            f"Test targets: in {num_frames:,} frame{'s' * (num_frames != 1)}, one at a time, at random positions whose "
+            "center is in the region; they occlude nothing else."
         ]
     if result.source.get("frames") and any(region.bands for region in result.regions):
         return ["No test targets in the near field: a recording has no scene to place them in."]

@@ -152,6 +152,7 @@ def format_rig_yaml(name: str, sensors: Sequence[Sensor]) -> str:
     for sensor in sensors:
         if isinstance(sensor, BaseModel):
             documents.append(sensor.model_dump(mode="json", exclude_unset=True))
+    # A rig with only some of its sensors would not be the measured rig.
     if not documents or len(documents) < len(sensors):
         return ""
     return to_yaml({"name": name, "sensors": documents})

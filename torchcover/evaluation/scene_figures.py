@@ -101,6 +101,7 @@ def plot_scenario(
         One figure for each frame.
     """
     frames = _create_frames(scenario, rig, vehicle, max(frame_indices), seed)
+    # Figures show a whole room, or the default grid outdoors.
     x_m, y_m = frames.scenario.find_room_bounds_m() or (GRID_X_M, GRID_Y_M)
     for frame_index in frame_indices:
         frame = frames[frame_index]
@@ -194,6 +195,7 @@ def _compute_ground_heights_m(terrain_m: Matrix, positions_m: Matrix) -> Matrix:
     position, face = shapely.STRtree(polygons).query(shapely.points(positions_m), predicate="intersects")
     normals, corners_m = _compute_normals(terrain_m)[face], terrain_m[face, 0]
     slope_m = ((positions_m[position] - corners_m[:, :2]) * normals[:, :2]).sum(axis=1)
+    # The lowest face counts, since a bridge is no ground for the obstacles below it.
     heights_m = np.full(len(positions_m), np.inf)
     np.minimum.at(heights_m, position, corners_m[:, 2] - slope_m / normals[:, 2])
     return np.where(np.isfinite(heights_m), heights_m, 0.0)

@@ -3,7 +3,6 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import groupby
 from typing import Any
 
 import numpy as np
@@ -105,6 +104,7 @@ def build_target_plan(target_map: TargetMap) -> TargetVisibilityMap:
     near_mask = target_map.free_mask & (target_map.distance_m <= PARAMS.max_distance_m)
     num_positions, num_undetected = int(near_mask.sum()), int((near_mask & ~target_map.detected_mask).sum())
     area_m2 = format_square_meters(num_undetected * target_map.raster.cell_m**2)
+    # The failure of a single sensor leaves nothing to compare.
     failure_effects_m2: dict[str, float] = {}
     if len(target_map.sensor_names) > 1:
         failure_effects_m2 = target_map.compute_failure_effects_m2(PARAMS.max_distance_m)
@@ -141,11 +141,13 @@ def summarize_target_maps(target_maps: Mapping[str, TargetMap]) -> tuple[str, ..
             shares[rig] = share
     if not shares:
         return (f"No position {within} is free, so detection there is unknown.",)
-    best_first = sorted(shares, key=lambda rig: -shares[rig])
-    texts: list[str] = []
-    for percent, rigs in groupby(best_first, lambda rig: format_whole_percent(shares[rig])):
-        positions = "" if texts else f" of the positions {within}"
-        texts.append(f"at {percent} %{positions} by {', '.join(rigs)}")
+    # Rigs whose shares are equal in whole percent are named together.
+    best_first = sorted(shares, key=shares.__getitem__, reverse=True)
+    rigs_by_percent: dict[str, list[str]] = {}
+    for rig in best_first:
+        rigs_by_percent.setdefault(format_whole_percent(shares[rig]), []).append(rig)
+    texts = [f"at {percent} % by {', '.join(rigs)}" for percent, rigs in rigs_by_percent.items()]
+    texts[0] = texts[0].replace(" by ", f" of the positions {within} by ", 1)
     target_map = target_maps[best_first[0]]
     bottom = f", {target_map.target_bottom_m:.2f} m above the ground," if target_map.target_bottom_m else ""
     target = f"{capitalize(format_target_name(target_map.target))} of {target_map.target_size_m[2]:.2f} m{bottom}"
@@ -172,6 +174,7 @@ def _describe_failures(rig: str, target_map: TargetMap) -> str:
 def _build_maps(target_map: TargetMap) -> list[PageMap]:
     """Build the maps of points, detection, visible surface and detecting sensors."""
     positive_points = target_map.points[target_map.points > 0]
+    # A few positions close to a sensor have most points and would hide the differences between all others.
     max_points = 10.0
     if len(positive_points):
         max_points = max(float(np.percentile(positive_points, PARAMS.points_percentile)), 10.0)

@@ -113,6 +113,11 @@ class Rig(BuiltInDocument):
         return merge_meshes(meshes)
 
     @property
+    def sensor_names(self) -> tuple[str, ...]:
+        """Names of the sensors, in their order."""
+        return tuple(sensor.name for sensor in self.sensors)
+
+    @property
     def sensor_model(self) -> Literal["ideal", "real"]:
         """`real` if range-limited returns of at least one LiDAR are simulated; `ideal` if every hit returns."""
         is_real = any(isinstance(sensor, Lidar) and sensor.range_at_10_percent_m for sensor in self.sensors)

@@ -314,7 +314,7 @@ def build_rig_fields(rigs: Mapping[str, Rig], scans: Mapping[str, Sequence[Senso
     point_counts: dict[str, dict[str, int]] = {}
     for name, rig_scans in scans.items():
         clouds[name] = torch.from_numpy(np.concatenate([scan.points for scan in rig_scans]))
-        sensor_names = [sensor.name for sensor in rigs[name].sensors]
+        sensor_names = rigs[name].sensor_names
         point_counts[name] = dict(zip(sensor_names, [len(scan.points) for scan in rig_scans], strict=True))
         if any(scan.measured_points is not None for scan in rig_scans):
             points, errors_m = [], []

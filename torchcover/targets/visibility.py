@@ -93,7 +93,7 @@ def measure_target_visibility(
         vehicle_box=vehicle_box,
         vehicle_outline_m=compute_vehicle_outline_m(scenario),
         sensor_model=rig.sensor_model,
-        sensor_names=tuple(sensor.name for sensor in rig.sensors),
+        sensor_names=rig.sensor_names,
         sensor_positions_m=np.array([sensor.mount.to_matrix()[:2, 3] for sensor in rig.sensors]),
         detection_points=detection_points,
         threshold_m=threshold_m,
