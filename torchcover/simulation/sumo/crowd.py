@@ -135,12 +135,11 @@ def _find_ego(users: Sequence[RoadUser], data: FloatingCarData, ego_id: str, dur
     if not tracks:
         raise ValueError(f"ego_id: no vehicle {ego_id!r} up to t = {data.last_time_s:g} s, where the data end")
     # The message proposes the duration of the first track with this name.
-    present_s = float(tracks[0].track.times_s[-1])
-    end_s = data.begin_s + present_s
+    end_s = data.begin_s + float(tracks[0].track.times_s[-1])
+    possible_s = max(end_s - data.begin_s, 0.0)
     raise ValueError(
         f"ego_id: {ego_id!r} is not present {_format_window(data, duration_s)}: it leaves the network, teleports or "
-        f"has a gap after t = {end_s:g} s; shorten duration_s to {max(end_s - data.begin_s, 0.0):g}, or choose another ego "
-        "vehicle"
+        f"has a gap after t = {end_s:g} s; shorten duration_s to {possible_s:g}, or choose another ego vehicle"
     )
 
 
