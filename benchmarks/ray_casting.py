@@ -16,11 +16,11 @@ from torchcover.data import SimulatedFrames
 from torchcover.evaluation.cpu_cores import set_threads
 from torchcover.geometry import invert
 from torchcover.simulation import PaperReference, Rig, Scenario, SensorNoise
-from torchcover.simulation.instant import SensorScan
+from torchcover.simulation.mounted_sensor import MountedSensor
 from torchcover.simulation.raycaster import cast_from_vehicle
 from torchcover.simulation.rays import rotate, split_into_tiles
-from torchcover.simulation.scene import SceneGeometry
-from torchcover.simulation.sight import MountedSensor
+from torchcover.simulation.scene_geometry import SceneGeometry
+from torchcover.simulation.scene_snapshot import SensorScan
 
 RANGE_M = 120.0
 STEP = 200

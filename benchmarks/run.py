@@ -25,10 +25,10 @@ EMBREE, BARE_SEARCH, TORCH = "bare Embree", "bare search", "`import torch`"
 PARTS = (START, WORLDS, RIG, REFERENCE, MOVING, SEARCH, SUMS, BODIES, MAPS, FILES)
 # Function -> what it is part of.
 WATCHED = {
-    "torchcover.simulation.stage:MountedRigStore.get_mounted_rigs": WORLDS,
+    "torchcover.simulation.mounted_rigs:MountedRigStore.get_mounted_rigs": WORLDS,
     "torchcover.simulation.simulator:Simulator._scan": RIG,
     "torchcover.simulation.surface_reference:SurfaceReference.scan": REFERENCE,
-    "torchcover.simulation.scene:SceneGeometry.get_snapshot": MOVING,
+    "torchcover.simulation.scene_geometry:SceneGeometry.get_snapshot": MOVING,
     "torchcover.neighbors.query:_search_nearest": SEARCH,
     "torchcover.coverage.sums:CoverageSums.compute_sums": SUMS,
     "torchcover.coverage.sums:CoverageSums.add_sums": SUMS,

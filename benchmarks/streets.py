@@ -21,9 +21,9 @@ from torchcover.recordings.recording import Scan
 from torchcover.recordings.vehicle_cloud import transform_to_vehicle
 from torchcover.simulation import PaperReference, Rig, Scenario, Simulator
 from torchcover.simulation.returns import get_material_index
-from torchcover.simulation.scene import SceneGeometry as Scenery
+from torchcover.simulation.scene import Scene
+from torchcover.simulation.scene_geometry import SceneGeometry as Scenery
 from torchcover.simulation.traffic.fleet import REAR_OF
-from torchcover.simulation.world import Scene
 
 WORLDS = ("urban", "sumo_random", "parking", "highway")
 TRACKS = ("tracks_argoverse2", "tracks_nuscenes")

@@ -23,7 +23,7 @@ from torchcover.evaluation import build_flat_ground, evaluate_encounters, plot_e
 from torchcover.geometry import convert_rotation_to_euler, find_overlaps
 from torchcover.simulation import PaperReference, Rig, Scenario, Simulator, set_ego
 from torchcover.simulation.bodies import get_shape_name
-from torchcover.simulation.moving import BodyGeometry
+from torchcover.simulation.moving_bodies import BodyGeometry
 from torchcover.targets import Target
 
 torch.set_num_threads(1)

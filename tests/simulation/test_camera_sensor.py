@@ -9,7 +9,7 @@ from torchcover import Rig
 from torchcover.data import SimulatedFrames
 from torchcover.simulation import CameraSensor, PaperReference, RayHits, Scenario, SensorNoise, SurfaceReference
 from torchcover.simulation.rays import split_into_tiles
-from torchcover.simulation.scene import SceneGeometry
+from torchcover.simulation.scene_geometry import SceneGeometry
 
 LENSES = {
     "pinhole": {"fov_deg": 100.0},

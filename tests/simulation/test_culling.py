@@ -14,9 +14,9 @@ from torchcover.simulation.culling import (
 )
 from torchcover.simulation.raycaster import cast_from_vehicle
 from torchcover.simulation.rays import compute_unit_directions, rotate, rotate_each, split_into_tiles
-from torchcover.simulation.scene import SceneGeometry
+from torchcover.simulation.scene import Actor, Scene
+from torchcover.simulation.scene_geometry import SceneGeometry
 from torchcover.simulation.shapes import Box, Plane
-from torchcover.simulation.world import Actor, Scene
 
 EGO = BoundingBox((-2.45, -0.97, 0.0), (2.45, 0.97, 1.63))
 SPHERE = split_into_tiles(compute_unit_directions(np.linspace(-89, 89, 60)[:, None], np.linspace(-180, 179, 120)[None]))

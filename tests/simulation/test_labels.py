@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from torchcover.geometry.trajectory import Trajectory
+from torchcover.simulation.scene import Actor, Scene, compute_labels
 from torchcover.simulation.shapes import Box
-from torchcover.simulation.world import Actor, Scene, compute_labels
 
 CAR = Box(type="box", size_m=(4.0, 2.0, 1.5)).build_mesh()
 UTM_M = np.array([5.6e5, 5.9e6, 80.0])

@@ -17,9 +17,9 @@ from torchcover.simulation.bodies import Vehicle
 from torchcover.simulation.ground_faces import find_ground_faces, find_level_faces
 from torchcover.simulation.local_ground import LocalGround
 from torchcover.simulation.reference_sensor import ReferenceContext
-from torchcover.simulation.scene import SceneGeometry
+from torchcover.simulation.scene import Actor, Scene
+from torchcover.simulation.scene_geometry import SceneGeometry
 from torchcover.simulation.shapes import Box, Cylinder, Mesh
-from torchcover.simulation.world import Actor, Scene
 from torchcover.simulation.writing import write_recording
 
 from .small_worlds import EGO, FLOOR, assert_agrees, box, scenario, sum_weights

@@ -7,7 +7,7 @@ import pytest
 
 from torchcover.simulation import Lidar, PaperReference, Pose, Rig, Scenario, Simulator
 from torchcover.simulation.rig import set_ego
-from torchcover.simulation.scene import SceneGeometry
+from torchcover.simulation.scene_geometry import SceneGeometry
 
 EGO = {"shape": {"type": "box", "size_m": [4, 2, 1]}}
 GROUND = {"name": "ground", "shape": {"type": "plane", "size_m": [400, 400]}}

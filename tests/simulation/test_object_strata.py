@@ -8,13 +8,13 @@ from torchcover.data import SimulatedFrames
 from torchcover.detection import measure_box_visibility
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation import Rig, SurfaceReference
+from torchcover.simulation.mounted_sensor import compute_visibility
 from torchcover.simulation.patches import Patches, UprightBoxes
 from torchcover.simulation.reference_sensor import ReferenceContext
-from torchcover.simulation.scene import SceneGeometry
+from torchcover.simulation.scene import Actor, Scene
+from torchcover.simulation.scene_geometry import SceneGeometry
 from torchcover.simulation.shapes import Box, Plane
-from torchcover.simulation.sight import compute_visibility
 from torchcover.simulation.surface_strata import SurfaceStrata
-from torchcover.simulation.world import Actor, Scene
 
 from .small_worlds import AHEAD, FLOOR, assert_agrees, box, scenario
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from torchcover.simulation import PaperReference, Rig, Scenario, Simulator
-from torchcover.simulation.scene import SceneGeometry
+from torchcover.simulation.scene_geometry import SceneGeometry
 
 
 def rig(max_range_m=60.0, **keys):

@@ -8,9 +8,9 @@ from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation import Pose
 from torchcover.simulation.bodies import move_to_vehicle_frame
 from torchcover.simulation.rays import compute_unit_directions, split_into_tiles
-from torchcover.simulation.scene import SceneGeometry
+from torchcover.simulation.scene import Actor, Scene
+from torchcover.simulation.scene_geometry import SceneGeometry
 from torchcover.simulation.shapes import Box, Plane
-from torchcover.simulation.world import Actor, Scene
 
 SPHERE = split_into_tiles(
     compute_unit_directions(np.linspace(-89, 89, 150)[:, None], np.linspace(-179, 179, 300)[None])

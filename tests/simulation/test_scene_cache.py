@@ -11,11 +11,11 @@ import pytest
 from torchcover.files import BadFileError
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation import PaperReference, Rig, Scenario, Simulator, scene_cache
+from torchcover.simulation.scene import Actor, Scene
 from torchcover.simulation.scene_cache import SceneCache, encode_scene, read_scene
 from torchcover.simulation.shapes import Box
 from torchcover.simulation.traffic import HighwayTraffic, ParkingTraffic, UrbanTraffic
 from torchcover.simulation.traffic.fleet import load_bodies
-from torchcover.simulation.world import Actor, Scene
 
 EGO = {"shape": {"type": "box", "size_m": [4, 2, 1.5]}}
 LOT = {"type": "parking", "duration_s": 1.0, "time_step_s": 0.2, "crossings_per_aisle": 0, "parked_share": 0.1}

@@ -15,10 +15,10 @@ from torchcover.simulation import (
     memory,
 )
 from torchcover.simulation.memory import check_memory_fits, find_memory_limit_bytes
-from torchcover.simulation.scene import SceneGeometry
+from torchcover.simulation.scene import Actor, Scene, count_time_steps
+from torchcover.simulation.scene_geometry import SceneGeometry
 from torchcover.simulation.shapes import Box
 from torchcover.simulation.traffic import HighwayTraffic, UrbanTraffic
-from torchcover.simulation.world import Actor, Scene, count_time_steps
 
 SPACED = {"vertical_fov_deg": (-10, 10), "horizontal_fov_deg": 360, "max_range_m": 50}
 AREAS = (((0.0, 20.0), (-5.0, 5.0)),)

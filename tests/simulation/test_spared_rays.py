@@ -6,10 +6,10 @@ import pytest
 from torchcover.simulation import CameraSensor, Lidar, Pose, Radar, Scenario, SensorNoise
 from torchcover.simulation.camera_sensor import Stereo
 from torchcover.simulation.culling import SearchSpheres
+from torchcover.simulation.mounted_sensor import MountedSensor
 from torchcover.simulation.rays import compute_ray_pixel_indices, compute_unit_directions, split_into_tiles
-from torchcover.simulation.scene import SceneGeometry
+from torchcover.simulation.scene_geometry import SceneGeometry
 from torchcover.simulation.sensor import ScanTimes
-from torchcover.simulation.sight import MountedSensor
 
 ROOF = Pose(x_m=0.45, z_m=1.73, yaw_deg=20, pitch_deg=3)
 MAX_SEPARATE_POINTS = 800  # default of SearchSpheres.from_points

@@ -12,7 +12,7 @@ from torchcover.recordings.formats.tracks import read_trajectory
 from torchcover.simulation import Pose
 from torchcover.simulation.rays import compute_unit_directions, split_into_tiles
 from torchcover.simulation.recorded.bodies import read_box_actors
-from torchcover.simulation.scene import SceneGeometry
+from torchcover.simulation.scene_geometry import SceneGeometry
 
 HEADER = "t,x,y,z,roll,pitch,yaw\n"
 BOXES = "t,id,category,x,y,z,length,width,height,yaw\n"

@@ -11,7 +11,7 @@ from torchcover.encounters.detection import MountedRig
 from torchcover.encounters.encounter import EncounterPath
 from torchcover.encounters.staging import compute_path_poses
 from torchcover.simulation import Rig, Scenario
-from torchcover.simulation.moving import BodyGeometry
+from torchcover.simulation.moving_bodies import BodyGeometry
 from torchcover.simulation.shapes import Box
 from torchcover.simulation.traffic.idm import Driver, compute_acceleration_mps2, compute_gap_ratio, integrate_motion
 from torchcover.simulation.traffic.trailers import compute_tractrix_yaw_rad

@@ -13,10 +13,10 @@ from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation.culling import SearchSpheres
 from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.rays import compute_unit_directions, split_into_tiles
-from torchcover.simulation.scene import SceneGeometry
+from torchcover.simulation.scan_motion import compute_parabola_weights
+from torchcover.simulation.scene import Actor, Scene
+from torchcover.simulation.scene_geometry import SceneGeometry
 from torchcover.simulation.shapes import Box, Mesh, Plane
-from torchcover.simulation.sweep import compute_parabola_weights
-from torchcover.simulation.world import Actor, Scene
 
 from .case import Case, most, relative
 

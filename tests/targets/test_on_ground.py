@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from torchcover.simulation import Rig, Scenario
-from torchcover.simulation.scene import SceneGeometry
+from torchcover.simulation.scene_geometry import SceneGeometry
 from torchcover.targets.placing import Raster, compute_ground_heights_m
 from torchcover.targets.result import FREE, OUTSIDE
 from torchcover.targets.surface import Target

@@ -24,8 +24,8 @@ from torchcover.simulation.bodies import (
     describe_windows,
 )
 from torchcover.simulation.documents import read_mapping, suggest_names
+from torchcover.simulation.mounted_sensor import describe_self_hits
 from torchcover.simulation.rig import set_ego
-from torchcover.simulation.sight import describe_self_hits
 
 DEFAULT_RIG = "front_roof_128"
 # Kind of a document -> key that only documents of this kind have.

@@ -14,14 +14,14 @@ from torchcover.encounters.staging import FRAME_INTERVAL_S, StagedEncounter
 from torchcover.geometry.arrays import Bools, Float64, Int64
 from torchcover.simulation.camera_sensor import CameraSensor
 from torchcover.simulation.lidar import Lidar
-from torchcover.simulation.moving import BodyGeometry, BodyGeometryCache, MovingBodies
+from torchcover.simulation.mounted_rigs import mount_sensors
+from torchcover.simulation.mounted_sensor import MountedSensor, RayEnds, compute_visibility
+from torchcover.simulation.moving_bodies import BodyGeometry, BodyGeometryCache, MovingBodies
 from torchcover.simulation.radar import Radar
 from torchcover.simulation.rig import Rig
 from torchcover.simulation.scenario import Scenario
-from torchcover.simulation.scene import SceneGeometry
+from torchcover.simulation.scene_geometry import SceneGeometry
 from torchcover.simulation.sensor import Sensor, SensorNoise
-from torchcover.simulation.sight import MountedSensor, RayEnds, compute_visibility
-from torchcover.simulation.stage import mount_sensors
 from torchcover.targets.counting import SensorBeams, TargetHits, find_measured_hits, find_target_hits
 from torchcover.targets.target_frames import SensorFrame
 

@@ -12,10 +12,10 @@ from torchcover.geometry import BoundingBox, compute_contact_time_s, find_overla
 from torchcover.geometry.arrays import Bools, Float64
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation.bodies import Shape, build_actor_mesh, get_shape_name
-from torchcover.simulation.moving import BodyGeometry, BodyGeometryCache
-from torchcover.simulation.scene import SceneGeometry
+from torchcover.simulation.moving_bodies import BodyGeometry, BodyGeometryCache
+from torchcover.simulation.scene import Actor, Scene
+from torchcover.simulation.scene_geometry import SceneGeometry
 from torchcover.simulation.shapes import Plane
-from torchcover.simulation.world import Actor, Scene
 from torchcover.targets.placing import build_poses
 
 # Frames of an encounter; scans start in whole frames.

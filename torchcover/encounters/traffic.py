@@ -10,8 +10,8 @@ from torchcover.geometry import BoundingBox, compute_contact_time_s, invert, tra
 from torchcover.geometry.arrays import Bools, Float64
 from torchcover.recordings.objects import Track, extract_objects, find_vehicle_class
 from torchcover.recordings.recording import Recording
+from torchcover.simulation.scene import Scene
 from torchcover.simulation.traffic.fleet import REAR_OF
-from torchcover.simulation.world import Scene
 
 # Groups of road users in the order of tables, and the SUMO vehicle classes of each.
 ROAD_USER_GROUPS = {

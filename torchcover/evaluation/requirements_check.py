@@ -22,7 +22,7 @@ from torchcover.evaluation.task import AnyScenario, build_task, compute_frame_in
 from torchcover.evaluation.verdicts import Float64, Readings, Verdict, judge_requirements
 from torchcover.simulation import Rig, Scenario, Sensor, set_ego
 from torchcover.simulation.camera_sensor import CameraSensor
-from torchcover.simulation.moving import BodyGeometry
+from torchcover.simulation.moving_bodies import BodyGeometry
 from torchcover.targets import Target, measure_visibility_at_positions
 from torchcover.targets.result import PositionVisibility
 from torchcover.targets.visibility import THRESHOLD_M

@@ -16,7 +16,7 @@ from torchcover.simulation import GRID_X_M, GRID_Y_M, CameraSensor, PaperReferen
 from torchcover.simulation.bodies import Vehicle
 from torchcover.simulation.mount_regions import MountRegion, Skin
 from torchcover.simulation.rig import is_roadside, set_ego
-from torchcover.simulation.world import Scene
+from torchcover.simulation.scene import Scene
 
 
 @dataclass(frozen=True)

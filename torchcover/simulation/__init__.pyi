@@ -45,5 +45,5 @@ from .simulator import Simulator as Simulator
 from .surface_reference import SurfaceReference as SurfaceReference
 from .urdf import Robot as Robot
 from .urdf import read_robot as read_robot
-from .world import ObjectLabel as ObjectLabel
+from .scene import ObjectLabel as ObjectLabel
 from .writing import write_recording as write_recording

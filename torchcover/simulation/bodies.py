@@ -22,10 +22,10 @@ from torchcover.simulation.documents import (
     read_mapping,
     resolve_name_or_file,
 )
+from torchcover.simulation.mesh_checks import check_mesh
 from torchcover.simulation.mount_regions import MountRegion
 from torchcover.simulation.returns import Material, get_material_index
 from torchcover.simulation.shapes import Mesh
-from torchcover.simulation.sound import check_mesh
 
 # Smaller shifts of a vehicle are rounding in its file; larger ones are reported.
 MIN_REPORTED_SHIFT_M = 0.01

@@ -8,8 +8,8 @@ from pydantic import model_validator
 
 from torchcover.geometry.arrays import Float64
 from torchcover.simulation.documents import Bounds, Document
-from torchcover.simulation.instant import is_enclosed
 from torchcover.simulation.raycaster import RayCaster
+from torchcover.simulation.scene_snapshot import is_enclosed
 from torchcover.simulation.shapes import Mesh
 
 MountSide = Literal["above", "front", "rear", "left", "right"]

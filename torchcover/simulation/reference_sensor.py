@@ -14,10 +14,10 @@ import numpy as np
 from torchcover.coverage.grid import BandFrame
 from torchcover.geometry import BoundingBox, build_transform, convert_euler_to_rotation
 from torchcover.geometry.arrays import Float32, Float64, Int64
-from torchcover.simulation.instant import SceneSnapshot
 from torchcover.simulation.rays import Tile, compute_unit_directions, split_into_tiles
 from torchcover.simulation.regions_of_interest import QueryPlan
-from torchcover.simulation.scene import SceneGeometry
+from torchcover.simulation.scene_geometry import SceneGeometry
+from torchcover.simulation.scene_snapshot import SceneSnapshot
 
 # (bounding box of the ego vehicle, random numbers) -> (4, 4) pose in the vehicle frame.
 PoseSampler = Callable[[BoundingBox, np.random.Generator], Float64]

@@ -17,14 +17,14 @@ from torchcover.simulation.documents import BuiltInDocument, Document, Pose, Rel
 from torchcover.simulation.ground_faces import MAX_SLOPE_DEG, find_level_faces
 from torchcover.simulation.kinds import TRAFFIC
 from torchcover.simulation.lidar import Lidar
+from torchcover.simulation.mesh_checks import find_coincident_faces, warn_about_coincident_faces
 from torchcover.simulation.radar import Radar
 from torchcover.simulation.recorded.bodies import read_box_actors
 from torchcover.simulation.returns import CLEAR, Weather
+from torchcover.simulation.scene import Actor, Scene, count_time_steps
 from torchcover.simulation.sensor import Sensor
 from torchcover.simulation.shapes import Mesh, MeshFile
-from torchcover.simulation.sound import find_coincident_faces, warn_about_coincident_faces
 from torchcover.simulation.traffic.kind import Traffic
-from torchcover.simulation.world import Actor, Scene, count_time_steps
 
 # Ego vehicle of a scenario and rigs without a vehicle.
 DEFAULT_EGO = VehicleShape(type="vehicle", vehicle="suv")

@@ -23,10 +23,10 @@ from torchcover.files import BadFileError, check_dtype_kind, guard_reader, parse
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation.builtin import hash_builtin_documents, list_builtin_names
 from torchcover.simulation.scenario import ActorDescription, Scenario
+from torchcover.simulation.scene import Actor, Scene
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.sumo.simulating import find_sumo_home
 from torchcover.simulation.traffic.fleet import load_bodies
-from torchcover.simulation.world import Actor, Scene
 
 # Types in the JSON of a cached scene, by name.
 ENCODED_TYPES: dict[str, Any] = {encoded.__name__: encoded for encoded in (Scene, Actor, Trajectory, Mesh)}

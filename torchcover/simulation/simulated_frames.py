@@ -18,15 +18,15 @@ from torchcover.detection.inside import add_point_counts
 from torchcover.frames.frame import Frame, Measurement
 from torchcover.frames.source import FrameDataset
 from torchcover.geometry.arrays import Float64
-from torchcover.simulation.instant import SensorScan
 from torchcover.simulation.kinds import REFERENCE_SENSORS
+from torchcover.simulation.mounted_sensor import describe_self_hits
 from torchcover.simulation.reference_sensor import PaperReference, ReferenceSensor
 from torchcover.simulation.regions_of_interest import QueryPlan, RegionsOfInterest
 from torchcover.simulation.rig import Rig, is_roadside, set_ego
 from torchcover.simulation.scenario import Scenario
+from torchcover.simulation.scene_snapshot import SensorScan
 from torchcover.simulation.sensor import Sensor
 from torchcover.simulation.shapes import Mesh
-from torchcover.simulation.sight import describe_self_hits
 from torchcover.simulation.simulator import Observation, Simulator
 from torchcover.simulation.surface_reference import SurfaceReference
 

@@ -13,15 +13,15 @@ import torch
 from torchcover.geometry import BoundingBox
 from torchcover.geometry.arrays import Float32, Int64
 from torchcover.simulation.culling import SearchSpheres
-from torchcover.simulation.instant import SceneSnapshot, SensorScan
 from torchcover.simulation.memory import BYTES_PER_RAY, check_memory_fits
+from torchcover.simulation.mounted_rigs import MountedRigs, MountedRigStore, SceneStore, warn_about_missing_ground
 from torchcover.simulation.reference_sensor import ReferenceContext, ReferenceScan, ReferenceSensor
 from torchcover.simulation.rig import Rig, set_ego
 from torchcover.simulation.scenario import Scenario
-from torchcover.simulation.scene import SceneGeometry
+from torchcover.simulation.scene import ObjectLabel, compute_labels
+from torchcover.simulation.scene_geometry import SceneGeometry
+from torchcover.simulation.scene_snapshot import SceneSnapshot, SensorScan
 from torchcover.simulation.sensor import SensorNoise
-from torchcover.simulation.stage import MountedRigs, MountedRigStore, SceneStore, warn_about_missing_ground
-from torchcover.simulation.world import ObjectLabel, compute_labels
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,6 +10,8 @@ from torchcover.coverage.grid import PAPER_HEIGHTS, BandFrame
 from torchcover.geometry import BoundingBox, build_transform
 from torchcover.geometry.arrays import Float64
 from torchcover.simulation.local_ground import TOLERANCE_M
+from torchcover.simulation.mesh_checks import START_DISTANCE_M
+from torchcover.simulation.mounted_sensor import Visibility, compute_visibility
 from torchcover.simulation.patches import UprightBoxes
 from torchcover.simulation.reference_sensor import (
     ReferenceContext,
@@ -18,8 +20,6 @@ from torchcover.simulation.reference_sensor import (
     sample_position_in_shell,
 )
 from torchcover.simulation.regions_of_interest import DEFAULT_BAND_FRAME, Areas, Bands, QueryPlan
-from torchcover.simulation.sight import Visibility, compute_visibility
-from torchcover.simulation.sound import START_DISTANCE_M
 from torchcover.simulation.surface_strata import SurfacePoints, SurfaceStrata
 
 # Rays end at this height above the surface, so that they do not hit it; surfaces closer to it coincide with it.

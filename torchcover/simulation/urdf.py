@@ -19,12 +19,12 @@ from torchcover.recordings.unsupported_formats import find_remedy
 from torchcover.simulation.bodies import merge_meshes
 from torchcover.simulation.documents import FARTHEST_M, explain_document_error
 from torchcover.simulation.gazebo_sensors import PlacedSensor, read_numbers, read_pose, read_sensors
-from torchcover.simulation.instant import is_enclosed
+from torchcover.simulation.mounted_sensor import count_self_hits, describe_self_hits
 from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.rig import Rig
+from torchcover.simulation.scene_snapshot import is_enclosed
 from torchcover.simulation.sensor import Sensor
 from torchcover.simulation.shapes import Box, Cylinder, Ellipsoid, Mesh, MeshFile
-from torchcover.simulation.sight import count_self_hits, describe_self_hits
 
 
 @dataclass(frozen=True)

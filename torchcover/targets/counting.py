@@ -12,11 +12,11 @@ import torch
 
 from torchcover.geometry.arrays import Float32, Float64, Int32, Int64
 from torchcover.simulation.culling import compute_outlines
-from torchcover.simulation.instant import run_in_threads
-from torchcover.simulation.moving import MovingBodies
+from torchcover.simulation.mounted_sensor import MountedSensor, RayEnds
+from torchcover.simulation.moving_bodies import MovingBodies
 from torchcover.simulation.rays import rotate
+from torchcover.simulation.scene_snapshot import run_in_threads
 from torchcover.simulation.sensor import RayHits
-from torchcover.simulation.sight import MountedSensor, RayEnds
 from torchcover.targets.placing import set_pose_heights
 from torchcover.targets.surface import PackedBits, Target, TargetSurface
 from torchcover.targets.target_frames import SensorFrame, TargetFrame

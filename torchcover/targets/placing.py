@@ -8,7 +8,7 @@ import numpy as np
 
 from torchcover.geometry import BoundingBox, find_overlaps
 from torchcover.geometry.arrays import Bools, Float64, Int64
-from torchcover.simulation.instant import SceneSnapshot
+from torchcover.simulation.scene_snapshot import SceneSnapshot
 
 SIDES = ("front", "rear", "left", "right")
 # "narrow" turns the narrower side of a target's box to the vehicle, "wide" the wider one; numbers are yaws in degrees.

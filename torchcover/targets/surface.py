@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from torchcover.geometry.arrays import Bools, Float64
 from torchcover.simulation.bodies import build_actor_mesh, create_body_shape
-from torchcover.simulation.instant import ALL_AROUND_RAYS, SceneSnapshot
-from torchcover.simulation.moving import BodyGeometry
+from torchcover.simulation.mounted_sensor import RANGE_ROUNDING, compute_visibility
+from torchcover.simulation.moving_bodies import BodyGeometry
 from torchcover.simulation.patches import find_outward_faces
+from torchcover.simulation.scene_snapshot import ALL_AROUND_RAYS, SceneSnapshot
 from torchcover.simulation.shapes import Mesh
-from torchcover.simulation.sight import RANGE_ROUNDING, compute_visibility
 from torchcover.simulation.surface_reference import ABOVE_M
 from torchcover.simulation.surface_strata import PLANE_STEPS
 

@@ -8,14 +8,14 @@ import torch
 
 from torchcover.geometry import BoundingBox, build_transform
 from torchcover.geometry.arrays import Bools, Float64
-from torchcover.simulation.instant import SceneSnapshot
+from torchcover.simulation.mounted_rigs import MountedRigStore, SceneStore
+from torchcover.simulation.mounted_sensor import MountedSensor, RayEnds
 from torchcover.simulation.reference_sensor import ReferenceContext, sample_position_in_shell
 from torchcover.simulation.rig import Rig
 from torchcover.simulation.scenario import Scenario
-from torchcover.simulation.scene import SceneGeometry
+from torchcover.simulation.scene_geometry import SceneGeometry
+from torchcover.simulation.scene_snapshot import SceneSnapshot
 from torchcover.simulation.sensor import SensorNoise
-from torchcover.simulation.sight import MountedSensor, RayEnds
-from torchcover.simulation.stage import MountedRigStore, SceneStore
 from torchcover.targets.placing import compute_ground_heights_m, is_blocked, set_pose_heights
 from torchcover.targets.surface import NUM_SAMPLES, PackedBits, Target, TargetSurface
 

@@ -7,7 +7,7 @@ from tests.recordings.drives import Drive
 from torchcover.recordings import open_recording
 from torchcover.simulation import Rig, Scenario, SimulatedFrames, write_recording, write_scenario
 from torchcover.simulation.cell_mesh import CELL_M, build_cell_mesh
-from torchcover.simulation.scene import SceneGeometry
+from torchcover.simulation.scene_geometry import SceneGeometry
 from torchcover.simulation.shapes import Box
 
 SPEED_MPS, CAR_MPS, SECONDS = 8.0, -6.0, 2.4

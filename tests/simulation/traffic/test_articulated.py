@@ -6,9 +6,9 @@ import pytest
 from torchcover.geometry import build_transform, convert_euler_to_rotation
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation.bodies import Vehicle
+from torchcover.simulation.scene import Actor
 from torchcover.simulation.traffic.fleet import REAR_OF, Fleet, load_bodies
 from torchcover.simulation.traffic.trailers import HITCHES, compute_tractrix_yaw_rad, compute_trailer_poses
-from torchcover.simulation.world import Actor
 
 from .test_separation import Solids, find_overlaps_among
 

@@ -22,11 +22,11 @@ from torchcover.simulation.height_field import (
     compute_cell_centers_m,
     count_corners,
 )
+from torchcover.simulation.scene import Actor
 from torchcover.simulation.shapes import Box, Mesh
 from torchcover.simulation.traffic.assemble import HORIZON_M
 from torchcover.simulation.traffic.fleet import CATEGORIES, VehicleType, load_bodies
 from torchcover.simulation.traffic.frontage import StreetSide, find_street_sides
-from torchcover.simulation.world import Actor
 
 
 @dataclass(frozen=True)

@@ -31,13 +31,13 @@ from torchcover.simulation.recorded.excerpt import (
     choose_time_span,
     split_at_gaps,
 )
+from torchcover.simulation.scene import Actor, Scene, count_time_steps
 from torchcover.simulation.shapes import Mesh, MeshFile
 from torchcover.simulation.traffic.assemble import HORIZON_M
 from torchcover.simulation.traffic.fleet import EGO, load_bodies
 from torchcover.simulation.traffic.frontage import RoadsideDensity, place_scenery
 from torchcover.simulation.traffic.kind import Traffic
 from torchcover.simulation.traffic.scenery import merge_by_kind
-from torchcover.simulation.world import Actor, Scene, count_time_steps
 
 
 def convert_id(content: Any) -> Any:  # noqa: ANN401  (any content of a file)

@@ -19,6 +19,7 @@ from torchcover.simulation.height_field import (
     compute_cell_centers_m,
     count_corners,
 )
+from torchcover.simulation.scene import Actor
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.sumo.motion import Motion
 from torchcover.simulation.sumo.paths import compute_rectangle_corners_m, smooth_positions
@@ -28,7 +29,6 @@ from torchcover.simulation.traffic.assemble import compute_attitude_deg
 from torchcover.simulation.traffic.city import CITY, PARKED_KINDS
 from torchcover.simulation.traffic.fleet import CATEGORIES, EGO, REAR_OF, Fleet, get_part_kinds
 from torchcover.simulation.traffic.scenery import CURB_HEIGHT_M, build_sidewalk
-from torchcover.simulation.world import Actor
 
 
 def build_ground(vicinity: Vicinity) -> FlatGround | GroundHeightField:

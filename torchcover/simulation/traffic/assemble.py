@@ -8,12 +8,12 @@ import numpy as np
 
 from torchcover.geometry.arrays import Bools, Float64, Int64
 from torchcover.geometry.trajectory import Trajectory
+from torchcover.simulation.scene import Actor
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.traffic.fleet import CATEGORIES, EGO, REAR_OF, Fleet
 from torchcover.simulation.traffic.flow import Agent, Lane, TrafficHistory
 from torchcover.simulation.traffic.hills import Hills
 from torchcover.simulation.traffic.trailers import HITCHES, compute_trailer_poses
-from torchcover.simulation.world import Actor
 
 # Largest range of a sensor: road users that never come this close to the ego vehicle are omitted from the scene.
 HORIZON_M = 250.0

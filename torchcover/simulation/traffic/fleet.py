@@ -11,12 +11,12 @@ from torchcover.files import load_road_user_classes
 from torchcover.geometry import BoundingBox
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation.bodies import Vehicle
+from torchcover.simulation.scene import Actor
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.traffic.flow import Agent
 from torchcover.simulation.traffic.idm import Driver
 from torchcover.simulation.traffic.junctions import JunctionPassage
 from torchcover.simulation.traffic.trailers import HITCHES
-from torchcover.simulation.world import Actor
 
 
 class VehicleType(NamedTuple):

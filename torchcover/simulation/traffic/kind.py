@@ -10,10 +10,10 @@ from pydantic import Field
 from torchcover.geometry.arrays import Float64
 from torchcover.simulation.builtin import hash_builtin_documents
 from torchcover.simulation.documents import Document
+from torchcover.simulation.scene import Actor, Scene, count_time_steps
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.traffic.fleet import Fleet, load_bodies
 from torchcover.simulation.traffic.scenery import Scenery
-from torchcover.simulation.world import Actor, Scene, count_time_steps
 
 
 class Traffic(Document):

@@ -14,7 +14,7 @@ import numpy as np
 from torchcover.geometry import invert, transform_points
 from torchcover.geometry.arrays import Float32, Float64, Int64
 from torchcover.simulation.culling import SLACK_M, BoxOutlines, compute_outlines
-from torchcover.simulation.moving import BodyHits, MovingBodies
+from torchcover.simulation.moving_bodies import BodyHits, MovingBodies
 from torchcover.simulation.raycaster import Hits, RayCaster, cast_from_vehicle
 from torchcover.simulation.rays import Tile, rotate, rotate_each
 

@@ -7,11 +7,11 @@ import numpy as np
 
 from torchcover.geometry import invert, transform_points
 from torchcover.geometry.arrays import Bools, Float32, Float64, Int32, Int64
-from torchcover.simulation.instant import SceneSnapshot
 from torchcover.simulation.local_ground import SLACK_M as HEIGHT_SLACK_M
 from torchcover.simulation.local_ground import TOLERANCE_M, GroundHeightPyramid, round_height_bounds_m
 from torchcover.simulation.patches import HeightFunction, Patches, UprightBoxes
 from torchcover.simulation.rays import rotate_each
+from torchcover.simulation.scene_snapshot import SceneSnapshot
 from torchcover.simulation.shapes import Mesh
 
 # Boxes are extended by this margin because coordinates are float32.

@@ -14,10 +14,10 @@ from torchcover.geometry.arrays import Bools, Float32, Float64, Int32, Int64
 from torchcover.geometry.rigid import Matrix
 from torchcover.simulation.culling import BoxOutlines, compute_outlines
 from torchcover.simulation.local_ground import LocalGround
-from torchcover.simulation.moving import MovingBodies
+from torchcover.simulation.moving_bodies import MovingBodies
 from torchcover.simulation.raycaster import HitAttributes, Hits, RayCaster, cast_from_vehicle
 from torchcover.simulation.rays import TILE_ROWS, Tile, compute_unit_directions, rotate, split_into_tiles
-from torchcover.simulation.sweep import BodyPoses, MotionSampler, RayTimes, ScanMotion, sample_no_motion
+from torchcover.simulation.scan_motion import BodyPoses, MotionSampler, RayTimes, ScanMotion, sample_no_motion
 
 Result = TypeVar("Result")
 

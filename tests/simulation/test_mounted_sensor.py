@@ -9,12 +9,12 @@ from torchcover.geometry import invert
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation import Lidar, Pose, SensorNoise
 from torchcover.simulation.bodies import Body, move_to_vehicle_frame
-from torchcover.simulation.instant import SceneSnapshot
+from torchcover.simulation.mounted_sensor import MountedSensor
 from torchcover.simulation.rays import split_into_tiles
-from torchcover.simulation.scene import SceneGeometry
+from torchcover.simulation.scene import Actor, Scene
+from torchcover.simulation.scene_geometry import SceneGeometry
+from torchcover.simulation.scene_snapshot import SceneSnapshot
 from torchcover.simulation.shapes import Box, Cylinder, Plane
-from torchcover.simulation.sight import MountedSensor
-from torchcover.simulation.world import Actor, Scene
 
 UTM = np.array([513_248.37, 5_403_655.81, 312.5])
 LIDAR = Lidar(

@@ -10,10 +10,10 @@ from torchcover.geometry import build_transform
 from torchcover.simulation import SurfaceReference, shapes
 from torchcover.simulation.ground_faces import find_level_faces
 from torchcover.simulation.local_ground import GroundHeightPyramid
+from torchcover.simulation.mesh_checks import check_mesh, find_coincident_faces
 from torchcover.simulation.patches import Patches, UprightBoxes, find_outward_faces
-from torchcover.simulation.scene import SceneGeometry
+from torchcover.simulation.scene_geometry import SceneGeometry
 from torchcover.simulation.shapes import Box, Ellipsoid, Mesh, Plane
-from torchcover.simulation.sound import check_mesh, find_coincident_faces
 
 from .small_worlds import AHEAD, ALL_HEIGHTS, FLOOR, assert_agrees, box, scenario, sum_weights
 

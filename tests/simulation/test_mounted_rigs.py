@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from torchcover.simulation import PaperReference, Rig, Scenario, Simulator, stage
+from torchcover.simulation import PaperReference, Rig, Scenario, Simulator, mounted_rigs
 
 # Six frames per run.
 SHORT = Scenario.model_validate(
@@ -59,9 +59,9 @@ def test_shuffled_frames_build_each_scene_once(built):
 @pytest.mark.parametrize(("room_for", "workers"), [(0.5, 1), (2.5, 1), (2.5, 4)])
 def test_cached_scenes_stay_within_the_budget(monkeypatch, built, room_for, workers):
     size = simulator().get_scene_geometry(0)[0].num_bytes
-    memory_bytes = room_for * size / stage.SceneStoreParams().max_memory_share
-    monkeypatch.setattr(stage, "find_memory_limit_bytes", lambda: memory_bytes)
-    monkeypatch.setattr(stage, "get_worker_info", lambda: SimpleNamespace(num_workers=workers))
+    memory_bytes = room_for * size / mounted_rigs.SceneStoreParams().max_memory_share
+    monkeypatch.setattr(mounted_rigs, "find_memory_limit_bytes", lambda: memory_bytes)
+    monkeypatch.setattr(mounted_rigs, "get_worker_info", lambda: SimpleNamespace(num_workers=workers))
     built.clear()
     made = simulator()
     for run in (0, 1, 0, 2, 0, 1):
@@ -83,8 +83,8 @@ def test_dropped_scenes_need_no_garbage_collection():
 
 
 def test_scenes_share_casters_and_sensors():
-    stages = stage.MountedRigStore(stage.SceneStore(SHORT, seed=0), {"roof": Rig.load("front_roof_128")})
+    stages = mounted_rigs.MountedRigStore(mounted_rigs.SceneStore(SHORT, seed=0), {"roof": Rig.load("front_roof_128")})
     first, second = stages.get_mounted_rigs(0), stages.get_mounted_rigs(1)
-    casters = [set(stage.scene_geometry.get_snapshot(0).moving_bodies.casters) for stage in (first, second)]
+    casters = [set(rigs.scene_geometry.get_snapshot(0).moving_bodies.casters) for rigs in (first, second)]
     assert casters[0] & casters[1]
     assert first.sensors_by_rig is second.sensors_by_rig

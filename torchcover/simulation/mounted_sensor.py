@@ -9,15 +9,15 @@ from torchcover.geometry import build_transform
 from torchcover.geometry.arrays import Bools, Float32, Float64, Int32, Int64
 from torchcover.simulation.bodies import Body
 from torchcover.simulation.culling import SearchSpheres
-from torchcover.simulation.instant import SceneSnapshot, SensorScan, run_in_threads
 from torchcover.simulation.memory import BYTES_PER_RAY, check_memory_fits
 from torchcover.simulation.raycaster import RayCaster
 from torchcover.simulation.rays import BLOCK_SIZE, Tile, compute_ray_pixel_indices, rotate, split_into_tiles
 from torchcover.simulation.returns import CLEAR, Weather
-from torchcover.simulation.scene import SceneGeometry, compute_hit_ranges_m
+from torchcover.simulation.scan_motion import RayTimes
+from torchcover.simulation.scene_geometry import SceneGeometry, compute_hit_ranges_m
+from torchcover.simulation.scene_snapshot import SceneSnapshot, SensorScan, run_in_threads
 from torchcover.simulation.sensor import RayHits, ScanTimes, Sensor, SensorNoise
 from torchcover.simulation.shapes import Mesh
-from torchcover.simulation.sweep import RayTimes
 
 # Relative rounding of a range in float32: a ray towards a target ends before it by this share of its length.
 RANGE_ROUNDING = 1e-6

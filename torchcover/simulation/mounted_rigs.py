@@ -11,16 +11,16 @@ from torch.utils.data import get_worker_info
 
 from torchcover.geometry.arrays import Bools, Float64, Int64
 from torchcover.simulation.bodies import describe_windows
-from torchcover.simulation.instant import SceneSnapshot
 from torchcover.simulation.local_ground import ROUNDING_M
 from torchcover.simulation.memory import find_memory_limit_bytes
-from torchcover.simulation.moving import BodyGeometryCache
+from torchcover.simulation.mounted_sensor import MountedSensor
+from torchcover.simulation.moving_bodies import BodyGeometryCache
 from torchcover.simulation.rig import Rig
 from torchcover.simulation.scenario import Scenario
-from torchcover.simulation.scene import SceneGeometry
 from torchcover.simulation.scene_cache import SceneCache
+from torchcover.simulation.scene_geometry import SceneGeometry
+from torchcover.simulation.scene_snapshot import SceneSnapshot
 from torchcover.simulation.shapes import Mesh
-from torchcover.simulation.sight import MountedSensor
 
 
 @dataclass(eq=False)

@@ -9,11 +9,11 @@ from torchcover.geometry import invert, transform_points
 from torchcover.geometry.trajectory import Trajectory
 from torchcover.simulation import CameraSensor, Lidar, Pose, SensorNoise
 from torchcover.simulation.bodies import move_to_vehicle_frame
-from torchcover.simulation.scene import SceneGeometry
+from torchcover.simulation.mounted_sensor import MountedSensor
+from torchcover.simulation.scene import Actor, Scene
+from torchcover.simulation.scene_geometry import SceneGeometry
 from torchcover.simulation.sensor import ScanTimes
 from torchcover.simulation.shapes import Box, Plane
-from torchcover.simulation.sight import MountedSensor
-from torchcover.simulation.world import Actor, Scene
 
 PERIOD_S, COLUMNS = 0.1, 40
 LIDAR = Lidar(
