@@ -141,7 +141,7 @@ def needing(pitch_deg):
 @pytest.mark.parametrize(("needed_deg", "lowest", "highest"), [(5.0, 5.0, 9.0), (50.0, 12.0, 15.0)])
 def test_target_requirements_are_met_or_nearly_met(monkeypatch, needed_deg, lowest, highest):
     """The best near is 4 degrees; a child needs 5, or more than the range has."""
-    monkeypatch.setattr("torchcover.placement.objective.check_requirements", needing(needed_deg))
+    monkeypatch.setattr("torchcover.placement.objective.check", needing(needed_deg))
     result = searched(of=space(requirements=required(points=5)), num_evaluations=24)
     assert list(result.search.evaluations[0].shortfalls) == ["child_110cm, points_m [[5.0, 0.0]], points >= 5"]
     assert lowest <= result.best.evaluation.values["roof.pitch_deg"] <= highest
