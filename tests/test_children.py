@@ -16,7 +16,7 @@ import pytest
 import torch
 from torch.distributed import HashStore
 
-from tests.files import apart_readers
+from tests.files import isolated_readers
 from torchcover.data import Frame
 from torchcover.evaluation import observe
 from torchcover.evaluation.heartbeat import Heartbeat, HeartbeatParams, report_silent_ranks
@@ -186,12 +186,12 @@ def test_a_stopped_sumo_is_reported(stopped, tmp_path, monkeypatch):
 
 def test_stopped_reader_is_reported_and_times_out(stopped, tmp_path, monkeypatch):
     (tmp_path / "file.x").write_text("content")
-    assert apart_readers.stopping(tmp_path / "file.x")["one"] == 1
+    assert isolated_readers.stopping(tmp_path / "file.x")["one"] == 1
     assert [message.split(" (process ")[0] for message in stopped] == ["the process that reads files"]
     monkeypatch.setattr("torchcover.files.processes.warnings.warn", lambda *_, **__: None)
     monkeypatch.setattr(isolated, "BASE_TIMEOUT_S", 0.5)
     with pytest.raises(ValueError, match="the process that reads it was stopped"):
-        apart_readers.stopping(tmp_path / "file.x")
+        isolated_readers.stopping(tmp_path / "file.x")
 
 
 @pytest.mark.parametrize("pause_s", [0.0, 1.0])

@@ -27,21 +27,21 @@ def metric(values, draws=None, name="metric"):
 
 def test_perfect_metrics_have_rank_correlation_1():
     truth = judged_by([[3.0, 1.0, 4.0, 1.5, 5.0], [3.5, 0.0, 4.5, 2.0, 6.0]])
-    found = correlate_rankings([metric(truth.mean, name="same"), metric(-truth.mean, name="opposite")], truth)
-    for row, value in zip(found.correlations, (1.0, -1.0), strict=True):
+    result = correlate_rankings([metric(truth.mean, name="same"), metric(-truth.mean, name="opposite")], truth)
+    for row, value in zip(result.correlations, (1.0, -1.0), strict=True):
         assert row.spearman == (pytest.approx(value),) * 3
         assert row.kendall == (pytest.approx(value),) * 3
         assert row.p_value == pytest.approx(2 / 120)
-    assert found.best_p_value == pytest.approx(2 / 120)  # the same order, or the opposite one
+    assert result.best_p_value == pytest.approx(2 / 120)  # equal or opposite order
 
 
 def test_constant_metrics_have_no_rank_correlation():
     truth = judged_by([[1.0, 2.0, 3.0, 4.0]])
-    found = correlate_rankings([metric([7.0] * 4, name="rays"), metric([1.0, 3.0, 2.0, 4.0], name="other")], truth)
+    result = correlate_rankings([metric([7.0] * 4, name="rays"), metric([1.0, 3.0, 2.0, 4.0], name="other")], truth)
     assert np.isnan(
-        [*found.correlations[0].spearman, *found.correlations[0].kendall, found.correlations[0].p_value]
+        [*result.correlations[0].spearman, *result.correlations[0].kendall, result.correlations[0].p_value]
     ).all()
-    assert (found.metric_count, found.best_metric) == (1, "other")
+    assert (result.metric_count, result.best_metric) == (1, "other")
     nothing = correlate_rankings([metric([7.0] * 4)], truth)
     assert (nothing.metric_count, nothing.best_metric) == (0, None)
     assert np.isnan([nothing.best_p_value, nothing.chance_threshold]).all()
@@ -50,18 +50,18 @@ def test_constant_metrics_have_no_rank_correlation():
 def test_best_p_values_are_uniform_under_chance():
     generator = np.random.default_rng(0)
     many, values = [metric(generator.normal(size=4)) for _ in range(6)], generator.normal(size=4)
-    # A truth that has nothing to do with the metrics is any of its orders, each as likely.
-    found = [
+    # Under chance, all orders of the target are equally likely.
+    result = [
         correlate_rankings(many, judged_by([values[order]]), num_samples=1)
         for order in map(list, permutations(range(4)))
     ]
     best, alone = (
         np.array(p)
-        for p in zip(*((one.best_p_value, [row.p_value for row in one.correlations]) for one in found), strict=True)
+        for p in zip(*((one.best_p_value, [row.p_value for row in one.correlations]) for one in result), strict=True)
     )
     for level in np.unique(best):
         assert (best <= level).mean() == pytest.approx(level)
-    # Whoever takes the p of the best one alone is far too often sure.
+    # The uncorrected p-value of the best metric is significant far too often.
     for level in np.unique(alone)[:2]:
         assert (alone[:, 0] <= level).mean() == pytest.approx(level)
         assert (alone.min(axis=1) <= level).mean() > 2 * level
@@ -101,7 +101,7 @@ def test_other_numbers_of_placements_are_refused():
         correlate_rankings([metric([1.0, 2.0, 3.0], np.zeros((7, 3)))], truth)
 
 
-# Results of papers.
+# Published results
 
 
 def test_place3d_tables_have_the_published_means():
@@ -119,7 +119,7 @@ def test_place3d_tables_have_the_published_means():
         "pedestrian": pytest.approx(-0.10, abs=0.01),
     }
     assert PLACE3D["miou", ""].raters == ("MinkUNet", "PolarNet", "SPVCNN", "Cylinder3D")
-    # The paper's own metric ranks cars as its detectors do.
+    # The metric of the paper ranks placements for cars as its detectors do.
     assert compute_spearman(
         PLACE3D["m_sog_1e-6", "detection"].select(cars.placements).mean, cars.mean
     ) == pytest.approx(1.0)
@@ -137,7 +137,7 @@ def test_every_placement_of_the_table_is_a_rig():
         ([[1, 2, 3, 4]], np.nan),
         ([[1, 2, 3, 4], [10, 20, 30, 40]], 1.0),
         ([[1, 2, 3, 4], [4, 3, 2, 1]], -1.0),
-        # Of three, two alike and one opposite: (1 - 1 - 1) / 3.
+        # Two equal series and one opposite: (1 - 1 - 1) / 3.
         ([[1, 2, 3, 4], [1, 2, 3, 4], [4, 3, 2, 1]], -1 / 3),
     ],
 )

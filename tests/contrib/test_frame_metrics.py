@@ -34,7 +34,7 @@ GRID = BevGrid(x_m=(0.0, 8.0), y_m=(0.0, 4.0), cell_m=1.0, heights={"low": (-0.5
 CAR = [10.0, 0.0, 1.0, 4.0, 2.0, 2.0, 0.0]
 
 
-# Closed forms.
+# Closed forms
 
 
 @pytest.mark.parametrize(
@@ -89,14 +89,14 @@ def test_the_share_of_an_object_weighs_square_metres():
     reference = [[8.0, 0.0, 0.5], [8.0, 0.0, 1.5], [30.0, 0.0, 0.0]]
     metric = ObjectCoverage(categories=("car", "bus"))
     metric.update(frame_of([[8.0, 0.0, 0.6]], reference, [CAR], ["car"], weights=[1.0, 3.0, 50.0]))
-    found = values(metric)
+    result = values(metric)
     assert (
-        found["object_coverage_0.4m"]
-        == found["object_coverage_0.4m:car"]
-        == found["object_coverage_0.4m:0-20m"]
+        result["object_coverage_0.4m"]
+        == result["object_coverage_0.4m:car"]
+        == result["object_coverage_0.4m:0-20m"]
         == 0.25
     )
-    assert math.isnan(found["object_coverage_0.4m:bus"])
+    assert math.isnan(result["object_coverage_0.4m:bus"])
     assert {number.count for number in metric.compute() if not number.has_value} == {0}
 
 
@@ -114,21 +114,21 @@ def test_uniformity_ranges_from_one_cell_to_even_points():
     for cloud, uniformity in ((even, 1.0), ([[0.5, 0.5, 0.0]] * 7, 1 / 32)):
         metric = PointDensity(GRID, [Region("near", (0.0, 2.0), (0.0, 4.0))])
         metric.update(frame_of(cloud))
-        found = values(metric)
-        assert found["point_uniformity_1m"] == pytest.approx(uniformity, abs=1e-15)
-        assert found["point_density"] == pytest.approx(len(cloud) / 32)
-        assert found["points"] == len(cloud)
+        result = values(metric)
+        assert result["point_uniformity_1m"] == pytest.approx(uniformity, abs=1e-15)
+        assert result["point_density"] == pytest.approx(len(cloud) / 32)
+        assert result["points"] == len(cloud)
 
 
 def test_empty_clouds_have_density_0_without_uniformity():
     metric = PointDensity(GRID, ())
     metric.update(frame_of([]))
-    found = values(metric)
-    assert (found["points"], found["point_density"]) == (0.0, 0.0)
-    assert math.isnan(found["point_uniformity_1m"])
+    result = values(metric)
+    assert (result["points"], result["point_density"]) == (0.0, 0.0)
+    assert math.isnan(result["point_uniformity_1m"])
 
 
-# The field of view, and what is false in it.
+# Field of view and false visible cells
 
 
 def lidar(**changes):
@@ -140,7 +140,7 @@ def test_rays_cross_cells_down_to_the_ground():
     grid = BevGrid(x_m=(-1.0, 5.0), y_m=(-1.0, 1.0), cell_m=0.25, heights={"low": (-0.1, 0.5), "high": (0.5, 2.0)})
     seen = compute_field_of_view([lidar(mount=Pose(x_m=0.05, y_m=0.1, z_m=1.0))], grid)
     low, high = (set((grid.x_centers_m[band.nonzero()[:, 1]]).tolist()) for band in seen)
-    assert low == {0.625, 0.875, 1.125}  # below 0.5 m from x = 0.55 on, and on the ground at 1.05
+    assert low == {0.625, 0.875, 1.125}  # below 0.5 m from x = 0.55 m, on the ground at x = 1.05 m
     assert high == {0.125, 0.375, 0.625}
     assert {int(row) for row in seen.nonzero()[:, 1]} == {4}
 
@@ -155,10 +155,10 @@ def test_no_cell_that_a_ray_crosses_is_missed():
     ends_m = np.where(directions[:, 2] < 0, origin_m[2] / np.maximum(-directions[:, 2], 1e-9), 60.0).clip(max=50.0)
     along = np.linspace(0.0, 1.0, 4001)[1:-1]
     points = (origin_m + (directions * ends_m[:, None])[:, None] * along[None, :, None]).reshape(-1, 3)
-    found = np.zeros_like(seen)
-    found.reshape(-1)[grid.assign_cells(torch.from_numpy(points)).cell_indices.numpy()] = True
-    assert (seen >= found).all()
-    assert (seen & ~found).sum() < 0.01 * found.sum()  # of which a ray cuts off less than a centimetre
+    result = np.zeros_like(seen)
+    result.reshape(-1)[grid.assign_cells(torch.from_numpy(points)).cell_indices.numpy()] = True
+    assert (seen >= result).all()
+    assert (seen & ~result).sum() < 0.01 * result.sum()  # a ray crosses less than a centimeter of it
 
 
 def test_rays_end_at_the_vehicle_and_at_range():
@@ -175,7 +175,7 @@ def test_false_visible_is_a_share_of_blind_cells():
     sensors = [lidar(vertical_fov_deg=(0.0, 0.0), mount=Pose(x_m=0.0, y_m=0.5, z_m=1.0), max_range_m=5.0)]
     grid = BevGrid(x_m=(0.0, 8.0), y_m=(0.0, 1.0), cell_m=1.0, heights={"high": (0.5, 2.0)})
     metric = FalseVisible(sensors, None, grid)
-    # Seen: 0. Not seen: 1 to 3 and 7, the first three of which the ray crosses. Nobody asked about the others.
+    # Cell 0 is visible; cells 1 to 3 and 7 are blind, of which the ray crosses 1 to 3. Other cells do not count.
     reference = [[x + 0.5, 0.5, 1.0] for x in (0, 1, 2, 3, 7)] + [[0.5, 0.9, 1.9]]
     metric.update(frame_of([[0.5, 0.5, 1.1]], reference))
     (number,) = metric.compute()
@@ -188,7 +188,7 @@ def test_rigs_without_blind_cells_have_no_false_visible():
     assert [number.has_value for number in metric.compute()] == [False, False]
 
 
-# Slow twins.
+# Slow implementations
 
 
 def test_k_cover_equals_a_loop_over_sensors():
@@ -202,7 +202,7 @@ def test_k_cover_equals_a_loop_over_sensors():
     near = Region("near", (0.0, 4.0), (0.0, 2.0))
     metric = KCover(GRID, [near], 0.9)
     metric.update(frame_of(cloud.tolist(), reference.tolist(), weights=weights.tolist(), sensors=sensors))
-    found = values(metric)
+    result = values(metric)
     parts = np.split(cloud.astype(np.float32), np.cumsum(list(sensors.values()))[:-1])
     for k in (1, 2, 3):
         for name, chosen in (
@@ -215,7 +215,7 @@ def test_k_cover_equals_a_loop_over_sensors():
                 if chosen(q):
                     seeing = sum((np.linalg.norm(part - q, axis=1) <= 0.9).any() for part in parts)
                     above, below = above + weight * (seeing >= k), below + weight
-            assert found[f"k_cover_{k}_0.9m{name}"] == pytest.approx(above / below, rel=1e-6)
+            assert result[f"k_cover_{k}_0.9m{name}"] == pytest.approx(above / below, rel=1e-6)
 
 
 def test_errors_are_those_of_a_mean_over_worlds():
@@ -251,7 +251,7 @@ def test_numbers_of_few_scenes_have_no_error(worlds, with_objects, known):
 def test_resampled_metrics_equal_metrics_over_resampled_scenes():
     case = CASES["object coverage"]
     estimate = case.over(case.frames).estimate()
-    assert len(estimate.frame_counts) == len(case.frames)  # a world each
+    assert len(estimate.frame_counts) == len(case.frames)  # one scene per frame
     drawn = case.over([case.frames[0], case.frames[0], case.frames[3]]).compute()
     weights = torch.zeros(1, len(case.frames))
     weights[0, 0], weights[0, 3] = 2, 1
@@ -284,7 +284,7 @@ def test_jackknife_values_equal_metrics_without_the_scene(name):
     assert errors.isfinite().any()
 
 
-# What does not matter, and what is unknown.
+# Invariances and unknown numbers
 
 
 @EVERY

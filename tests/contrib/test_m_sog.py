@@ -29,11 +29,11 @@ def seen(*points):
     return torch.tensor(points).reshape(-1, 3)
 
 
-AHEAD = beam(y_m=0.25, z_m=0.75)  # 8 voxels, those of both points among them
+AHEAD = beam(y_m=0.25, z_m=0.75)  # 8 voxels, including those of both points
 
 
 def test_three_labels_of_one_voxel_by_hand():
-    # At the same place: a car in half of four frames, something else in one, nothing in one.
+    # In one voxel: a car in two of four frames, other content in one, empty in one.
     beside = boxes((2.0, 3.0, 1.0, 1.0, 1.0, 2.0, 0.0))
     frames = [
         frame(0, boxes(CAR), reference=seen(ON_CAR)),
@@ -50,7 +50,7 @@ def test_three_labels_of_one_voxel_by_hand():
 
 
 def test_points_vote_and_a_draw_is_the_category():
-    # The voxel from 1.5 to 2 m holds the front of the box only down to 1.6.
+    # The voxel from 1.5 to 2 m contains the front of the box only from 1.6 m.
     short = boxes((2.1, 0.0, 1.0, 1.0, 1.0, 2.0, 0.0))
     in_it, beside_it = [1.9, 0.25, 0.75], [1.51, 0.25, 0.75]
     metric = MSog([AHEAD], voxel_m=0.5, region=REGION)

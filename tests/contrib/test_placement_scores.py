@@ -14,23 +14,23 @@ RIGS = {name: f"place3d2024_{name}" for name in ("center", "line", "pyramid")}
 def test_coverage_scores_equal_those_of_evaluate():
     region = Region("front", (0.0, 20.0), (-10.0, 10.0))
     scores = score_placements(RIGS, "courtyard", region=region, metrics=[], num_frames=8, seed=3)
-    asked = {
+    request = {
         "regions": {"front": {"x_m": (0, 20), "y_m": (-10, 10)}},
         "grid": {"x_m": (0, 20), "y_m": (-10, 10), "cell_m": 1.0},
     }
     result = evaluate(
-        list(RIGS.values()), "courtyard", regions=RegionsOfInterest.model_validate(asked), num_frames=8, seed=3
+        list(RIGS.values()), "courtyard", regions=RegionsOfInterest.model_validate(request), num_frames=8, seed=3
     )
-    found = {one.name: one for one in scores.rankings}
+    actual = {one.name: one for one in scores.rankings}
     for measure, words in (("area", "visible surface"), ("cells", "observed cells")):
         each = [
             [float(coverage.estimate(region, band, measure).value[1]) for coverage in result.coverages.values()]
             for band in ("ground", "obstacle")
         ]
         for name, expected in zip(("ground", "obstacle", "both bands"), (*each, np.mean(each, axis=0)), strict=True):
-            one = found[f"detection 0.4 m, {name}, front, {words}"]
-            np.testing.assert_array_equal(one.scores, expected)  # one number, not two of one name
-            # Draws of worlds are around the number that all of them give.
+            one = actual[f"detection 0.4 m, {name}, front, {words}"]
+            np.testing.assert_array_equal(one.scores, expected)  # no ambiguous names
+            # Bootstrap values lie around the number of all scenes.
             assert one.samples.shape[1] == 3
             np.testing.assert_allclose(
                 one.samples.mean(axis=0), expected, atol=4 * one.samples.std(axis=0).max() + 1e-3

@@ -53,8 +53,8 @@ def test_infinite_values_are_the_largest_not_unknown():
 
 def test_p_values_use_all_permutations():
     one, other = [1, 2, 3, 4, 5], [2, 1, 4, 3, 5]
-    found = abs(stats.spearmanr(one, other).statistic)
-    expected = np.mean([abs(stats.spearmanr(one, order).statistic) >= found - 1e-9 for order in permutations(other)])
+    result = abs(stats.spearmanr(one, other).statistic)
+    expected = np.mean([abs(stats.spearmanr(one, order).statistic) >= result - 1e-9 for order in permutations(other)])
     assert check_best_correlation(one, other).p_value == pytest.approx(expected, abs=1e-15)
 
 

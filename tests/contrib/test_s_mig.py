@@ -44,7 +44,7 @@ def test_entropy_is_one_bit_at_half_occupancy():
     )
     assert number.parameters["voxels_crossed"] == 20
     assert number.parameters["entropy_captured_nats"] == -number.value
-    # The same ray again, or from four sensors, is no other voxel.
+    # Repeated rays, also of four sensors, cross no further voxel.
     again = [ahead.model_copy(update={"name": name}) for name in "abcd"]
     assert value(s_mig(again, half)).value == number.value
 
@@ -96,15 +96,15 @@ def slowly(objects, grid):
 def test_occupancy_equals_a_slow_implementation():
     generator, grid = np.random.default_rng(3), VoxelGrid(REGION, 0.5)
     frames = [frame(index, random_boxes(generator, index % 6), place=index // 2) for index in range(40)]
-    frames.append(frames[5])  # the same frame again
+    frames.append(frames[5])  # a repeated frame
     metric = s_mig([beam()], frames)
-    found = build_occupancy(metric.boxes.numpy(), 0, grid, 16)
+    result = build_occupancy(metric.boxes.numpy(), 0, grid, 16)
     counts = np.zeros((16, *grid.shape), dtype=int)
     for one in frames:
-        counts[one.block_index // 2] += slowly(one.boxes, grid)  # 20 places: two in a block
-    assert np.array_equal(found.voxels, np.flatnonzero(counts.sum(axis=0)))
-    assert np.array_equal(found.counts[found.pattern_indices].T, counts.reshape(16, -1)[:, found.voxels])
-    assert found.frame_counts.tolist() == [4, 5, *[4] * 8, *[0] * 6]
+        counts[one.block_index // 2] += slowly(one.boxes, grid)  # 20 block indices: two per block
+    assert np.array_equal(result.voxels, np.flatnonzero(counts.sum(axis=0)))
+    assert np.array_equal(result.counts[result.pattern_indices].T, counts.reshape(16, -1)[:, result.voxels])
+    assert result.frame_counts.tolist() == [4, 5, *[4] * 8, *[0] * 6]
 
 
 def test_overlapping_boxes_count_once():
@@ -112,15 +112,15 @@ def test_overlapping_boxes_count_once():
 
     def occupied(*rows):
         table = build_occupancy_rows(boxes(*rows), 0, ("car",), REGION).numpy()
-        found = build_occupancy(table, 0, grid, 16)
-        assert found.counts.max() == 1
-        return len(found.voxels)
+        result = build_occupancy(table, 0, grid, 16)
+        assert result.counts.max() == 1
+        return len(result.voxels)
 
     shifted = (6.0, *AHEAD[1:])
     assert occupied(AHEAD) == 8 * 4 * 4
     assert occupied(AHEAD, AHEAD) == 8 * 4 * 4
     assert occupied(AHEAD, shifted) == 10 * 4 * 4
-    # Sides on centres: each belongs to one of two neighbours, whatever float32 makes of them.
+    # Faces on voxel centers: each center belongs to one of two adjacent boxes, despite rounding to float32.
     level = (0.25, 0.25, 0.35, 1.0, 1.0, 1.2, 0.0)
     assert occupied(level) == 2 * 2 * 2
     assert occupied(level, (1.25, *level[1:])) == 4 * 2 * 2

@@ -9,7 +9,7 @@ import pytest
 from torchcover.contrib.voxels import VoxelGrid, find_crossed_voxels
 from torchcover.geometry import BoundingBox
 
-# Sides that are exact in binary, and are not equal in number.
+# Side lengths that are exact in binary, with different numbers of voxels.
 GRID = VoxelGrid(BoundingBox((-1.0, -0.5, -0.5), (1.0, 1.0, 0.5)), 0.5)
 TINY = Fraction(1, 10**6)
 
@@ -65,9 +65,9 @@ def test_random_rays_match_exact_arithmetic():
     for ray in range(200):
         one = slice(ray, ray + 1)
         least, most = slowly(GRID, origins[one], directions[one], ends[one])
-        found = find_crossed_voxels(GRID, origins[one], directions[one], ends[one])
-        assert (least <= found).all(), ray
-        assert (found <= most).all(), ray
+        result = find_crossed_voxels(GRID, origins[one], directions[one], ends[one])
+        assert (least <= result).all(), ray
+        assert (result <= most).all(), ray
 
 
 MIDDLE = VoxelGrid(BoundingBox((-5.0, -5.0, -2.0), (5.0, 5.0, 2.0)), 0.5)
@@ -75,17 +75,17 @@ MIDDLE = VoxelGrid(BoundingBox((-5.0, -5.0, -2.0), (5.0, 5.0, 2.0)), 0.5)
 
 def test_nearly_parallel_rays_stay_in_the_upper_voxel():
     for tiny in (0.0, 1e-17, -1e-17, 1e-13, -1e-13):
-        found = np.argwhere(find_crossed_voxels(MIDDLE, [0.0, 0.0, 0.25], [[1.0, tiny, tiny]]))
-        assert found[:, 1:].tolist() == [[10, 4]] * 10
-    # From far away it would leave the region's side.
+        result = np.argwhere(find_crossed_voxels(MIDDLE, [0.0, 0.0, 0.25], [[1.0, tiny, tiny]]))
+        assert result[:, 1:].tolist() == [[10, 4]] * 10
+    # From far away it would leave the region on that side.
     assert find_crossed_voxels(MIDDLE, [-1e6, 0.25, 0.25], [[1.0, 1e-5, 0.0]]).sum() == 0
 
 
 def test_grazing_rays_stay_within_the_region():
     grid = VoxelGrid(BoundingBox((0.0, 0.0, 0.0), (4.0, 4.0, 1.0)), 1.0)
-    # Within a billionth of the wall at the last plane, and beyond it only after that.
-    found = np.argwhere(find_crossed_voxels(grid, [0.0, 4.0 - 3.5e-9, 0.5], [[1.0, 1e-9, 0.0]]))
-    assert found.tolist() == [[0, 3, 0], [1, 3, 0], [2, 3, 0], [3, 3, 0]]
+    # Within 1e-9 of the border at the last plane, and beyond it afterwards.
+    result = np.argwhere(find_crossed_voxels(grid, [0.0, 4.0 - 3.5e-9, 0.5], [[1.0, 1e-9, 0.0]]))
+    assert result.tolist() == [[0, 3, 0], [1, 3, 0], [2, 3, 0], [3, 3, 0]]
 
 
 def some_rays(count=300):

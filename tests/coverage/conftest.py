@@ -13,7 +13,7 @@ def slow_coverage():
 
 
 def _slow_coverage(grid, steps, thresholds_m=(0.4,), max_radius=math.inf):
-    per_cell = defaultdict(list)  # cell -> for each step with points there, the distances of those points
+    per_cell = defaultdict(list)  # Distances of the points of each frame with points in the cell, by cell.
     for sensor, reference in steps:
         in_step = defaultdict(list)
         distance = cdist(reference, sensor).min(axis=1, initial=math.inf)

@@ -87,9 +87,9 @@ def test_frame_quantiles_are_quantiles_of_frame_means(level):
     random = np.random.default_rng(3)
     steps = [random.uniform(0.02, 0.9, random.integers(1, 9)) for _ in range(101)]
     means = [np.float32(step).astype(float).mean() for step in steps]
-    found = quantile([(ORIGIN, points_at(*step)) for step in steps], level, kind=FrameQuantiles)
+    result = quantile([(ORIGIN, points_at(*step)) for step in steps], level, kind=FrameQuantiles)
     expected = np.quantile(means, level, method="inverted_cdf")
-    assert abs(found - expected) <= max(0.123 * expected, 0.01)
+    assert abs(result - expected) <= max(0.123 * expected, 0.01)
 
 
 def test_a_bad_moment_is_no_bad_point():
@@ -145,17 +145,17 @@ def test_region_numbers_aggregate_all_points_of_the_region():
     for row, (region, band) in zip(coverage.summary(), product((NEAR, ALL), BANDS.values()), strict=True):
         each = [radii_in(region, *step, band) for step in steps]
         radii, m2 = (np.concatenate(parts) for parts in zip(*each, strict=True))
-        found = {key: number.value for key, number in row.numbers.items()}
-        assert found["radius_maximum_m"] == pytest.approx(radii.max(), rel=1e-6)
-        # Points that weigh their square metres: their pooled mean is that by area.
-        assert found["radius_pooled_m"] == pytest.approx((radii * m2).sum() / m2.sum(), rel=1e-6)
-        assert found["radius_pooled_m"] == pytest.approx(found["radius_m"], rel=1e-12)
+        result = {key: number.value for key, number in row.numbers.items()}
+        assert result["radius_maximum_m"] == pytest.approx(radii.max(), rel=1e-6)
+        # With area weights, the pooled mean equals the mean over area.
+        assert result["radius_pooled_m"] == pytest.approx((radii * m2).sum() / m2.sum(), rel=1e-6)
+        assert result["radius_pooled_m"] == pytest.approx(result["radius_m"], rel=1e-12)
         shares = np.concatenate([own / own.sum() for _, own in each])
         order = radii.argsort()
         half = radii[order][np.searchsorted(shares[order].cumsum(), 0.5 * len(steps))]
-        assert found["radius_q0.5_m"] == pytest.approx(half, rel=0.13)
+        assert result["radius_q0.5_m"] == pytest.approx(half, rel=0.13)
         means = [(own * weights).sum() / weights.sum() for own, weights in each]
-        assert found["radius_frame_q0.5_m"] == pytest.approx(np.quantile(means, 0.5), rel=0.13)
+        assert result["radius_frame_q0.5_m"] == pytest.approx(np.quantile(means, 0.5), rel=0.13)
 
 
 def test_region_errors_are_jackknife_errors_over_blocks():
@@ -169,7 +169,7 @@ def test_region_errors_are_jackknife_errors_over_blocks():
         left_out.append(in_regions(rest, has_area_weights=True).compute().summary()[-1].numbers["radius_q0.9_m"].value)
     pseudo = 8 * whole - 7 * np.array(left_out)
     assert numbers["radius_q0.9_m"].error == pytest.approx(pseudo.std(ddof=1) / 8**0.5, rel=1e-9)
-    few = in_regions(steps[:8], has_area_weights=True).compute().summary()[-1].numbers  # a block each, coarse or fine
+    few = in_regions(steps[:8], has_area_weights=True).compute().summary()[-1].numbers
     assert few["radius_pooled_m"].error == pytest.approx(few["radius_m"].error, rel=1e-9)
     assert math.isnan(numbers["radius_maximum_m"].error)
     assert all(math.isnan(number.error) for number in in_regions(steps[:7]).compute().summary()[0].numbers.values())
@@ -227,19 +227,19 @@ def test_any_number_of_a_result_has_an_estimate():
         **row.redundancy.detecting_sensors,
     }
     for key in keys:
-        found, compared = (each.estimate_number(key, NEAR, "all") for each in (one, other))
-        assert [quantity.key for quantity in found.quantities] == [key]
+        result, compared = (each.estimate_number(key, NEAR, "all") for each in (one, other))
+        assert [quantity.key for quantity in result.quantities] == [key]
         if key in values:
-            assert float(found.value) == values[key].value
-        # Three worlds are too few to show an error, and enough to race with.
-        assert found.jackknife_values.shape == (3, 1)
-        assert math.isnan(found.error)
-        assert compared.subtract(found).compute_errors(3).isnan().tolist() == [key == "radius_maximum_m"]
+            assert float(result.value) == values[key].value
+        # Three scenes are too few for a reported error, and enough for early stopping.
+        assert result.jackknife_values.shape == (3, 1)
+        assert math.isnan(result.error)
+        assert compared.subtract(result).compute_errors(3).isnan().tolist() == [key == "radius_maximum_m"]
     with pytest.raises(ValueError, match=r"radius_q0\.8_m: the result has no such number; it has radius_q0"):
         one.estimate_number("radius_q0.8_m", NEAR, "all")
 
 
-# Any other
+# Custom aggregations
 
 
 @dataclass(frozen=True)
@@ -266,16 +266,16 @@ def test_custom_aggregations_appear_in_maps_numbers_and_tables():
     metric = CoverageMetric(FOUR, num_blocks=16, aggregations=[Blind()], regions=[NEAR])
     for index, (sensor, reference, _) in enumerate(steps):
         metric.update(sensor, reference, block_index=index)
-    found = metric.compute()
+    result = metric.compute()
     blind = [(radii_in(NEAR, *step)[0] > 0.5) for step in steps]
     base, sums = (
         torch.tensor(each, dtype=torch.float64) for each in ([len(b) for b in blind], [b.sum() for b in blind])
     )
     expected = Estimate.from_ratios((), base, sums[:, None], torch.ones(16))
-    number = found.summary()[0].numbers["blind_share"]
+    number = result.summary()[0].numbers["blind_share"]
     assert (number.value, number.error) == pytest.approx((float(expected.value), float(expected.error)), rel=1e-12)
-    assert found.layers["blind_share"].values.shape == FOUR.shape
-    table = CoverageTable.from_coverages({"rig": found}, [NEAR])
+    assert result.layers["blind_share"].values.shape == FOUR.shape
+    table = CoverageTable.from_coverages({"rig": result}, [NEAR])
     assert table.rows["rig"][0].summary.numbers["blind_share"] == number
     for written in ("text", "csv", "json", "markdown"):
         assert "blind_share" in RENDERERS[written](table) or "nothing is near" in " ".join(

@@ -98,7 +98,7 @@ def test_area_sums_merge_and_load_exactly(tmp_path, blocks):
     assert torch.equal(loaded.layers["radius_area_m"].values, coverage.layers["radius_area_m"].values)
 
 
-# Regions that overlap, with edges that no cell of 0.32 m follows; the last is what is left of the first.
+# Overlapping regions whose bounds are no edges of 0.32 m cells; the last is the rest of the first.
 ODD = (
     Region("near", x_m=(0.4, 3.3), y_m=(0.5, 2.1)),
     Region("far", x_m=(2.9, 7.77), y_m=(0.0, 4.0)),
@@ -137,12 +137,12 @@ def test_points_belong_to_regions_by_position():
     coverage = of_odd(steps).compute()
     for region in ODD:
         for height, band in HEIGHTS.items():
-            found = coverage.estimate(region, height)
-            np.testing.assert_allclose(found.value, twin(steps, region, *band), rtol=1e-6)
-            np.testing.assert_allclose(found.jackknife_values[0], twin(steps[1:], region, *band), rtol=1e-6)
+            result = coverage.estimate(region, height)
+            np.testing.assert_allclose(result.value, twin(steps, region, *band), rtol=1e-6)
+            np.testing.assert_allclose(result.jackknife_values[0], twin(steps[1:], region, *band), rtol=1e-6)
             (row,) = (row for row in coverage.summary([region]) if row.band == height)
             assert row.visible_m2 > 0
-    # By the centres of cells it is another number.
+    # Assignment by cell centers gives another number.
     cells = coverage.area_sums.sum_cells(ODD[0].mask_cells(coverage.grid), 0).sum(dim=0)
     assert abs(cells[1] / cells[0] / coverage.estimate(ODD[0], "low").value[0] - 1) > 1e-3
 
@@ -168,9 +168,9 @@ def test_area_average_is_independent_of_any_order():
 
 def test_other_regions_need_bounds_on_cell_edges(tmp_path):
     of_odd(steps_of(20)).compute().save(tmp_path / "coverage.npz")
-    loaded, asked = Coverage.load(tmp_path / "coverage.npz"), Region("later", x_m=(0.32, 3.2), y_m=(0.64, 1.6))
-    there = of_odd(steps_of(20), regions=[asked]).compute()
-    one, two = (each.estimate(asked, "low") for each in (there, loaded))
+    loaded, request = Coverage.load(tmp_path / "coverage.npz"), Region("later", x_m=(0.32, 3.2), y_m=(0.64, 1.6))
+    there = of_odd(steps_of(20), regions=[request]).compute()
+    one, two = (each.estimate(request, "low") for each in (there, loaded))
     torch.testing.assert_close(one.value, two.value, rtol=1e-12, atol=0)
     assert (len(one.frame_counts), len(two.frame_counts)) == (20, 5)  # sums over cells are in fewer blocks
     assert str(loaded.summary(ODD)) == str(of_odd(steps_of(20)).compute().summary(ODD))
@@ -239,6 +239,6 @@ def simulated(region, reference_sensor, steps):
     coverage = metric.compute()
     estimates = {height: coverage.estimate(region, height, "area") for height in ("ground", "obstacle")}
     return {
-        height: list(zip(found.value.tolist(), found.error.tolist(), strict=True))
-        for height, found in estimates.items()
+        height: list(zip(result.value.tolist(), result.error.tolist(), strict=True))
+        for height, result in estimates.items()
     }

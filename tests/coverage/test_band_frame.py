@@ -15,7 +15,7 @@ from torchcover.simulation import Lidar
 
 EXTENT = {"x_m": (0.0, 40.0), "y_m": (0.0, 1.0), "cell_m": 1.0}
 GROUND, VEHICLE = (BevGrid(**EXTENT, band_frame=band_frame) for band_frame in ("ground", "vehicle"))
-# A ramp of 1 in 10 from x = 0 on: a point on it, and one that stands 1 m above it, in every cell.
+# A ramp with slope 0.1 from x = 0: in every cell a point on it, and a point 1 m above it.
 ALONG_M = torch.arange(40) + 0.5
 ON_RAMP = torch.stack([ALONG_M, torch.full_like(ALONG_M, 0.5), 0.1 * ALONG_M], dim=1)
 ABOVE = ON_RAMP + torch.tensor([0.0, 0.0, 1.0])
@@ -126,12 +126,12 @@ def test_what_looks_at_frames_takes_their_heights():
         one.update(frame)
     assert torch.equal(observer.compute().point_counts, measured(GROUND, HEIGHT).point_counts)
     assert k_cover.compute()[0].value == 0.5
-    # All points of the rig are on the ramp, one in each square metre; over z half of them lie above 2 m.
+    # All points of the rig are on the ramp, one per square meter; by z half of them lie above 2 m.
     assert [number.value for number in density.compute()[1:]] == [1.0, 1.0]
     over_z = PointDensity(VEHICLE, ())
     over_z.update(frame)
     assert over_z.compute()[1].value == 0.5
-    # What stands on the ramp is seen in none of its 40 cells, of which rays 1 m above the ground cross one, or all.
+    # Points above the ramp are detected in none of its 40 cells; rays 1 m above ground cross one of them, or all.
     assert [one.compute()[1].value for one in predicted] == [1 / 40, 1.0]
     unknown = dataclasses.replace(frame, reference_heights_m=None)
     for one in (observer, k_cover, density):

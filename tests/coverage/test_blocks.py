@@ -12,7 +12,7 @@ from torchcover.coverage import Coverage, Layer, Maximum, MeanOfMeans, PooledMea
 from torchcover.coverage.sparse_sums import BlockSums, ObservedCells
 from torchcover.estimation import compute_jackknife_error, estimate_ratio_errors
 
-# Cells so large that the sensor point below a reference point is always the nearest.
+# In cells of this size the sensor point below a reference point is always the nearest.
 SHAPE = {"x_m": (0.0, 400.0), "y_m": (0.0, 100.0), "cell_m": 100.0, "heights": {"all": (-1.0, 1.0)}}
 GRID = BevGrid(**SHAPE)
 CELLS = GRID.num_cells
@@ -33,7 +33,7 @@ def random_steps(count: int, seed: int = 0, *, dyadic: bool = False, weighted: b
     steps = []
     for index in range(count):
         cells = np.flatnonzero(random.random(CELLS) < 0.6)
-        if dyadic:  # two points: means and sums of these are exact
+        if dyadic:  # means and sums of two such values are exact
             radii = {int(cell): (random.integers(0, 64, 2) / 64).tolist() for cell in cells}
         else:
             radii = {int(cell): random.random(random.integers(1, 4)).tolist() for cell in cells}
@@ -168,7 +168,7 @@ def test_sums_and_errors_are_those_of_plain_loops(count):
 def test_cell_errors_use_two_pseudo_blocks():
     steps = random_steps(64, seed=3)
     coverage, sums = metric_over(steps).compute(), slow_blocks(steps, 16)
-    for name, found in zip(("radius", "detection"), coverage.errors.values(), strict=True):
+    for name, result in zip(("radius", "detection"), coverage.errors.values(), strict=True):
         for cell in range(CELLS):
             n, s = sums["observed_frames"][:, cell], sums[name][:, cell]
             mean, usual = s.sum() / n.sum(), n.sum() / np.count_nonzero(n)
@@ -176,7 +176,7 @@ def test_cell_errors_use_two_pseudo_blocks():
             residual = [s[j] - mean * n[j] for j in range(16) if n[j]] + [usual * (own - mean) for own in imagined]
             k = len(residual)
             expected = math.sqrt(k / (k - 1) * sum(r * r for r in residual)) / (n.sum() + 2 * usual)
-            assert float(found.flatten()[cell]) == pytest.approx(expected, rel=1e-9)
+            assert float(result.flatten()[cell]) == pytest.approx(expected, rel=1e-9)
 
 
 def test_fewer_than_8_blocks_give_no_error():
@@ -217,7 +217,7 @@ def test_unreliable_numbers_of_blocks_are_refused(blocks):
         CoverageMetric(GRID, num_blocks=blocks)
 
 
-# Which block a step is in
+# Blocks of frames
 
 
 def test_the_order_of_the_steps_does_not_matter():
@@ -437,7 +437,7 @@ def test_weights_compensate_the_density_of_points():
     assert found(denser, None) == pytest.approx([7 / 12, 0.195], abs=0.005)
 
 
-# Are the errors true?
+# Errors against the spread over runs
 
 
 def coverage_of(radii: np.ndarray, probed: np.ndarray) -> Coverage:
@@ -473,7 +473,7 @@ def test_reported_errors_equal_the_spread_over_runs(alike):
         errors.append(estimate.error)
         cells.append(coverage.radius.flatten())
         of_cells.append(coverage.errors["radius_m"].flatten())
-    # Each known to 4 %: the spread from 300 runs.
+    # The spread over 300 runs is known to 4 %.
     torch.testing.assert_close(torch.stack(errors).mean(dim=0), torch.stack(numbers).std(dim=0), rtol=0.12, atol=0)
     truth = torch.tensor([0.3, 0.6, 0.9, 1.2], dtype=torch.float64)  # of 2 x 0.3 times a half, one, ...
     covers = (torch.stack(cells) - truth).abs() <= 2 * torch.stack(of_cells)

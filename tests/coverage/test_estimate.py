@@ -113,8 +113,8 @@ def test_numbers_without_maps_equal_those_with_maps(measure):
     for number, (sensor, reference) in enumerate(steps_of(40)):
         metric.update(sensor, reference, weights=reference[:, 0] + 0.1, block_index=number)
     places = [(PART, height) for height in GRID.heights]
-    for place, found in zip(places, metric.estimate_regions(places, measure), strict=True):
+    for place, result in zip(places, metric.estimate_regions(places, measure), strict=True):
         expected = metric.compute().estimate(*place, measure)
-        assert found.quantities == expected.quantities
+        assert result.quantities == expected.quantities
         for name in ("value", "jackknife_values", "frame_counts"):
-            torch.testing.assert_close(getattr(found, name), getattr(expected, name), rtol=0, atol=0)
+            torch.testing.assert_close(getattr(result, name), getattr(expected, name), rtol=0, atol=0)

@@ -45,8 +45,8 @@ def test_cells_are_half_open_wherever_the_range_lies(bounds, axis):
 def test_bands_are_half_open_without_gaps():
     grid = BevGrid(x_m=(0.0, 1.0), y_m=(0.0, 1.0), cell_m=1.0)
     for z, band in [(-0.5, 0), (0.0, 0), (0.4999, 0), (0.5, 1), (1.9999, 1), (2.0, None), (-0.5001, None)]:
-        found = index_of(grid, at(z=z))
-        assert (found and found[0]) == band if band is not None else found is None
+        result = index_of(grid, at(z=z))
+        assert (result and result[0]) == band if band is not None else result is None
 
 
 @pytest.mark.parametrize("order", [("low", "middle", "high"), ("high", "low", "middle"), ("middle", "high", "low")])
@@ -55,8 +55,8 @@ def test_bands_come_in_any_order_and_with_gaps(order):
     grid = BevGrid(x_m=(0.0, 1.0), y_m=(0.0, 1.0), cell_m=1.0, heights={name: bounds[name] for name in order})
     expected = {-2.0: "low", -1.5: "low", -1.0: "middle", 0.0: "middle", 0.5: None, 2.0: None, 3.0: "high", 4.0: None}
     for z, name in {**expected, -2.5: None, 9.0: None}.items():
-        found = index_of(grid, at(z=z))
-        assert (order[found[0]] if found else None) == name
+        result = index_of(grid, at(z=z))
+        assert (order[result[0]] if result else None) == name
 
 
 def test_many_bands_are_those_that_few_would_be():
@@ -110,11 +110,11 @@ def test_points_lie_between_the_edges_of_their_cell(low, count, cell, share):
     assert (edges[0], edges[-1]) == bounds
     assert (edges.diff() > 0).all()
     y = bounds[0] + share * (bounds[1] - bounds[0])
-    found = grid.find_cells(at(x=0.0, y=y)).item()
+    result = grid.find_cells(at(x=0.0, y=y)).item()
     if bounds[0] <= y < bounds[1]:
-        assert edges[found] <= y < edges[found + 1]
+        assert edges[result] <= y < edges[result + 1]
     else:
-        assert found == -1
+        assert result == -1
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float32, torch.float64])
@@ -122,7 +122,7 @@ def test_points_of_any_dtype_are_compared_exactly(dtype):
     grid = BevGrid(x_m=(0, 1), y_m=(0, 1), cell_m=0.1, heights=ONE_BAND)
     x = torch.arange(10).to(dtype) / 10
     points = torch.stack([x, torch.zeros_like(x), torch.zeros_like(x)], dim=1)
-    # What 0.7 becomes in a short type lies on one side of 0.7.
+    # Rounded to a short dtype, 0.7 lies on one side of 0.7.
     expected = [max(k for k in range(10) if value >= k / 10) for value in x.double().tolist()]
     assert grid.find_cells(points).tolist() == expected
     assert grid.find_cells(points.T.contiguous().T.requires_grad_()).tolist() == expected
@@ -162,7 +162,7 @@ def test_no_points_have_no_cells():
     assert (cells.shape, cells.dtype) == ((0,), torch.int64)
 
 
-# What a grid says of itself
+# Properties of grids
 
 
 def test_centres_lie_in_the_middle():
@@ -202,7 +202,7 @@ def test_a_grid_does_not_change_with_its_arguments():
     assert grid.shape == (1, 1, 2)
 
 
-# What is refused
+# Refused inputs
 
 
 @pytest.mark.parametrize("cell", [0.0, -0.5, math.nan, math.inf])

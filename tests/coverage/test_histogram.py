@@ -14,9 +14,9 @@ from torchcover.coverage.aggregations.quantiles import check_levels, compute_his
 @settings(max_examples=100, deadline=None)
 @given(st.lists(st.integers(-5, 5), min_size=2, max_size=6).map(sorted), st.floats(-6, 6))
 def test_bin_of_is_the_definition(edges, value):
-    found = find_bins(torch.tensor([value], dtype=torch.float64), torch.tensor(edges, dtype=torch.float64)).item()
+    result = find_bins(torch.tensor([value], dtype=torch.float64), torch.tensor(edges, dtype=torch.float64)).item()
     bins = [i for i in range(len(edges) - 1) if edges[i] <= value < edges[i + 1]]
-    assert found == (bins[0] if bins else -1)
+    assert result == (bins[0] if bins else -1)
 
 
 @settings(max_examples=60, deadline=None)
@@ -29,17 +29,17 @@ def test_quantiles_lie_in_the_true_bin(values, level):
     histogram = torch.zeros(10, 2, dtype=torch.float64)
     for value in values:
         histogram[int(value), 0] += 1.0
-    found = compute_histogram_quantiles(histogram, edges, (level,))
+    result = compute_histogram_quantiles(histogram, edges, (level,))
     true = np.quantile(values, level, method="inverted_cdf")
-    assert math.floor(true) <= found[0, 0].item() <= math.floor(true) + 1
-    assert found[0, 1].isnan()
+    assert math.floor(true) <= result[0, 0].item() <= math.floor(true) + 1
+    assert result[0, 1].isnan()
 
 
 def test_quantiles_are_linear_within_a_bin():
     edges = torch.tensor([0.0, 1.0, 3.0, math.inf], dtype=torch.float64)
     histogram = torch.tensor([[0.0], [4.0], [1.0]], dtype=torch.float64)
-    found = compute_histogram_quantiles(histogram, edges, (0.0, 0.2, 0.4, 0.8, 0.9, 1.0))
-    assert found.flatten().tolist() == [1.0, 1.5, 2.0, 3.0, math.inf, math.inf]
+    result = compute_histogram_quantiles(histogram, edges, (0.0, 0.2, 0.4, 0.8, 0.9, 1.0))
+    assert result.flatten().tolist() == [1.0, 1.5, 2.0, 3.0, math.inf, math.inf]
 
 
 @pytest.mark.parametrize("weights", [(0.1, 0.2, 0.3, 0.6), (1, 2, 3, 6), (0.7, 0.1, 0.8), (1 / 3, 1 / 3, 2 / 3)])

@@ -318,17 +318,17 @@ def test_more_sensor_points_never_make_it_worse(seed):
 def test_points_detect_at_thresholds_above_their_error():
     points, reference = torch.rand(2, 40, 3, generator=torch.Generator().manual_seed(2)).unbind()
     error = torch.linspace(-0.6, 0.6, 40)[torch.randperm(40, generator=torch.Generator().manual_seed(3))]
-    asked = {thresholds: CoverageMetric(ONE_CELL, thresholds, max_radius_m=9.0) for thresholds in SETS_OF_THRESHOLDS}
-    for metric in asked.values():
+    request = {thresholds: CoverageMetric(ONE_CELL, thresholds, max_radius_m=9.0) for thresholds in SETS_OF_THRESHOLDS}
+    for metric in request.values():
         metric.update([points], [reference], errors_m=[error])
-    found = {thresholds: metric.compute() for thresholds, metric in asked.items()}
-    (radius,) = {float(one.radius) for one in found.values()}
+    result = {thresholds: metric.compute() for thresholds, metric in request.items()}
+    (radius,) = {float(one.radius) for one in result.values()}
     assert radius == float(coverage([(points[error.abs() <= 0.4], reference)], max_radius_m=9.0).radius)
     for threshold in (0.1, 0.25, 0.5):
-        (known,) = {float(one.detection[given.index(threshold)]) for given, one in found.items() if threshold in given}
+        (known,) = {float(one.detection[given.index(threshold)]) for given, one in result.items() if threshold in given}
         near = torch.cdist(reference, points[error.abs() <= threshold]).amin(dim=1) <= threshold
         assert known == pytest.approx(float(near.double().mean()))
-    assert len({float(one) for one in found[0.1, 0.25, 0.5].detection}) == 3
+    assert len({float(one) for one in result[0.1, 0.25, 0.5].detection}) == 3
 
 
 def test_errors_are_in_the_order_of_sensors():
@@ -377,7 +377,7 @@ def test_a_step_split_in_two_is_another_number():
     assert parts.radius.item() == (0.125 + 0.6875) / 2
 
 
-# What is refused
+# Refused inputs
 
 
 @pytest.mark.parametrize(
@@ -385,7 +385,7 @@ def test_a_step_split_in_two_is_another_number():
     [
         ({"thresholds_m": (0.4, -0.1)}, r"thresholds_m: finite distances >= 0 in meters are needed; got \(0.4, -0.1\)"),
         ({"thresholds_m": (math.nan,)}, "thresholds_m: finite distances >= 0"),
-        # Within it lies whatever a blind rig has not seen.
+        # A blind rig would detect all points within this threshold.
         ({"thresholds_m": (0.4, math.inf)}, r"thresholds_m: finite distances .*got \(0.4, inf\)"),
         ({"thresholds_m": (0.4, 0.5, 0.4)}, r"thresholds_m: values that differ in six digits.*got \(0.4, 0.5, 0.4\)"),
         ({"thresholds_m": (0.4, 0.40000004)}, "thresholds_m: values that differ in six digits"),

@@ -15,7 +15,7 @@ from torchcover.coverage import CoverageNumberMetric, sums
 GRID = BevGrid(x_m=(0.0, 8.0), y_m=(-2.0, 2.0), cell_m=1.0, heights={"low": (-1.0, 0.5), "high": (0.5, 2.0)})
 NEAR, FAR = Region("near", (0.0, 4.0), (-2.0, 2.0)), Region("far", (4.0, 8.0), (-2.0, 2.0))
 OPTIONS = {"thresholds_m": (0.4, 1.0), "max_radius_m": 9.0}
-# Named so that neither the order of names nor that of making is that of the directions.
+# The order of names and of creation differs from the order of directions.
 NUMBERS = {
     "d_far": ("detection_1m", FAR, "high"),
     "a_radius": ("radius_m", NEAR, "low"),
@@ -47,15 +47,15 @@ def test_a_number_is_that_of_the_summary(options):
         for one in (whole, *each.values()):
             one.update(*clouds, weights=weights)
     for name, one in each.items():
-        found = pickle.loads(pickle.dumps(one)).compute()
-        assert (found.shape, found.dtype) == ((), torch.float64)
-        assert found.item() == scalar(whole.compute(), name)
+        result = pickle.loads(pickle.dumps(one)).compute()
+        assert (result.shape, result.dtype) == ((), torch.float64)
+        assert result.item() == scalar(whole.compute(), name)
 
 
 @pytest.mark.parametrize("name", NUMBERS)
 def test_tracker_uses_the_direction_of_the_number(name):
     tracker = MetricTracker(numbers()[name])
-    for seed, points in enumerate((5, 400, 40)):  # the second sees most
+    for seed, points in enumerate((5, 400, 40)):  # the second rig detects most
         tracker.increment()
         tracker.update(*step(seed, points))
     best, at = tracker.best_metric(return_step=True)
@@ -76,7 +76,7 @@ def test_collections_measure_each_frame_once(monkeypatch):
             searched.clear()
             tracker.update(*step(seed, points))
             whole.update(*step(seed, points))
-        assert len(searched) == 2  # the collection's, which knows after the first step that all share their sums
+        assert len(searched) == 2  # the collection groups metrics with equal sums after the first frame
         truths.append(whole.compute())
         assert tracker.compute() == tracker.compute() == {name: scalar(truths[-1], name) for name in NUMBERS}
     best, at = tracker.best_metric(return_step=True)

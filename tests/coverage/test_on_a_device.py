@@ -19,7 +19,7 @@ from torchcover.frames import Frame, rotate
 from torchcover.neighbors import backend_choice
 
 GPU, MPS = torch.device("cuda", 0), torch.device("mps", 0)
-# What takes tensors of two devices.
+# Functions that accept tensors on two devices.
 MOVES = ("to", "cpu", "numpy", "tolist", "copy_")
 
 
@@ -95,7 +95,7 @@ def each_step():
 def test_the_sums_stay_on_the_device():
     grid = BevGrid(x_m=(0.0, 20.0), y_m=(0.0, 20.0), cell_m=1.0, heights={"low": (0.0, 4.0), "high": (4.0, 20.0)})
     every = (Maximum(), PooledMean(), Quantiles((0.5, 0.9)), FrameQuantiles((0.9,)))
-    # 8 blocks for 10 steps, so that some are added up in pairs.
+    # 8 blocks for 10 frames, so that some blocks are merged.
     options = {"max_radius_m": 30.0, "num_blocks": 8, "aggregations": every, "has_area_weights": True}
     here, there = (CoverageMetric(grid, (0.4, 1.0), backend="cdist", **options) for _ in range(2))
     for sensor, reference, weights in each_step():
@@ -106,13 +106,13 @@ def test_the_sums_stay_on_the_device():
         for clouds in each_step():
             sensor, reference, weights = on_gpu(*clouds)
             there.update(sensor, reference, weights=weights)
-        found = there.compute()
+        result = there.compute()
         assert gpu.to_host == []
-        assert all(isinstance(layer.values, OnGpu) for layer in found.layers.values())
-        scalars = found.scalars([Region("front", (0.0, 20.0), (5.0, 15.0))])
+        assert all(isinstance(layer.values, OnGpu) for layer in result.layers.values())
+        scalars = result.scalars([Region("front", (0.0, 20.0), (5.0, 15.0))])
     expected = here.compute()
     for key, layer in expected.layers.items():
-        np.testing.assert_array_equal(as_values(found.layers[key].values), layer.values.numpy())
+        np.testing.assert_array_equal(as_values(result.layers[key].values), layer.values.numpy())
     assert scalars == expected.scalars([Region("front", (0.0, 20.0), (5.0, 15.0))])
     assert max((count for _, count in gpu.to_host), default=0) <= 2 * 20 * 20
 
@@ -132,9 +132,9 @@ def test_a_gpu_adds_up_what_the_cpu_does():
         for clouds in each_step():
             sensor, reference, weights = (cloud.to(metric.device) for cloud in clouds)
             metric.update(sensor, reference, weights=weights)
-    expected, found = (metric.compute() for metric in metrics)
+    expected, result = (metric.compute() for metric in metrics)
     for key, layer in expected.layers.items():
-        torch.testing.assert_close(found.layers[key].values.cpu(), layer.values, rtol=1e-6, atol=0, equal_nan=True)
+        torch.testing.assert_close(result.layers[key].values.cpu(), layer.values, rtol=1e-6, atol=0, equal_nan=True)
 
 
 def test_box_visibility_stays_on_the_device(monkeypatch):
@@ -146,9 +146,9 @@ def test_box_visibility_stays_on_the_device(monkeypatch):
     expected = measure_box_visibility(sensor, reference, boxes, reference_weights=weights)
     with PretendedGpu() as gpu:
         clouds = on_gpu(sensor, reference)
-        found = measure_box_visibility(*clouds, boxes, reference_weights=weights.as_subclass(OnGpu))
-    assert isinstance(found.share, OnGpu)
-    np.testing.assert_array_equal(as_values(found.share), expected.share.numpy())
+        result = measure_box_visibility(*clouds, boxes, reference_weights=weights.as_subclass(OnGpu))
+    assert isinstance(result.share, OnGpu)
+    np.testing.assert_array_equal(as_values(result.share), expected.share.numpy())
     assert all(count <= len(boxes) for _, count in gpu.to_host)
 
 
@@ -166,12 +166,24 @@ def test_devices_without_float64_get_what_the_cpu_computes():
         turned = rotate(frame, 0.3)
         region = Region.from_corners("corner", [(0.0, 0.0), (20.0, 0.0), (20.0, 20.0)])
         return [
-            *nearest(reference, sensor), blind_spot_radius(sensor, reference, max_radius=2.0), grid.find_cells(reference),
-            *grid.assign_cells(reference), grid.count_points_by_column(reference), region.mask_points(*reference[:, :2].T),
-            *find_points_in_boxes(reference, boxes), seen.share, seen.reference_points, compute_bev_iou(boxes.rows, boxes.rows),
-            turned.reference, turned.boxes.rows, *camera.project(reference), camera.unproject(depth),
-            *camera.rays(reference[:, :2]), camera.convert_z_to_distance(depth), camera.to_vehicle(reference),
-        ]  # fmt: skip
+            *nearest(reference, sensor),
+            blind_spot_radius(sensor, reference, max_radius=2.0),
+            grid.find_cells(reference),
+            *grid.assign_cells(reference),
+            grid.count_points_by_column(reference),
+            region.mask_points(*reference[:, :2].T),
+            *find_points_in_boxes(reference, boxes),
+            seen.share,
+            seen.reference_points,
+            compute_bev_iou(boxes.rows, boxes.rows),
+            turned.reference,
+            turned.boxes.rows,
+            *camera.project(reference),
+            camera.unproject(depth),
+            *camera.rays(reference[:, :2]),
+            camera.convert_z_to_distance(depth),
+            camera.to_vehicle(reference),
+        ]
 
     def measure(sensor, reference, weights, boxes):
         metric, recall = CoverageMetric(grid, max_radius_m=30.0, has_area_weights=True), RecallByVisibility()
@@ -185,9 +197,9 @@ def test_devices_without_float64_get_what_the_cpu_computes():
     numbers = measure(sensor, reference, weights, boxes)
     with PretendedGpu(MPS):
         there = [tensor.as_subclass(OnMps) for tensor in (sensor, reference, weights)]
-        found = compute_all(*there, boxes.to(MPS), depth.as_subclass(OnMps))
+        result = compute_all(*there, boxes.to(MPS), depth.as_subclass(OnMps))
         assert measure(*there, boxes.to(MPS)) == pytest.approx(numbers, nan_ok=True, rel=1e-6)
-    for here, tensor in zip(expected, found, strict=True):
+    for here, tensor in zip(expected, result, strict=True):
         assert isinstance(tensor, OnMps)
         np.testing.assert_allclose(as_values(tensor), here.numpy(), rtol=1e-6)
 

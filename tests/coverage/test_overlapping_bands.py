@@ -46,12 +46,12 @@ def test_a_point_in_several_bands_is_counted_once():
 def test_assigned_cells_are_the_cells_of_each_band():
     points = torch.randn(500, 3, generator=torch.Generator().manual_seed(1))
     bins = grid_of(BANDS).assign_cells(points)
-    found = set(zip(bins.point_indices[bins.point_positions].tolist(), bins.cell_indices.tolist(), strict=True))
+    result = set(zip(bins.point_indices[bins.point_positions].tolist(), bins.cell_indices.tolist(), strict=True))
     expected = set()
     for number, (name, band) in enumerate(BANDS.items()):
         cells = grid_of({name: band}).find_cells(points)
         expected |= {(at, cell + number * 32) for at, cell in enumerate(cells.tolist()) if cell >= 0}
-    assert found == expected
+    assert result == expected
     assert len(bins.cell_indices) == len(expected)
     assert bins.point_indices.tolist() == sorted({at for at, _ in expected})
 

@@ -54,16 +54,16 @@ def test_significance_equals_a_paired_t_test(shift, seed):
             metric.update(torch.tensor([[0.5, 0.5, -radius]]), torch.tensor([[0.5, 0.5, 0.0]]), block_index=at)
         coverages[name] = metric.compute()
     itself, other = compute_differences(coverages, NEAR, "ground").values()
-    found = other["radius_m"]
+    result = other["radius_m"]
     test = stats.ttest_rel(radii["b"], radii["a"])
-    assert found.value == pytest.approx(radii["b"].mean() - radii["a"].mean(), abs=1e-6)
-    assert abs(found.value) / found.error == pytest.approx(abs(test.statistic), rel=1e-4)
-    assert found.is_significant is bool(test.pvalue < 0.05)
-    assert found.p_value == pytest.approx(test.pvalue, rel=1e-3)
-    assert (found.block_count, found.better_count) == (16, (radii["b"] < radii["a"]).sum())
-    # Of lengths the end that is farther from 0 is a quarter longer.
-    low, high = (end - found.value for end in test.confidence_interval())
-    reach = (low, 1.25 * high) if found.value > 0 else (1.25 * low, high)
-    assert (found.low - found.value, found.high - found.value) == pytest.approx(reach, abs=1e-3)
+    assert result.value == pytest.approx(radii["b"].mean() - radii["a"].mean(), abs=1e-6)
+    assert abs(result.value) / result.error == pytest.approx(abs(test.statistic), rel=1e-4)
+    assert result.is_significant is bool(test.pvalue < 0.05)
+    assert result.p_value == pytest.approx(test.pvalue, rel=1e-3)
+    assert (result.block_count, result.better_count) == (16, (radii["b"] < radii["a"]).sum())
+    # The interval of a length reaches 1.25 times as far on the side away from 0.
+    low, high = (end - result.value for end in test.confidence_interval())
+    reach = (low, 1.25 * high) if result.value > 0 else (1.25 * low, high)
+    assert (result.low - result.value, result.high - result.value) == pytest.approx(reach, abs=1e-3)
     assert itself["radius_m"][1:3] == (0.0, 0.0)
     assert itself["radius_m"].is_significant is False

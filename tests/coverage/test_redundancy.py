@@ -54,18 +54,18 @@ def test_failure_numbers_equal_the_rig_without_the_sensor(has_area_weights, empt
         rest = measured(steps(empty=empty), without=sensor, by_sensor=False, has_area_weights=has_area_weights)
         for quantity in rest.quantities:
             key = quantity.key.replace("_", "_area_", 1) if has_area_weights else quantity.key
-            found = whole.redundancy.layers[f"{quantity.key}_without_{sensor}"].values
+            result = whole.redundancy.layers[f"{quantity.key}_without_{sensor}"].values
             exact = (
                 {"rtol": 0, "atol": 0} if has_area_weights and "detection" in key else {"rtol": 1e-13, "atol": 1e-15}
             )
-            torch.testing.assert_close(found, rest.layers[key].values, equal_nan=True, **exact)
-        for found, expected, full in zip(whole.summary(), rest.summary(), alone.summary(), strict=True):
-            region = next(region for region in REGIONS if region.name == found.region)
-            compared = compute_differences({"all": alone, "rest": rest}, region, found.band)["rest"]
+            torch.testing.assert_close(result, rest.layers[key].values, equal_nan=True, **exact)
+        for result, expected, full in zip(whole.summary(), rest.summary(), alone.summary(), strict=True):
+            region = next(region for region in REGIONS if region.name == result.region)
+            compared = compute_differences({"all": alone, "rest": rest}, region, result.band)["rest"]
             for key, number in expected.numbers.items():
-                own = found.redundancy.failure_numbers[sensor][key]
+                own = result.redundancy.failure_numbers[sensor][key]
                 assert own.value == pytest.approx(number.value, rel=1e-13)
-                change = found.redundancy.failure_effects[sensor][key]
+                change = result.redundancy.failure_effects[sensor][key]
                 assert change.value == pytest.approx(number.value - full.numbers[key].value, rel=1e-9, abs=1e-13)
                 if has_area_weights:
                     assert own.error == pytest.approx(number.error, rel=1e-9)
@@ -78,7 +78,7 @@ def test_failure_numbers_equal_the_rig_without_the_sensor(has_area_weights, empt
 
 def test_how_many_sensors_see_a_point_is_counted():
     whole = measured(steps(), has_area_weights=True)
-    # The mean number is the sum of what each sees alone.
+    # The mean number of detecting sensors is the sum of the detection rates of single sensors.
     alone = []
     for sensor in SENSORS:
         only = [({sensor: clouds[sensor]}, reference, weights) for clouds, reference, weights in steps()]

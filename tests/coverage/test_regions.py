@@ -20,7 +20,7 @@ def test_the_papers_regions():
 
 
 def test_cells_belong_to_the_region_of_their_center():
-    # Centres along x: ..., 0.25, 0.75, 1.25, ...; along y: -1.75, ..., 1.75.
+    # Centers along x: ..., 0.25, 0.75, 1.25, ...; along y: -1.75, ..., 1.75.
     mask = Region("r", x_m=(0.25, 1.25), y_m=(-0.3, 0.25)).mask_cells(GRID)
     assert mask.shape == (8, 16)
     inside = [
@@ -86,7 +86,7 @@ def test_regions_without_cells_are_refused_early():
     ("x", "y"), [((-4.0, 4.0), (-2.0, 2.0)), ((0.25, 1.25), (-0.3, 0.25)), ((-1.1, 0.6), (0.75, 2.0))]
 )
 def test_rectangles_as_polygons_equal_rectangles(x, y):
-    # 0.25, -0.25 and so on are centres of cells: on an edge.
+    # 0.25, -0.25 and so on are cell centers on an edge.
     corners = [(x[0], y[0]), (x[1], y[0]), (x[1], y[1]), (x[0], y[1])]
     for order in (corners, corners[::-1], [*corners, corners[0]]):
         polygon = Region.from_corners("r", order)
@@ -95,7 +95,7 @@ def test_rectangles_as_polygons_equal_rectangles(x, y):
 
 
 def test_polygons_with_a_common_edge_partition_cells():
-    # The edge goes through centres.
+    # The edge passes through cell centers.
     left = Region.from_corners("left", [(-4.0, -2.0), (0.25, -2.0), (2.25, 2.0), (-4.0, 2.0)])
     right = Region.from_corners("right", [(0.25, -2.0), (4.0, -2.0), (4.0, 2.0), (2.25, 2.0)])
     assert torch.equal(left.mask_cells(GRID), ~right.mask_cells(GRID))
@@ -126,7 +126,7 @@ def test_a_name_is_given_once():
 
 
 def test_polygons_with_a_common_edge_partition_points():
-    # Corners, points of the edge to the last bit, and some around it.
+    # Corners, exact points on the edge, and random points near it.
     left = Region.from_corners("left", [(-4.0, -2.0), (0.3, -2.0), (2.1, 2.0), (-4.0, 2.0)])
     right = Region.from_corners("right", [(0.3, -2.0), (4.0, -2.0), (4.0, 2.0), (2.1, 2.0)])
     share = torch.linspace(0, 1, 1001, dtype=torch.float64)

@@ -144,17 +144,17 @@ def test_pooled_means_without_a_block_use_other_frames():
     metric = CoverageMetric(grid, aggregations=[PooledMean()], regions=[region], num_blocks=8)
     for at, radius in enumerate(radii):
         metric.update(torch.tensor([[0.5, 0.5, -radius]]), torch.tensor([[0.5, 0.5, 0.0]]), block_index=at)
-    found = metric.compute().estimate_aggregated(region, "all")
+    result = metric.compute().estimate_aggregated(region, "all")
     without = [(sum(radii) - radius) / 7 for radius in radii]
-    assert found.jackknife_values[:, 0].tolist() == pytest.approx(without)
-    assert found.frame_counts.tolist() == [1] * 8
+    assert result.jackknife_values[:, 0].tolist() == pytest.approx(without)
+    assert result.frame_counts.tolist() == [1] * 8
 
 
 def test_what_was_not_aggregated_has_no_numbers():
     grid = BevGrid(x_m=(0.0, 1.0), y_m=(0.0, 1.0), cell_m=1.0, heights={"all": (-1.0, 1.0)})
     result = a_coverage(grid=grid, frames=torch.tensor([[[1]]]))
-    found = result.estimate_aggregated(Region("one", grid.x_m, grid.y_m), "all")
-    assert (found.quantities, len(found.value)) == ((), 0)
+    actual = result.estimate_aggregated(Region("one", grid.x_m, grid.y_m), "all")
+    assert (actual.quantities, len(actual.value)) == ((), 0)
 
 
 def test_repr_shows_the_observed_share():
@@ -196,7 +196,7 @@ def test_a_file_gives_back_what_was_saved(tmp_path, options, as_text):
     )
     metric.update(torch.zeros(1, 3), torch.rand(50, 3, generator=torch.Generator().manual_seed(0)))
     result = metric.compute()
-    path = tmp_path / "coverage"  # no suffix: the name is left as it is
+    path = tmp_path / "coverage"  # without a suffix the name does not change
     result.save(str(path) if as_text else path)
     assert path.is_file()
     assert_same(Coverage.load(str(path) if as_text else path), result)
@@ -206,20 +206,20 @@ def test_loaded_results_keep_errors_and_comparisons(tmp_path):
     """Loaded results are equal in all bits, since files contain the sums in blocks."""
     random = torch.Generator().manual_seed(3)
     grid = BevGrid(x_m=(0.0, 4.0), y_m=(-2.0, 2.0), cell_m=1.0, heights={"all": (-1.0, 1.0)})
-    region, found = Region("all", grid.x_m, grid.y_m), {}
+    region, result = Region("all", grid.x_m, grid.y_m), {}
     metrics = {name: CoverageMetric(grid, num_blocks=16) for name in ("a", "b")}
     for _ in range(20):
         reference = torch.rand(40, 3, generator=random) * 4 - torch.tensor([0.0, 2.0, 0.0])
         for metric in metrics.values():
             metric.update(torch.rand(30, 3, generator=random) * 4, reference)
     for name, metric in metrics.items():
-        found[name] = metric.compute()
-        found[name].save(tmp_path / f"{name}.npz")
-    loaded = {name: Coverage.load(tmp_path / f"{name}.npz") for name in found}
-    assert repr(loaded["b"].summary([region])) == repr(found["b"].summary([region]))  # NaN equals no NaN
+        result[name] = metric.compute()
+        result[name].save(tmp_path / f"{name}.npz")
+    loaded = {name: Coverage.load(tmp_path / f"{name}.npz") for name in result}
+    assert repr(loaded["b"].summary([region])) == repr(result["b"].summary([region]))  # NaN differs from NaN
     assert loaded["b"].summary([region])[0].numbers["radius_m"].error > 0
-    assert compute_differences(loaded, region, "all") == compute_differences(found, region, "all")
-    for key, error in found["a"].errors.items():
+    assert compute_differences(loaded, region, "all") == compute_differences(result, region, "all")
+    for key, error in result["a"].errors.items():
         assert torch.equal(loaded["a"].errors[key].nan_to_num(), error.nan_to_num())
 
 

@@ -80,10 +80,10 @@ def _bits(data, random):
 
 
 def _number(data, random):
-    found = list(re.finditer(rb"-?\d+(\.\d+)?", data[:4000]))
-    if not found:
+    result = list(re.finditer(rb"-?\d+(\.\d+)?", data[:4000]))
+    if not result:
         return _bits(data, random)
-    one = random.choice(found)
+    one = random.choice(result)
     return data[: one.start()] + random.choice(NUMBERS) + data[one.end() :]
 
 

@@ -30,12 +30,12 @@ def estimate(m2, each, steps=None):
 def test_jackknife_values_of_ratios_ignore_unused_blocks():
     m2, each = sums(9)
     m2[4], each[4] = 0.0, 0.0
-    found = estimate(m2, each, [1, 1, 1, 1, 0, 1, 1, 1, 1])
-    np.testing.assert_allclose(found.value, each.sum(axis=0) / m2.sum(), rtol=1e-12)
-    assert len(found.jackknife_values) == len(found.frame_counts) == 8
-    np.testing.assert_allclose(found.jackknife_values[-1], each[:-1].sum(axis=0) / m2[:-1].sum(), rtol=1e-12)
+    result = estimate(m2, each, [1, 1, 1, 1, 0, 1, 1, 1, 1])
+    np.testing.assert_allclose(result.value, each.sum(axis=0) / m2.sum(), rtol=1e-12)
+    assert len(result.jackknife_values) == len(result.frame_counts) == 8
+    np.testing.assert_allclose(result.jackknife_values[-1], each[:-1].sum(axis=0) / m2[:-1].sum(), rtol=1e-12)
     of_each = estimate(np.stack([m2, m2]).T, each, [1, 1, 1, 1, 0, 1, 1, 1, 1])
-    np.testing.assert_allclose(of_each.jackknife_values, found.jackknife_values, rtol=1e-12)
+    np.testing.assert_allclose(of_each.jackknife_values, result.jackknife_values, rtol=1e-12)
 
 
 @pytest.mark.parametrize("blocks", [8, 19, 200])
@@ -43,14 +43,14 @@ def test_differences_of_scene_means_equal_paired_t_tests(blocks):
     random = np.random.default_rng(blocks)
     own, other = random.random((2, blocks, 2))
     one, two = (estimate(np.ones(blocks), each) for each in (own, other))
-    found, mirrored = list(two.compute_differences(one).values()), list(one.compute_differences(two).values())
-    for at, (difference, back) in enumerate(zip(found, mirrored, strict=True)):
+    result, mirrored = list(two.compute_differences(one).values()), list(one.compute_differences(two).values())
+    for at, (difference, back) in enumerate(zip(result, mirrored, strict=True)):
         test = stats.ttest_rel(other[:, at], own[:, at])
         low, high = test.confidence_interval()
         assert difference.value == pytest.approx((other - own)[:, at].mean(), rel=1e-9)
         assert difference.value / difference.error == pytest.approx(test.statistic, rel=1e-9)
         assert difference.p_value == pytest.approx(test.pvalue, rel=1e-9)
-        # Of radii the side away from 0 is longer.
+        # Intervals of radii are longer on the side away from 0.
         below = BLIND_SIDE_FACTOR if at == 0 and difference.value < 0 else 1.0
         above = BLIND_SIDE_FACTOR if at == 0 and difference.value > 0 else 1.0
         middle = difference.value
@@ -58,10 +58,10 @@ def test_differences_of_scene_means_equal_paired_t_tests(blocks):
         assert (difference.low, difference.high) == pytest.approx(expected, rel=1e-3)
         assert (back.low, back.high) == pytest.approx((-difference.high, -difference.low), rel=1e-9)
         assert difference.is_significant is bool(test.pvalue < 0.05)
-    # Less of a radius is better, more of a detection.
-    assert [each.better_count for each in found] == [(other < own)[:, 0].sum(), (other > own)[:, 1].sum()]
-    assert [each.improvement for each in found] == [-found[0].value, found[1].value]
-    assert {each.block_count for each in found} == {blocks}
+    # Lower is better for radii, higher for detection rates.
+    assert [each.better_count for each in result] == [(other < own)[:, 0].sum(), (other > own)[:, 1].sum()]
+    assert [each.improvement for each in result] == [-result[0].value, result[1].value]
+    assert {each.block_count for each in result} == {blocks}
 
 
 def test_dominated_blocks_give_errors_without_intervals():
@@ -140,7 +140,7 @@ def test_mixtures_have_welch_satterthwaite_degrees_of_freedom():
     freedom = sum(variances) ** 2 / (variances[0] ** 2 / 9 + variances[1] ** 2 / 24 + variances[2] ** 2 / 8)
     assert mixed.degrees_of_freedom == [int(freedom)]
     assert (number.low, number.high) == compute_interval95(number.value, number.error, int(freedom), RADIUS)
-    # Each stratum counts as it is, however many blocks it has.
+    # The weight of a stratum does not depend on its number of blocks.
     alone = Estimate.from_strata([(1.0, strata[0][1])]).to_numbers()["radius_m"]
     assert alone == strata[0][1].to_numbers()["radius_m"]
 

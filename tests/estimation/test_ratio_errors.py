@@ -24,8 +24,8 @@ def test_ratio_errors_use_two_pseudo_blocks(unit, blind):
         base = np.append(m2[:, cell], [mean_m2, mean_m2])
         residual = np.append(sums[:, cell], [covered * mean_m2, blind(ratio) * mean_m2]) - ratio * base
         expected.append(np.sqrt((residual**2).sum() * 18 / 17) / base.sum())
-    found = estimate_ratio_errors(torch.from_numpy(m2), torch.from_numpy(sums), unit)
-    np.testing.assert_allclose(found, expected, rtol=1e-12)
+    result = estimate_ratio_errors(torch.from_numpy(m2), torch.from_numpy(sums), unit)
+    np.testing.assert_allclose(result, expected, rtol=1e-12)
 
 
 def test_ratio_errors_approach_the_jackknife():

@@ -51,8 +51,8 @@ def twin(value, error, freedom, quantity, is_difference):
 @pytest.mark.parametrize("freedom", [7, 10, 42, 255])
 def test_intervals_use_student_t_on_unbounded_scales(quantity, is_difference, freedom):
     for value, error in ((0.3, 0.001), (0.3, 0.05), (0.02, 0.015), (0.98, 0.015)):
-        found = compute_interval95(value, error, freedom, quantity, is_difference=is_difference)
-        assert found == pytest.approx(twin(value, error, freedom, quantity, is_difference), rel=1e-4)
+        result = compute_interval95(value, error, freedom, quantity, is_difference=is_difference)
+        assert result == pytest.approx(twin(value, error, freedom, quantity, is_difference), rel=1e-4)
 
 
 def test_significant_differences_have_intervals_without_0():

@@ -134,11 +134,11 @@ def test_kills_leave_old_new_or_incomplete_results(tmp_path):
         before = {path: path.lstat().st_mtime_ns for path in folder.rglob("*")}
         try:
             texts, names = read_folder(folder)
-            # Maps that the manifest does not list yet are of the same run.
+            # Maps that are missing in the manifest belong to the same run.
             seen.append(states.index(({name: texts[name] for name in (*names, *MINE)}, names)))
         except BadFileError as error:
             seen.append("incomplete" in str(error) and 0.5)
-        assert {path: path.lstat().st_mtime_ns for path in folder.rglob("*")} == before  # readers write nothing
+        assert {path: path.lstat().st_mtime_ns for path in folder.rglob("*")} == before  # readers do not write
         if at % 8 == 0 or seen[-1] == 0.5:
             publish(folder, NUMBERS)
             assert read_folder(folder)[1] == set(NUMBERS)

@@ -10,7 +10,7 @@ from subprocess import run
 import numpy as np
 import pytest
 
-from tests.files import apart_readers
+from tests.files import isolated_readers
 from torchcover.files import BadFileError, guard_reader, isolated
 from torchcover.simulation.mesh_files import read_mesh_arrays
 
@@ -23,15 +23,15 @@ def path(tmp_path):
 
 
 def test_what_is_read_comes_as_it_was(path):
-    read = apart_readers.good(path, 2.5)
+    read = isolated_readers.good(path, 2.5)
     assert np.array_equal(read["numbers"], 2.5 * np.arange(6.0).reshape(2, 3))
     assert read["words"].tolist() == ["a", "file.x"]
     assert (read["none"].shape, read["none"].dtype, read["one"].item()) == ((0, 3), np.float32, 7)
-    read["numbers"][0] = 1.0  # it is ours
+    read["numbers"][0] = 1.0  # the variable belongs to the parent
 
 
 def test_output_of_libraries_does_not_disturb_answers(path):
-    (first, torch), (second, _) = (apart_readers.loud(path)["process"] for _ in range(2))
+    (first, torch), (second, _) = (isolated_readers.loud(path)["process"] for _ in range(2))
     assert first == second != os.getpid()
     assert not torch
 
@@ -42,59 +42,61 @@ def test_output_of_libraries_does_not_disturb_answers(path):
 ])  # fmt: skip
 def test_errors_are_raised_here(path, kind, error, words):
     with pytest.raises(error, match=words):
-        apart_readers.wrong(path, kind)
+        isolated_readers.wrong(path, kind)
 
 
 def test_crashes_are_bad_files_and_reading_continues(path):
-    door = guard_reader("a thing")(apart_readers.crashing)
+    door = guard_reader("a thing")(isolated_readers.crashing)
     for _ in range(2):
         with pytest.raises(BadFileError, match=r"file\.x: the library that reads it crashed; the file is damaged"):
             door(path)
-    assert apart_readers.good(path, 1.0)
+    assert isolated_readers.good(path, 1.0)
 
 
 def test_a_library_that_never_ends_is_ended(path, monkeypatch):
     monkeypatch.setattr(isolated, "BASE_TIMEOUT_S", 0.3)
     with pytest.raises(ValueError, match="it took more than 0 s"):
-        apart_readers.hanging(path)
+        isolated_readers.hanging(path)
     monkeypatch.undo()
-    assert apart_readers.good(path, 1.0)
+    assert isolated_readers.good(path, 1.0)
 
 
 def test_memory_is_what_files_may_take(path, monkeypatch):
-    assert apart_readers.greedy(path, 0.01)["bytes"][0] == 1
+    assert isolated_readers.greedy(path, 0.01)["bytes"][0] == 1
     with pytest.raises(MemoryError):
-        apart_readers.greedy(path, 40.0)
+        isolated_readers.greedy(path, 40.0)
     with pytest.raises(ValueError, match="OSError"):
-        apart_readers.writing(path)
+        isolated_readers.writing(path)
     assert path.with_suffix(".new").stat().st_size == 0
 
 
 def test_memory_kept_by_libraries_does_not_accumulate(path):
-    (first, process), (second, other) = (apart_readers.keeping(path, 1.1)["kept"] for _ in range(2))
+    (first, process), (second, other) = (isolated_readers.keeping(path, 1.1)["kept"] for _ in range(2))
     assert (first, second) == (1, 1)
-    assert process == other  # which has begun anew
-    apart_readers.keeping(path, 0.0)
-    assert apart_readers.keeping(path, 0.0)["kept"][0] == 2
+    assert process == other  # a new process
+    isolated_readers.keeping(path, 0.0)
+    assert isolated_readers.keeping(path, 0.0)["kept"][0] == 2
 
 
 def test_threads_and_forks_read_too(path):
-    found = []
-    threads = [threading.Thread(target=lambda: found.append(apart_readers.good(path, 3.0)["one"])) for _ in range(4)]
+    result = []
+    threads = [
+        threading.Thread(target=lambda: result.append(isolated_readers.good(path, 3.0)["one"])) for _ in range(4)
+    ]
     for thread in threads:
         thread.start()
     for thread in threads:
         thread.join()
-    assert len(found) == 4
-    here = apart_readers.loud(path)["process"][0]
+    assert len(result) == 4
+    here = isolated_readers.loud(path)["process"][0]
     queue = get_context("fork").SimpleQueue()
     worker = get_context("fork").Process(
-        target=lambda: queue.put(int(apart_readers.loud(path)["process"][0])), daemon=True
+        target=lambda: queue.put(int(isolated_readers.loud(path)["process"][0])), daemon=True
     )
     worker.start()
     assert queue.get() != here
     worker.join()
-    assert apart_readers.loud(path)["process"][0] == here
+    assert isolated_readers.loud(path)["process"][0] == here
 
 
 def test_parts_of_meshes_are_checked_as_meshes(tmp_path):

@@ -16,7 +16,7 @@ def test_outlines_are_counterclockwise_in_bird_eye_view():
     outline_m = BoundingBox((-1.0, -2.0, 0.5), (3.0, 4.0, 9.0)).outline_m
     np.testing.assert_array_equal(outline_m, [[-1, -2], [3, -2], [3, 4], [-1, 4]])
     x, y = outline_m.T
-    assert (x * np.roll(y, -1) - y * np.roll(x, -1)).sum() / 2 == 4 * 6  # the signed area: positive if so
+    assert (x * np.roll(y, -1) - y * np.roll(x, -1)).sum() / 2 == 4 * 6  # the signed area is positive
 
 
 @pytest.mark.parametrize(
@@ -42,5 +42,5 @@ def test_touching_boxes_do_not_overlap():
     above = np.eye(4)[None].copy()
     above[:, 2, 3] = 1.5
     assert not find_overlaps(car, above, car.corners_m).any()
-    away = build_poses(np.array([[3.6, 2.4]]), np.deg2rad([135]))  # their shadows along x and y overlap
+    away = build_poses(np.array([[3.6, 2.4]]), np.deg2rad([135]))  # their projections onto x and y overlap
     assert not find_overlaps(car, away, car.corners_m).any()

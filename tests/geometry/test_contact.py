@@ -59,11 +59,11 @@ SQUARE_M = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
         ([5, 0], [-1e-9, 0], 3e9),
         ([5, 0], [0, 0], np.inf),
         ([0.5, 0.5], [0, 0], 0),
-        ([2, 0], [0, 3], np.inf),  # one side along the other
+        ([2, 0], [0, 3], np.inf),  # a side slides along a side
         ([2, 0], [-1, 0], 0),
         ([2, 0], [1, 0], np.inf),
         ([2, 5], [0, -1], np.inf),
-        ([4, 8], [-1, -1], np.inf),  # corner past corner
+        ([4, 8], [-1, -1], np.inf),  # a corner passes a corner
         ([2 - 1e-9, 5], [0, -1], 3),
         ([5, 0], [-3e8, 1e-300], 1e-8),
     ],
@@ -79,7 +79,7 @@ def test_contact_time_is_exact_at_large_coordinates():
         [8.0, 4.0],
         np.array([-1, -0.5]),
     )
-    far_m = tilted_m + np.array([2.0**50, -(2.0**50)])  # where numbers are 0.25 m apart
+    far_m = tilted_m + np.array([2.0**50, -(2.0**50)])  # where adjacent numbers differ by 0.25 m
     assert compute_contact_time_s(far_m, far_m + away_m, velocity_mps) == compute_contact_time_s(
         tilted_m, tilted_m + away_m, velocity_mps
     )

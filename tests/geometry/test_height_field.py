@@ -61,7 +61,7 @@ def test_fit_finds_a_slope_despite_objects():
     places_m = RANDOM.uniform(0.0, 20.0, (4000, 2))
     slope_m = 1.0 + places_m @ [0.03, -0.02]
     heights_m = slope_m + RANDOM.normal(0.0, 0.01, 4000)
-    heights_m[::5] += 0.8  # of what stands there
+    heights_m[::5] += 0.8  # heights of objects
     field = fit_height_field(places_m, heights_m, np.array([20.0, 20.0]), (4.0, 2.0), above_weight=0.3)
     inner = (np.abs(places_m - 10.0) < 9.0).all(axis=1)
     assert np.abs(field.compute_heights_m(places_m[inner]) - slope_m[inner]).max() < 0.05

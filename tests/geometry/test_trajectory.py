@@ -98,7 +98,7 @@ def test_velocity_at_poses_is_the_mean_of_segments():
                 3.5: [0, 1.5, -0.5], 3.9: [0, 0, 0], 4.0: [0, 0, 0], 4.1: [0, 0, 0]}  # fmt: skip
     for time_s, velocity_mps in expected.items():
         np.testing.assert_allclose(track.compute_velocity_mps(time_s), velocity_mps, atol=1e-12)
-    for inner_s in (1.2, 2.0, 3.7):  # the difference of places, where nothing changes
+    for inner_s in (1.2, 2.0, 3.7):  # the difference of positions at constant velocity
         near = track.interpolate_positions_m(np.array([inner_s - 1e-6, inner_s + 1e-6]))
         np.testing.assert_allclose(track.compute_velocity_mps(inner_s), (near[1] - near[0]) / 2e-6, atol=1e-6)
     assert Trajectory.create_static((1, 2, 3)).compute_velocity_mps(0.0).tolist() == [0, 0, 0]
@@ -134,9 +134,11 @@ def test_positions_are_exact_at_the_times_of_poses():
     for transient in (False, True):
         track = Trajectory(times_s, places, np.zeros((3, 3)), transient)
         assert track.num_bytes == 2 * 3 * 3 * 8
-        for asked in (times_s, times_s[:2], times_s[1:], np.array([0.0, 2.0]), np.empty(0)):
-            expected = [track.interpolate(time_s)[:3, 3] for time_s in asked.tolist()]
-            np.testing.assert_allclose(track.interpolate_positions_m(asked), np.reshape(expected, (-1, 3)), atol=1e-12)
+        for request in (times_s, times_s[:2], times_s[1:], np.array([0.0, 2.0]), np.empty(0)):
+            expected = [track.interpolate(time_s)[:3, 3] for time_s in request.tolist()]
+            np.testing.assert_allclose(
+                track.interpolate_positions_m(request), np.reshape(expected, (-1, 3)), atol=1e-12
+            )
     for transient, before in ((False, [1, 2, 3]), (True, [np.nan] * 3)):
         alone = Trajectory(np.array([5.0]), np.array([[1.0, 2, 3]]), np.zeros((1, 3)), transient)
         np.testing.assert_array_equal(alone.interpolate_positions_m(np.array([4.0, 5.0])), [before, [1, 2, 3]])

@@ -53,8 +53,8 @@ class Search:
     def distance(self, reference, sensor, **options):
         """(N,) distances of numpy or torch clouds, in the type that `nearest` gives."""
         clouds = (torch.as_tensor(cloud).to(self.device) for cloud in (reference, sensor))
-        found = nearest(*clouds, backend=self.backend, memory_mb=self.memory_mb, **options)
-        return found.distance.cpu().numpy()
+        result = nearest(*clouds, backend=self.backend, memory_mb=self.memory_mb, **options)
+        return result.distance.cpu().numpy()
 
     def metric(self, grid, **options):
         return CoverageMetric(grid, backend=self.backend, memory_mb=self.memory_mb, **options).to(self.device)

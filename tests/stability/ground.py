@@ -81,8 +81,8 @@ def drive():
 
 def wrong_jumps(dtype=np.float64):
     times_s, poses, jump = drive()
-    found = find_pose_discontinuities(times_s, poses.astype(dtype).astype(np.float64))
-    return float(len(set(found.tolist()) ^ {jump}))
+    result = find_pose_discontinuities(times_s, poses.astype(dtype).astype(np.float64))
+    return float(len(set(result.tolist()) ^ {jump}))
 
 
 @lru_cache
@@ -93,8 +93,8 @@ def cells():
 
 def corners_m(dtype=np.float64):
     here, away = cells()
-    found = build_cell_mesh(here + away).vertices_m.astype(dtype).astype(np.longdouble)
-    return most(found - np.longdouble(CELL_M) * away - build_cell_mesh(here).vertices_m)
+    result = build_cell_mesh(here + away).vertices_m.astype(dtype).astype(np.longdouble)
+    return most(result - np.longdouble(CELL_M) * away - build_cell_mesh(here).vertices_m)
 
 
 CASES = [

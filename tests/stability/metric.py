@@ -65,9 +65,9 @@ def seen_once(search):
     once.update(sensor, search.cloud([[0.5, 0.5, 0.25], [1.5, 0.5, 0.75]]))
     for _ in range(45):
         once.merge_state(metric)
-    found = once.compute()
-    right = found.observed_frames.flatten().tolist() == [4096, 1]
-    return most(found.radius.flatten().cpu().numpy() - [0.25, 0.75]) if right else np.inf
+    result = once.compute()
+    right = result.observed_frames.flatten().tolist() == [4096, 1]
+    return most(result.radius.flatten().cpu().numpy() - [0.25, 0.75]) if right else np.inf
 
 
 @lru_cache
@@ -109,8 +109,8 @@ def on_borders(dtype, search):
     metric = search.metric(row_of_cells(CELLS, cell=0.1))
     reference = torch.stack([x, torch.full_like(x, 0.05), torch.zeros_like(x)], dim=1)
     metric.update(search.cloud([0.0, 0.0, 0.0]), reference.to(search.device))
-    found = metric.compute()
-    return wrong(found.point_counts.flatten().tolist(), cells) + abs(found.counts["outside_points"] - cells.count(-1))
+    result = metric.compute()
+    return wrong(result.point_counts.flatten().tolist(), cells) + abs(result.counts["outside_points"] - cells.count(-1))
 
 
 def wrong(points, cells):
@@ -121,8 +121,8 @@ def wrong(points, cells):
 
 def on_borders_by_quotients(dtype):
     x, cells = tenths(dtype)
-    found = [int(cell) if cell < CELLS else -1 for cell in torch.floor(x / 0.1).clamp(min=-1).tolist()]
-    return sum(a != b for a, b in zip(found, cells, strict=True))
+    result = [int(cell) if cell < CELLS else -1 for cell in torch.floor(x / 0.1).clamp(min=-1).tolist()]
+    return sum(a != b for a, b in zip(result, cells, strict=True))
 
 
 def coarse(dtype):
@@ -143,8 +143,8 @@ def coarse_points(dtype, search):
 
 def coarse_points_by_quotients(dtype):
     x, cells = coarse(dtype)
-    found = torch.floor(x / torch.tensor(0.1, dtype=dtype)).long().tolist()
-    return sum((a if a < CELLS else -1) != b for a, b in zip(found, cells, strict=True))
+    result = torch.floor(x / torch.tensor(0.1, dtype=dtype)).long().tolist()
+    return sum((a if a < CELLS else -1) != b for a, b in zip(result, cells, strict=True))
 
 
 HEIGHTS = {"ground": (-0.3, 0.1), "middle": (0.1, 0.7), "top": (0.9, 1.1)}
@@ -180,10 +180,10 @@ def region_cells(search):
     grid, wrong_cells = row_of_cells(CELLS, cell=0.1), 0
     metric = search.metric(grid)
     metric.update(search.cloud([0.0, 0.0, 0.0]), search.cloud([0.05, 0.05, 0.0]))
-    found = metric.compute()
+    result = metric.compute()
     for first in range(CELLS - 2):
         low, high = (2 * first + 1) / 20, (2 * first + 5) / 20
-        rows = found.summary([Region("part", x_m=(low, high), y_m=(0.0, 0.1))])
+        rows = result.summary([Region("part", x_m=(low, high), y_m=(0.0, 0.1))])
         wrong_cells += abs(rows[0].num_cells - 2)
     return wrong_cells
 
@@ -207,14 +207,14 @@ def far_grid(origin_m, search):
     metric.update(
         search.cloud(reference + np.array([0.0, 0.0, 0.5]), torch.float64), search.cloud(reference, torch.float64)
     )
-    found = metric.compute()
-    return wrong(found.point_counts.flatten().tolist(), range(CELLS)) + int((found.radius != 0.5).sum())
+    result = metric.compute()
+    return wrong(result.point_counts.flatten().tolist(), range(CELLS)) + int((result.radius != 0.5).sum())
 
 
 def far_grid_in_float32(origin_m):
     x = (origin_m + JUST_INSIDE_M).astype(np.float32)
-    found = np.floor((x - np.float32(origin_m)) / np.float32(0.25)).astype(int)
-    return wrong([int((found == cell).sum()) for cell in range(CELLS)], range(CELLS))
+    result = np.floor((x - np.float32(origin_m)) / np.float32(0.25)).astype(int)
+    return wrong([int((result == cell).sum()) for cell in range(CELLS)], range(CELLS))
 
 
 # Thresholds
@@ -239,14 +239,14 @@ def detections(search):
     grid = BevGrid(x_m=(0.0, 16.0 * CELLS), y_m=(0.0, 16.0), cell_m=16.0, heights={"all": (-1.0, 9.0)})
     metric = search.metric(grid, thresholds_m=THRESHOLDS_M)
     metric.update(search.cloud(sensor), search.cloud(reference))
-    found = metric.compute().detection[:, 0, 0].diagonal()
-    return int((found != 0.5).sum())
+    result = metric.compute().detection[:, 0, 0].diagonal()
+    return int((result != 0.5).sum())
 
 
 def detections_in_float64():
     reference, sensor = (cloud.astype(np.float64) for cloud in at_thresholds())
-    found = (np.linalg.norm(reference - sensor, axis=1).reshape(2, CELLS) <= np.array(THRESHOLDS_M)).mean(axis=0)
-    return int((found != 0.5).sum())
+    result = (np.linalg.norm(reference - sensor, axis=1).reshape(2, CELLS) <= np.array(THRESHOLDS_M)).mean(axis=0)
+    return int((result != 0.5).sum())
 
 
 def crowded(count, **options):

@@ -31,10 +31,10 @@ def drawn_along(way_m, yaw):
 
 def by_steps(way_m, yaw):
     """Integrate naively: yaw rate at the previous angle times the step."""
-    found = [yaw]
+    result = [yaw]
     for x_m, y_m in np.diff(way_m, axis=0):
-        found.append(found[-1] + (y_m * np.cos(found[-1]) - x_m * np.sin(found[-1])) / ROD_M)
-    return np.array(found)
+        result.append(result[-1] + (y_m * np.cos(result[-1]) - x_m * np.sin(result[-1])) / ROD_M)
+    return np.array(result)
 
 
 def circle(step_s, offset_m):
@@ -114,7 +114,7 @@ def by_cosine(radius_m):
 def contacts():
     """Seconds of contact as found and as they are, of a box that crosses at each speed, or stands, before an ego."""
     ego = BodyGeometry(Box.model_validate({"type": "box", "size_m": EGO_M}).build_mesh())
-    found = []
+    result = []
     for ego_kmh in SPEEDS_KMH:
         for other_kmh in (0.0, *SPEEDS_KMH):
             other = {"body": {"type": "box", "size_m": OTHER_M}, "speed_kmh": other_kmh}
@@ -127,8 +127,8 @@ def contacts():
             # The other heads along y: its width is before the ego's front, its length beside its sides.
             ahead_s = OTHER_M[1] / 2 / (ego_kmh / 3.6)
             aside_s = (EGO_M[1] + OTHER_M[0]) / 2 / (other_kmh / 3.6) if other_kmh else np.inf
-            found.append((staged.contact_time_s, 2.0 - min(ahead_s, aside_s)))
-    return np.array(found).T
+            result.append((staged.contact_time_s, 2.0 - min(ahead_s, aside_s)))
+    return np.array(result).T
 
 
 def contact():

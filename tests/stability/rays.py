@@ -154,13 +154,13 @@ def tilted_floor_and_ceiling():
 def from_a_surface(caster):
     """Count rays that miss the ceiling."""
     bodies, places, towards, expected = tilted_floor_and_ceiling()
-    found = [caster(bodies, place, towards) for place in places]
-    return sum(int((~(np.abs(range_m - expected) < 1e-3 * expected)).sum()) for range_m in found)
+    result = [caster(bodies, place, towards) for place in places]
+    return sum(int((~(np.abs(range_m - expected) < 1e-3 * expected)).sum()) for range_m in result)
 
 
 def along_a_surface(caster):
     """Rays that leave a plane in general position at slopes of 0.1 to 1e-5, and hit it."""
-    generator, found = np.random.default_rng(5), 0
+    generator, result = np.random.default_rng(5), 0
     for _ in range(100):
         floor_T = build_transform(
             convert_euler_to_rotation(*generator.uniform(-60, 60, 3)), generator.uniform(-50, 50, 3)
@@ -170,8 +170,8 @@ def along_a_surface(caster):
         flat = np.sqrt(1 - slope**2)
         towards = floor_T[:3, :3] @ np.stack([flat * np.cos(azimuth), flat * np.sin(azimuth), slope])
         range_m = caster([plane(200.0, 200.0).transform(floor_T)], place, towards.astype(np.float32))
-        found += int(np.isfinite(range_m).sum())
-    return found
+        result += int(np.isfinite(range_m).sum())
+    return result
 
 
 def coincident(caster):
@@ -234,7 +234,7 @@ def spared(met_by):
         rays /= np.sqrt((rays**2).sum(axis=1))[:, None]
         for distance_m in (0.0, 1e-9, 1e-3, 1.0, 250.0, 1e5):
             for radius_m in (1e-9, 0.2, 2.0, 0.999 * distance_m):
-                # Ahead, behind, and beside the sensor.
+                # In front of, behind and next to the sensor.
                 for towards in (rays[0], -rays[0], np.roll(rays[0], 1)):
                     centre_m = transform_points(vehicle_T_sensor, (towards * distance_m).astype(np.float64)[None])
                     way_m = (centre_m[0] - vehicle_T_sensor[:3, 3]).astype(np.longdouble) @ vehicle_T_sensor[:3, :3]
@@ -292,13 +292,13 @@ def turning(samples):
     samples_s = np.linspace(0.2, 0.3, samples)
     poses = np.stack([turn.interpolate(each) for each in samples_s])
     if samples == 3:
-        found = np.tensordot(compute_parabola_weights(samples_s, times_s), poses, 1)
+        result = np.tensordot(compute_parabola_weights(samples_s, times_s), poses, 1)
     else:
         share = ((times_s - 0.2) / 0.1)[:, None, None]
-        found = (1 - share) * poses[0] + share * poses[1]
+        result = (1 - share) * poses[0] + share * poses[1]
     corner = np.array([100.0, 0.0, 0.0, 1.0])
     return most(
-        np.linalg.norm(np.stack([turn.interpolate(each) for each in times_s]) @ corner - found @ corner, axis=1)
+        np.linalg.norm(np.stack([turn.interpolate(each) for each in times_s]) @ corner - result @ corner, axis=1)
     )
 
 
@@ -340,7 +340,8 @@ CASES = [
     Case("a frame that turns 9 degrees in a sweep, 100 m away", "float64 at each time", "m", 0.01, partial(turning, 3),
          "straight between two poses", partial(turning, 2)),
     Case("rays through balls of 1e-9 m to 100 km, around the sensor, beside and behind it, 100 km away", "longdouble",
-         "of 536,832 spared", 0, partial(spared, SearchSpheres.find_rays_through), "cosine in float32", partial(spared, met_by_cosine)),
+         "of 536,832 spared", 0, partial(spared, SearchSpheres.find_rays_through),
+         "cosine in float32", partial(spared, met_by_cosine)),
 ]  # fmt: skip
 
 

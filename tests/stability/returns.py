@@ -22,12 +22,12 @@ def extremes():
 @lru_cache
 def exact_log_excess():
     with mpmath.workdps(60):
-        found = []
+        result = []
         for row in zip(*extremes(), strict=True):
             range_m, cosine, reflectivity, exponent = map(mpmath.mpf, row)
             power = reflectivity / mpmath.mpf(0.1) * cosine**exponent * mpmath.exp(-2 * mpmath.mpf(FOG_PER_M) * range_m)
-            found.append(mpmath.log(power * (100 / range_m) ** 2))
-        return found
+            result.append(mpmath.log(power * (100 / range_m) ** 2))
+        return result
 
 
 @lru_cache

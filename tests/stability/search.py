@@ -131,8 +131,8 @@ def many(side, search):
 
 def many_by_products(side):
     reference, sensor = (cloud.astype(np.float32) for cloud in lattice(side))
-    found = [matrix_product(reference[k : k + 4], sensor) for k in range(0, len(reference), 4)]
-    return most(np.concatenate(found) - np.sqrt(0.14))
+    result = [matrix_product(reference[k : k + 4], sensor) for k in range(0, len(reference), 4)]
+    return most(np.concatenate(result) - np.sqrt(0.14))
 
 
 @lru_cache
@@ -155,7 +155,7 @@ def threshold(search):
 
 def threshold_by_squares():
     judged = [(around(t)[0] ** 2).sum(axis=1) <= np.float32(t) ** 2 for t in THRESHOLDS_M]
-    return sum(int((found != around(t)[1]).sum()) for t, found in zip(THRESHOLDS_M, judged, strict=True))
+    return sum(int((result != around(t)[1]).sum()) for t, result in zip(THRESHOLDS_M, judged, strict=True))
 
 
 @contextlib.contextmanager

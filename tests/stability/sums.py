@@ -57,8 +57,8 @@ def unlike_dense(found):
     np.add.at(sums, place, rows[:, 1])
     np.maximum.at(largest, place, rows[:, 2])
     dense = {int(key): own for key, *own in zip(places, sums, largest, strict=True)}
-    got = {int(key): own for key, *own in found.tolist()}
-    return sum(got.get(key) != own for key, own in dense.items()) + len(got.keys() - dense.keys())
+    result = {int(key): own for key, *own in found.tolist()}
+    return sum(result.get(key) != own for key, own in dense.items()) + len(result.keys() - dense.keys())
 
 
 def keys_in_float32():
@@ -150,7 +150,8 @@ CASES = [
     Case("sums and maxima of cells with keys up to 2^53", "a dense float64 array", "of 800 wrong", 0,
          lambda: unlike_dense(sum_rows(torch.from_numpy(extreme_rows()), 1)),
          "float32 keys", lambda: unlike_dense(keys_in_float32())),
-    Case("error of 512 blocks that differ by 1e-6", "longdouble", "relative", 1e-7, partial(jackknife, compute_jackknife_error),
+    Case("error of 512 blocks that differ by 1e-6", "longdouble", "relative", 1e-7,
+         partial(jackknife, compute_jackknife_error),
          "float32", partial(jackknife, jackknife_in_float32)),
     Case("error of a mixture with weights of 1e-12 and 1", "longdouble", "relative", 1e-12,
          partial(error_of_a_mixture, TINY), "weights not squared", partial(error_without_squares, TINY)),

@@ -38,7 +38,7 @@ def test_two_processes_give_the_numbers_of_one(tmp_path):
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
-        start_new_session=True,  # the second process is started by the first, and ends with it
+        start_new_session=True,  # the first process starts the second, and ends it
     )
     try:
         output = run.communicate(timeout=240)[0]
@@ -152,5 +152,5 @@ def test_the_state_goes_on_within_an_epoch():
     once.select_new(frames[:3], find_shard(DataLoader(frames, sampler=DistributedSampler(frames, 2, 1))))
     resumed.load_state_dict(once.state_dict())
     shard = find_shard(DataLoader(frames[:5], sampler=DistributedSampler(frames[:5], 2, 1)))
-    # The positions of this process are 1, 3, 5 of five samples: the last is padding.
+    # The samples of this process are 1, 3, 5 of five: the last is padding.
     assert resumed.select_new(frames[2:4], shard) == once.select_new(frames[2:4], shard) == []

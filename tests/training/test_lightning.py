@@ -146,7 +146,7 @@ def test_epochs_reset_and_skipped_ones_cost_nothing(tmp_path):
     measured = [epoch for epoch, frames in seen if frames]
     assert measured == [1, 1, 1, 3, 3, 3]
     assert_same(callback.coverage, expected(RandomFrames(5)))
-    # A validation on its own is always due.
+    # `trainer.validate` is always measured.
     callback.coverage = None
     make_trainer(tmp_path, callback).validate(Validated(), loader(4), verbose=False)
     assert_same(callback.coverage, expected(RandomFrames(4)))
@@ -179,7 +179,7 @@ def test_fixed_frames_are_measured_once(tmp_path, blank_maps):
         logged = [event.value for event in events.Scalars(f"coverage/val/{name}")]
         assert logged == pytest.approx([value] * 3, rel=1e-6, nan_ok=True)
     assert [event.step for event in events.Images("coverage/val/radius")] == [0]
-    # Another fit is another measurement, and has maps of its own.
+    # Another fit is measured again, with its own maps.
     trainer = make_trainer(tmp_path, callback, logger=TensorBoardLogger(tmp_path, name="", version="other"))
     trainer.fit(Validated(), loader(2), loader(5))
     assert_same(callback.coverage, truth)
@@ -276,7 +276,7 @@ def test_frames_need_area_weights_of_the_metric(tmp_path):
     without, other = RandomFrames(2)
     weighted = replace(other, reference_weights=torch.ones(40))
     for frames in ([without], [without, weighted], [weighted, without]):
-        with pytest.raises(ValueError, match="of (each|its) reference point"):
+        with pytest.raises(ValueError, match=r"of (each|its) reference point"):
             make_trainer(tmp_path, callback).fit(Validated(), loader(2), loader(frames))
 
 
@@ -373,7 +373,7 @@ class TakesFigures(TakesImages):
 def test_mlflow_gets_a_file_per_figure_and_step(tmp_path, blank_maps):
     taken = {}
 
-    def log_figure(run_id, figure, artifact_file, *, save_kwargs=None):  # that of MlflowClient
+    def log_figure(run_id, figure, artifact_file, *, save_kwargs=None):  # signature of MlflowClient
         figure.savefig(tmp_path / "drawn.png")
         taken[artifact_file] = run_id
 
@@ -389,7 +389,7 @@ def test_mlflow_gets_a_file_per_figure_and_step(tmp_path, blank_maps):
 def test_comet_gets_figures_by_name_and_step(tmp_path, blank_maps):
     taken = []
 
-    def log_figure(figure_name=None, figure=None, overwrite=False, step=None):  # that of comet_ml.Experiment
+    def log_figure(figure_name=None, figure=None, overwrite=False, step=None):  # signature of comet_ml.Experiment
         taken.append((figure_name, type(figure), step))
 
     logger = TakesFigures(log_figure)
@@ -506,7 +506,7 @@ def test_repeated_frames_of_resumed_loaders_count_once(tmp_path):
     make_trainer(tmp_path, callback, Save(tmp_path / "within.ckpt", 2)).fit(Model(), loader(8))
     with pytest.warns(UserWarning, match="your dataloader is not resumable"):
         make_trainer(tmp_path, callback).fit(Model(), loader(8), ckpt_path=tmp_path / "within.ckpt")
-    # The loader starts with the first batches again, in place of the last two.
+    # The loader repeats the first batches instead of the last two.
     assert_same(callback.coverage, expected(RandomFrames(4)))
 
 
@@ -535,7 +535,7 @@ def test_memory_does_not_grow_over_epochs(tmp_path, blank_maps):
     callback = CoverageCallback(make_metric(), stage="train")
     logger = TensorBoardLogger(tmp_path, name="", version="run")
     trainer = make_trainer(tmp_path, callback, Count(), logger=logger, max_epochs=3)
-    gc.freeze()  # what other tests left is not counted; with torch 2.4 there are tensors among it that are none
+    gc.freeze()  # Tensors of other tests do not count; with torch 2.4 some of them are invalid.
     try:
         trainer.fit(Model(), loader(6))
     finally:
@@ -567,7 +567,7 @@ def test_batches_without_frames_and_unknown_rigs_are_refused(tmp_path):
         make_trainer(tmp_path, CoverageCallback(make_metric(), rig_name="roof")).fit(Validated(), loader(2), loader(2))
 
 
-# What Lightning sees of a batch
+# Batch sizes in Lightning
 
 
 class LogsOwn(Validated):
@@ -580,15 +580,15 @@ class LogsOwn(Validated):
 
 @pytest.mark.parametrize("precision", ["64-true", "bf16-true", "16-true", "bf16-mixed"])
 def test_batches_are_not_modified_in_any_precision(tmp_path, precision):
-    wanted = CoverageMetric(BevGrid(**GRID), max_radius_m=9.0)
+    requested = CoverageMetric(BevGrid(**GRID), max_radius_m=9.0)
     for frame in RandomFrames(5):
-        wanted.update(frame.sensor, frame.reference)
+        requested.update(frame.sensor, frame.reference)
     callback = CoverageCallback(
         CoverageMetric(BevGrid(**GRID), max_radius_m=9.0), regions=REGIONS, should_log_maps=False
     )
     trainer = make_trainer(tmp_path, callback, precision=precision)
     trainer.fit(LogsOwn(), loader(3), loader(5))
-    assert callback.coverage.scalars(REGIONS) == wanted.compute().scalars(REGIONS)
+    assert callback.coverage.scalars(REGIONS) == requested.compute().scalars(REGIONS)
     assert float(trainer.callback_metrics["own"]) == pytest.approx((2 * 0 + 2 * 1 + 1 * 2) / 5)
 
 
@@ -606,14 +606,14 @@ def test_test_stage_has_a_separate_tag(tmp_path):
         def test_step(self, batch, batch_idx):
             pass
 
-    wanted = CoverageMetric(BevGrid(**GRID), max_radius_m=9.0)
+    requested = CoverageMetric(BevGrid(**GRID), max_radius_m=9.0)
     for frame in RandomFrames(5):
-        wanted.update(frame.sensor, frame.reference)
+        requested.update(frame.sensor, frame.reference)
     callback = CoverageCallback(
         CoverageMetric(BevGrid(**GRID), max_radius_m=9.0), regions=REGIONS, should_log_maps=False
     )
     trainer = make_trainer(tmp_path, callback)
     trainer.test(Tested(), loader(5), verbose=False)
     logged = {name: float(value) for name, value in trainer.callback_metrics.items()}
-    expected = {f"coverage/test/{name}": value for name, value in wanted.compute().scalars(REGIONS).items()}
+    expected = {f"coverage/test/{name}": value for name, value in requested.compute().scalars(REGIONS).items()}
     assert {name: logged[name] for name in expected} == pytest.approx(expected, rel=1e-6)

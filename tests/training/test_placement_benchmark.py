@@ -33,7 +33,7 @@ def test_incomplete_lines_are_overwritten(tmp_path):
     assert example.read_finished_trainings(path) == {}
     example.append_line(path, {"placement": "a", "seed": 0, "ap": 0.5})
     with path.open("a") as file:
-        file.write('{"placement": "b", "se')  # killed
+        file.write('{"placement": "b", "se')  # as after a kill
     assert example.read_finished_trainings(path) == {("a", 0): 0.5}
     example.append_line(path, {"placement": "b", "seed": 1, "ap": 0.25})
     assert example.read_finished_trainings(path) == {("a", 0): 0.5, ("b", 1): 0.25}

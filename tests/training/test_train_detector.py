@@ -37,19 +37,19 @@ def cars(count, seed):
 
 def answer_to(example, rows, scores):
     """Create the output of a perfect network: heat map and boxes of one frame."""
-    _, _, row, column, wanted = example.encode(rows)
+    _, _, row, column, expected = example.encode(rows)
     heat, boxes = torch.full((64, 64), -20.0), torch.zeros(8, 64, 64)
     heat[row, column] = scores.logit()
-    boxes[:, row, column] = wanted
+    boxes[:, row, column] = expected
     return heat, boxes
 
 
 def test_decoding_gives_back_what_was_encoded(example):
     rows, scores = cars(20, seed=0), torch.linspace(0.9, 0.1, 20)
-    found, found_scores = example.decode(*answer_to(example, rows, scores))
+    result, found_scores = example.decode(*answer_to(example, rows, scores))
     torch.testing.assert_close(found_scores, scores)
-    torch.testing.assert_close(found[:, :6], rows[:, :6], atol=1e-4, rtol=0)
-    torch.testing.assert_close(torch.exp(1j * found[:, 6]), torch.exp(1j * rows[:, 6]))
+    torch.testing.assert_close(result[:, :6], rows[:, :6], atol=1e-4, rtol=0)
+    torch.testing.assert_close(torch.exp(1j * result[:, 6]), torch.exp(1j * rows[:, 6]))
 
 
 def test_objects_beyond_the_region_are_not_encoded(example):
@@ -83,10 +83,10 @@ def test_network_is_invariant_to_point_order(example):
 def measure_average_precision(example, frames):
     metric = RecallByVisibility(score_thresholds=example.SCORES)
     for x_found, scores, x_there in frames:
-        found, there = (
+        result, there = (
             torch.tensor([[x, 0.0, 1.0, 4.0, 2.0, 1.5, 0.0] for x in xs]).view(-1, 7) for xs in (x_found, x_there)
         )
-        metric.update(found, Boxes.from_rows(there), torch.ones(len(there)), torch.tensor(scores))
+        metric.update(result, Boxes.from_rows(there), torch.ones(len(there)), torch.tensor(scores))
     return example.compute_average_precision(metric.compute())
 
 
@@ -94,7 +94,7 @@ def test_average_precision_in_closed_form(example):
     assert measure_average_precision(example, [([9.0, 19.0], [0.9, 0.8], [9.0, 19.0])]) == 1.0
     # Half of the objects: recalls 0 to 0.5 of 101.
     assert measure_average_precision(example, [([9.0], [0.9], [9.0, 19.0])]) == pytest.approx(51 / 101)
-    # Only false ones, and nothing at all.
+    # Only false detections, and none at all.
     assert measure_average_precision(example, [([40.0], [0.9], [9.0])]) == 0.0
     assert measure_average_precision(example, [([], [], [9.0])]) == 0.0
     # True, false, true: precision 1 below a recall of 0.5, then from 1/2 in a line to 2/3.
@@ -113,9 +113,9 @@ def test_average_precision_in_closed_form(example):
 def test_average_precision_is_computed_per_range_bin(example):
     metric = RecallByVisibility(visibility_borders=(0.5,), score_thresholds=example.SCORES)
     there = torch.tensor([[x, 0.0, 1.0, 4.0, 2.0, 1.5, 0.0] for x in (9.0, 19.0, 29.0)])
-    # Both well visible ones are found, of two detections; the other is not.
-    found = there[:2]
-    metric.update(found, Boxes.from_rows(there), torch.tensor([0.9, 0.8, 0.1]), torch.tensor([0.9, 0.8]))
+    # Two detections match both well visible objects; the third object is missed.
+    result = there[:2]
+    metric.update(result, Boxes.from_rows(there), torch.tensor([0.9, 0.8, 0.1]), torch.tensor([0.9, 0.8]))
     counts = metric.compute()
     assert counts.compute_curve("visibility").bins[:2] == ("0-0.5", "0.5-1")
     assert (example.compute_average_precision(counts, 1), example.compute_average_precision(counts, 0)) == (
@@ -174,8 +174,8 @@ def test_correlation_over_drives_has_an_interval(example):
 def test_correlation_over_cells_compares_means_and_recalls(example):
     # Three cells of 6 cars: visible and found more and more.
     cell, k = np.repeat(np.arange(3), 6), np.tile(np.arange(6), 3)
-    found = np.where(k < 2 * cell + 1, 0.9, 0.1)
-    objects = np.column_stack([np.zeros(18), 6.4 * cell + 1.0, np.ones(18), 0.3 * cell + 0.01 * k, found])
+    result = np.where(k < 2 * cell + 1, 0.9, 0.1)
+    objects = np.column_stack([np.zeros(18), 6.4 * cell + 1.0, np.ones(18), 0.3 * cell + 0.01 * k, result])
     assert example.correlate_visibility_with_recall(objects) == pytest.approx(1.0)
     assert math.isnan(example.correlate_visibility_with_recall(objects, min_cars=7))
 

@@ -68,13 +68,13 @@ def test_small_kitti_run_ends_with_table_and_figure(example, drive, tmp_path, mo
     assert "Reference: points of velodyne, accumulated over 0.6 s" in said
     assert "also built the reference: surfaces that they never observe are missing" in said
     (line,) = (line for line in said.splitlines() if "not sampled" in line)
-    assert "│ 0 " in line  # the car is in the reference, whose scans show other rows of it
+    assert "│ 0 " in line  # the reference contains the car, since its scans show other rows of it
     assert (tmp_path / "recall.png").stat().st_size > 10_000
     events = EventAccumulator(str(tmp_path / "kitti"))
     events.Reload()
     tag = "coverage/kitti/val/detection_0.4m/0-51m/body"
     first, second = events.Scalars(tag)
-    assert first.value == second.value  # fixed frames do not know of the detector
+    assert first.value == second.value  # fixed frames do not depend on the detector
     assert 0.0 < first.value <= 1.0
     assert math.isnan(events.Scalars("val/recall/visibility not sampled")[1].value)
 

@@ -48,6 +48,6 @@ def test_terminals_show_control_characters(capsys):
     assert "\\x1b[2J\\x1b]0;mine" in (printed := capsys.readouterr().out)
     assert "two\nlines\\x9b" in printed
     assert escape_control_chars("two\nlines, ü, 車") == "two\nlines, ü, 車"
-    with terminal.status("opening"):  # whose own codes hide the cursor
+    with terminal.status("opening"):  # escape codes of rich hide the cursor
         pass
     assert "\x1b[?25l" in capsys.readouterr().out

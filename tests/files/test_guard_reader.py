@@ -115,7 +115,7 @@ def test_tables_with_many_columns_are_refused_quickly(tmp_path):
 
 
 def test_json_is_bounded_by_its_objects(tmp_path, monkeypatch):
-    (tmp_path / "a.json").write_text(f"[{'{},' * 10_000}{{}}]")  # 30 kB, which take 800 kB
+    (tmp_path / "a.json").write_text(f"[{'{},' * 10_000}{{}}]")  # 30 kB take 800 kB of memory
     monkeypatch.setenv("TORCHCOVER_MAX_FILE_GB", "0.0005")
     with pytest.raises(BadFileError, match=r"reading it takes 0\.00\d+ GB .* more than the 0\.0005 GB"):
         read_json_table(tmp_path / "a.json")
