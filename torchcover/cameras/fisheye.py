@@ -76,7 +76,7 @@ class KannalaBrandt:
         return _linearize_radial(a, b, gain, slope)
 
     def distort_radius(self, radius: Float64) -> Float64:
-        """Compute the distorted angle; see `Distortion`."""
+        """Compute the distorted angles in radians of (N,) incidence angles in radians, the radii of this chart."""
         k1, k2, k3, k4 = (to_float(k) for k in self.coefficients)
         s = radius * radius
         return radius * (1.0 + s * (k1 + s * (k2 + s * (k3 + s * k4))))
@@ -114,7 +114,7 @@ class ThetaPolynomial:
         return _linearize_radial(a, b, gain, (k2 + angle * (2.0 * k3 + angle * (3.0 * k4))) / angle)
 
     def distort_radius(self, radius: Float64) -> Float64:
-        """Compute the distorted angle; see `Distortion`."""
+        """Compute the distorted angles in radians of (N,) incidence angles in radians, the radii of this chart."""
         k1, k2, k3, k4 = (to_float(k) for k in self.coefficients)
         return radius * (k1 + radius * (k2 + radius * (k3 + radius * k4)))
 

@@ -266,7 +266,7 @@ class BrownConrady:
         return gain, (slope - gain * (k4 + s * (2.0 * k5 + s * (3.0 * k6)))) / below
 
     def distort_radius(self, radius: Float64) -> Float64:
-        """Multiply the radius by g; see `Distortion`."""
+        """Compute the distorted radii r g(r) of (N,) radii r = tan(incidence angle); tangential terms are left out."""
         k1, k2, _, _, k3, k4, k5, k6, *_ = self._padded
         s = radius * radius
         return radius * (1.0 + s * (k1 + s * (k2 + s * k3))) / (1.0 + s * (k4 + s * (k5 + s * k6)))

@@ -73,7 +73,7 @@ class PlacementRatings:
         return float(np.mean(pairs)) if pairs else float("nan")
 
     def select(self, placements: Sequence[str]) -> Self:
-        """Select some of the placements.
+        """Select the columns of some sensor placements in the ratings of all raters.
 
         Args:
             placements: Names in the desired order.

@@ -66,9 +66,9 @@ def estimate_area_average(coverage: "Coverage", region: Region, band: str) -> Es
 
 
 def sum_area_by_block(coverage: "Coverage", region: Region, band: str) -> tuple[Tensor, Tensor]:
-    """Sum over the visible surface of a region in each block of frames.
+    """Sum area and area-weighted quantities over the surface that the reference sensor observes, per block of frames.
 
-    R = E[ sum of r dA ] / E[ sum of dA ] is a ratio of additive sums, which does not depend on the number of points,
+    The mean R = E[ sum of r dA ] / E[ sum of dA ] of a quantity r is a ratio of additive sums, which does not depend on the number of points,
     the cell size or the share of observed cells. Either the metric assigned the points to the region by their position,
     or the bounds of the region are cell edges, so that its cells contain the same points.
 
@@ -78,7 +78,8 @@ def sum_area_by_block(coverage: "Coverage", region: Region, band: str) -> tuple[
         band: Name of the height band.
 
     Returns:
-        (B,) int64 frames of each block, and (B, 1 + Q) float64 area in square meters and each quantity times area.
+        (B,) int64 number of frames in each block, and (B, 1 + Q) float64 sums: area in square meters, then area times
+        each of `coverage.quantities`.
 
     Raises:
         ValueError: The reference points have no area weights, or the region has other bounds than cells.

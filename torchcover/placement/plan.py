@@ -118,7 +118,7 @@ class SearchPlan:
             space: The search space.
 
         Raises:
-            ValueError: The sensor model is "real", and no sensor of the start has known range limits.
+            ValueError: The sensor model is "real", but the start rig has no sensor with a known detection range.
         """
         content = {
             "space": space.collect_content(),

@@ -252,7 +252,7 @@ class Queries(NamedTuple):
 
 
 def _needs_sensors(key: str) -> bool:
-    """Return whether only a metric that distinguishes the sensors has the number."""
+    """Test whether a number, such as `detection_0.4m_without_roof`, needs a metric that distinguishes the sensors."""
     return FAILURE_KEY.match(key) is not None or not key.startswith(("radius", "detection", "cells_"))
 
 

@@ -318,7 +318,7 @@ class MapLayer:
 
 
 def build_map_layers(coverages: Mapping[str, Coverage]) -> Iterator[MapLayer]:
-    """Yield a layer for each quantity: the average of the coverages first, then other aggregations.
+    """Yield a map layer of all rigs for each quantity: means first, then other aggregations such as the maximum.
 
     Args:
         coverages: Name of the rig -> its coverage; several must be paired.

@@ -109,7 +109,7 @@ def _iterate_tile_slices(shape: tuple[int, ...], max_rows: int, max_columns: int
 
 
 def _build_tile(directions: Float64) -> Tile:
-    """Build the tile of (3, rows, columns) directions."""
+    """Build a tile of neighboring rays of a sensor from (3, rows, columns) unit directions; NaN marks a missing ray."""
     has_ray = ~np.isnan(directions[0])
     rays = directions.reshape(3, -1) if has_ray.all() else directions[:, has_ray]
     float_rays = np.ascontiguousarray(rays, dtype=np.float32)

@@ -218,13 +218,13 @@ class BuildingSite:
     def compute_depths_m(
         self, query_stations_m: Float64, side: int, curb_offset_m: float, max_depth_m: float
     ) -> Float64:
-        """Compute the depth of a block that keeps off the corridors of other stretches.
+        """Compute how deep a block of buildings is behind the curb, so that on bends it stays off the rest of the street.
 
         Args:
-            query_stations_m: (N,) stations.
+            query_stations_m: (N,) arc lengths along the centerline of the street.
             side: 1 for the left side, -1 for the right side.
             curb_offset_m: Distance of the curb from the centerline.
-            max_depth_m: Largest depth behind the curb.
+            max_depth_m: Largest depth, perpendicular to the street.
 
         Returns:
             (N,) depths in meters.
