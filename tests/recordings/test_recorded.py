@@ -182,7 +182,10 @@ MATRIX = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
         ("sensor: {flip_y: 1}", r"sensor\.flip_y: true or false is needed"),
         ("sensors: {roof: {}}", r"sensors\.roof: the folder sensors/roof/ does not exist in the recording"),
         ("reference: {area_weights: m2}", r"reference\.area_weights: true or false is needed"),
-        ("reference: {weight_kind: density}", r"reference\.weight_kind: unknown key.* for the reference also area_weights"),
+        (
+            "reference: {weight_kind: density}",
+            r"reference\.weight_kind: unknown key.* for the reference also area_weights",
+        ),
         ("sensor: {area_weights: true}", r"sensor\.area_weights: unknown key"),
         ("vehicle: {lower_m: [0, 0, 0]}", r"vehicle\.upper_m: a value is needed; the key is missing"),
         ("vehicle: {lower_m: [0, 0], upper_m: [1, 1, 1]}", r"vehicle\.lower_m: a list of at least 3 items"),

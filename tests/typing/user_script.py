@@ -21,8 +21,12 @@ def measured(frames: SimulatedFrames | RecordedFrames | RigSubset) -> Coverage:
 
 def compared(rigs: list[Path], frames: SimulatedFrames) -> list[float]:
     """Arguments in each of their forms, and what `evaluate` gives."""
-    one = evaluate("front_roof_128", "urban", num_frames=64, thresholds_m=0.4, device=torch.device("cpu"), metrics="all")
-    several = evaluate(rigs, frames=frames, thresholds_m=(0.4, 1.0), regions="regions.yaml", target_error=["1%", "0.02m"])
+    one = evaluate(
+        "front_roof_128", "urban", num_frames=64, thresholds_m=0.4, device=torch.device("cpu"), metrics="all"
+    )
+    several = evaluate(
+        rigs, frames=frames, thresholds_m=(0.4, 1.0), regions="regions.yaml", target_error=["1%", "0.02m"]
+    )
     evaluate("front_roof_128", stepz=64)  # type: ignore[call-arg]  # an argument that there is not
     evaluate("front_roof_128", num_frames="64")  # type: ignore[arg-type]
     return [float(coverage.radius.nanmean()) for coverage in compare([one, several, "saved.npz"]).coverages.values()]

@@ -66,11 +66,11 @@ def estimate_area_average(coverage: "Coverage", region: Region, band: str) -> Es
 
 
 def sum_area_by_block(coverage: "Coverage", region: Region, band: str) -> tuple[Tensor, Tensor]:
-    """Sum area and area-weighted quantities over the surface that the reference sensor observes, per block of frames.
+    """Sum area and area-weighted quantities over the observed surface of a region, per block of frames.
 
-    The mean R = E[ sum of r dA ] / E[ sum of dA ] of a quantity r is a ratio of additive sums, which does not depend on the number of points,
-    the cell size or the share of observed cells. Either the metric assigned the points to the region by their position,
-    or the bounds of the region are cell edges, so that its cells contain the same points.
+    The mean R = E[ sum of r dA ] / E[ sum of dA ] of a quantity r is a ratio of additive sums. It does not depend on the
+    number of points, the cell size or the share of observed cells. Either the metric assigned the points to the region
+    by their position, or the bounds of the region are cell edges, so that its cells contain the same points.
 
     Args:
         coverage: Result with area weights.

@@ -33,7 +33,7 @@ class SparseSums:
     """State of `BlockedSums`: a table of sums over the cells of each block that frames touched.
 
     A class attribute; `define_sparse_sums` creates its state. New rows are queued until the state is read or the queue
-    is as long as the table, so that a frame costs only what it touches. Rows are added in the order of their arrival, so
+    is as long as the table, so that a frame costs only what it touches. Rows are added in the order of their arrival:
     the time of the addition changes no bit.
     """
 

@@ -93,8 +93,8 @@ class MergeableMetric(MergeableSums, Metric):
         for rank, fingerprint in enumerate(fingerprints):
             if not torch.equal(fingerprint, fingerprints[0]):
                 raise ValueError(
-                    f"{type(self).__name__} has other parameters on rank {rank} than on rank 0, so their sums cannot be "
-                    "added; create it with the same arguments on each rank"
+                    f"{type(self).__name__} has other parameters on rank {rank} than on rank 0, so their sums cannot "
+                    "be added; create it with the same arguments on each rank"
                 )
         self._align_ranks(gather)
         for name in self._tables:

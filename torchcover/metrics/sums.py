@@ -31,7 +31,7 @@ class MergeableSums:
     * On a device without float64 (MPS) the sums stay on the CPU, to which clouds are moved.
 
     A subclass passes its parameters to `__init__`, adds its states with `define_sum`, and counts `num_frames`. The size
-    of a state is fixed; only a table (`define_table`) grows. With `MergeableMetric` before it in the bases, it becomes a
+    of a state is fixed; only a table (`define_table`) grows. With `MergeableMetric` before it in the bases it is a
     torchmetrics metric.
 
     Args:

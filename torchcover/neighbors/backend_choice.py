@@ -31,8 +31,8 @@ class BackendParams:
     """Cost model of the choice between backends, measured in docs/measured/speed.md and docs/measured/gpu.md.
 
     Packets are faster than the KD-tree for nearly all clouds, but loading numba takes each process half a second,
-    which about a hundred calls should save. The choice depends on the clouds alone: a choice by earlier searches would change
-    the last bits of a run with its number of workers.
+    which about a hundred calls should save. The choice depends on the clouds alone: a choice by earlier searches would
+    change the last bits of a run with its number of workers.
 
     If points are flat along an axis, so are the boxes of the KD-tree, while a packet compares all its queries with all
     points near any of them. In practice packets gain more than the model counts, and lose only beyond

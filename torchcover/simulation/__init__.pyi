@@ -30,6 +30,7 @@ from .returns import Weather as Weather
 from .rig import Rig as Rig
 from .rig import set_ego as set_ego
 from .scenario import Scenario as Scenario
+from .scene import ObjectLabel as ObjectLabel
 from .sensor import RayHits as RayHits
 from .sensor import Returns as Returns
 from .sensor import Sensor as Sensor
@@ -45,5 +46,4 @@ from .simulator import Simulator as Simulator
 from .surface_reference import SurfaceReference as SurfaceReference
 from .urdf import Robot as Robot
 from .urdf import read_robot as read_robot
-from .scene import ObjectLabel as ObjectLabel
 from .writing import write_recording as write_recording

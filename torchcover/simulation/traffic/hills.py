@@ -218,7 +218,7 @@ class BuildingSite:
     def compute_depths_m(
         self, query_stations_m: Float64, side: int, curb_offset_m: float, max_depth_m: float
     ) -> Float64:
-        """Compute how deep a block of buildings is behind the curb, so that on bends it stays off the rest of the street.
+        """Compute how deep a block of buildings is behind the curb; on bends it stays off the rest of the street.
 
         Args:
             query_stations_m: (N,) arc lengths along the centerline of the street.
