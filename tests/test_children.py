@@ -139,7 +139,7 @@ def stopped(monkeypatch):
         os.kill(int(re.search(r"kill -CONT (\d+)", message)[1]), signal.SIGCONT)
 
     monkeypatch.setattr("torchcover.files.processes.warnings.warn", warn)
-    for place in ("evaluation.pipeline", "files.isolated", "simulation.sumo.simulating"):
+    for place in ("evaluation.frame_workers", "files.isolated", "simulation.sumo.simulating"):
         monkeypatch.setattr(
             f"torchcover.{place}.report_stopped_processes", partial(report_stopped_processes, poll_interval_s=0.1)
         )
