@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import pytest
 
-from tests.simulation.small_worlds import FLOOR, box, scenario
+from tests.simulation.small_scenarios import FLOOR, box, scenario
 from torchcover import BevGrid, CoverageMetric, Region
 from torchcover.contrib import PUBLISHED, FrameQueryCache, MetricSetup, SMig
 from torchcover.coverage import Maximum

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.simulation.small_worlds import AHEAD, FLOOR, scenario
+from tests.simulation.small_scenarios import AHEAD, FLOOR, scenario
 from torchcover import Rig
 from torchcover.data import SimulatedFrames
 from torchcover.simulation import CameraSensor, PaperReference, RayHits, Scenario, SensorNoise, SurfaceReference

@@ -22,7 +22,7 @@ from torchcover.simulation.scene_geometry import SceneGeometry
 from torchcover.simulation.shapes import Box, Cylinder, Mesh
 from torchcover.simulation.writing import write_recording
 
-from .small_worlds import EGO, FLOOR, assert_agrees, box, scenario, sum_weights
+from .small_scenarios import EGO, FLOOR, assert_agrees, box, scenario, sum_weights
 
 EGO_MESH = Box(type="box", size_m=(4, 2, 1.5)).build_mesh()
 

@@ -15,7 +15,7 @@ from torchcover.simulation.patches import Patches, UprightBoxes, find_outward_fa
 from torchcover.simulation.scene_geometry import SceneGeometry
 from torchcover.simulation.shapes import Box, Ellipsoid, Mesh, Plane
 
-from .small_worlds import AHEAD, ALL_HEIGHTS, FLOOR, assert_agrees, box, scenario, sum_weights
+from .small_scenarios import AHEAD, ALL_HEIGHTS, FLOOR, assert_agrees, box, scenario, sum_weights
 
 CUBE = Box(type="box", size_m=(2, 2, 2)).build_mesh()
 

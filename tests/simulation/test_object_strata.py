@@ -16,7 +16,7 @@ from torchcover.simulation.scene_geometry import SceneGeometry
 from torchcover.simulation.shapes import Box, Plane
 from torchcover.simulation.surface_strata import SurfaceStrata
 
-from .small_worlds import AHEAD, FLOOR, assert_agrees, box, scenario
+from .small_scenarios import AHEAD, FLOOR, assert_agrees, box, scenario
 
 BEHIND = (((-20.0, -10.0), (-5.0, 5.0)),)
 GROUND = Plane(type="plane", size_m=(400.0, 400.0)).build_mesh()

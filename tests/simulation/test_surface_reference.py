@@ -14,7 +14,7 @@ from torchcover.coverage import BevGrid, CoverageMetric
 from torchcover.data import SimulatedFrames, collate_frames
 from torchcover.simulation import PaperReference, Rig, Scenario, Simulator, SurfaceReference
 
-from .small_worlds import AHEAD, ALL_HEIGHTS, EGO, FLOOR, assert_agrees, box, scenario, sum_weights
+from .small_scenarios import AHEAD, ALL_HEIGHTS, EGO, FLOOR, assert_agrees, box, scenario, sum_weights
 
 
 def write_sheet(folder, triangles, name="sheet.ply"):

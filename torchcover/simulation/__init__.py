@@ -1,4 +1,4 @@
-"""Simulated worlds: what a rig and a reference sensor see of a scenario."""
+"""Simulation of rigs and reference sensors in scenarios."""
 
 import lazy_loader
 
