@@ -9,6 +9,7 @@ with a target error end, and studies say that they would.
 import argparse
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -32,9 +33,12 @@ from torchcover.simulation import PaperReference, Rig, SurfaceReference
 SCENARIOS = {"urban": 50, "highway": 35}
 RIGS = ("front_roof_128", "front_grille_128")
 THRESHOLD_M, STEPS_OF_A_CITY, LENGTHS = 0.4, 6, (64, 256)
-# What is summed up of each point, each as one rig has it, or both as one.
-VALUES = [*((rig, what) for rig in ("roof", "grille", "both") for what in (RADIUS, make_detection_quantity(THRESHOLD_M))),
-          ("both", make_sensor_count_quantity(THRESHOLD_M)), ("both", make_redundancy_quantity(THRESHOLD_M))]  # fmt: skip
+# Values that are summed for each point: those of each rig, and of both rigs as one.
+VALUES = [
+    *product(("roof", "grille", "both"), (RADIUS, make_detection_quantity(THRESHOLD_M))),
+    ("both", make_sensor_count_quantity(THRESHOLD_M)),
+    ("both", make_redundancy_quantity(THRESHOLD_M)),
+]
 # A rig against another: roof and grille as a comparison has them, each against both as a sensor that fails.
 DIFFERENCES = {"difference": [("grille", "roof")], "loss": [("roof", "both"), ("grille", "both")]}
 # Where one city has more than this of the variance, it alone decides about the truth.

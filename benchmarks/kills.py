@@ -26,7 +26,7 @@ from matplotlib.figure import Figure
 
 from benchmarks import table
 from tests.cli.hostile import RIG, YARD
-from tests.killing import operations_of
+from tests.killing import run_in_fork
 from tests.placement.surfaces import Surface
 from torchcover.cli import app, search_run
 from torchcover.data import open_recording
@@ -152,9 +152,9 @@ def killed_result(name):
     command = RESULTS[name]
     place = Path(tempfile.mkdtemp(dir="."))
     earlier, whole = place / "earlier", place / "whole"
-    assert operations_of(lambda: run(command, earlier, *EARLIER.get(name, OTHERWISE)))[1] == 0
+    assert run_in_fork(lambda: run(command, earlier, *EARLIER.get(name, OTHERWISE)))[1] == 0
     shutil.copytree(earlier, whole)
-    count, code = operations_of(lambda: run(command, whole), copied=(whole, place / "killed"))
+    count, code = run_in_fork(lambda: run(command, whole), copied=(whole, place / "killed"))
     assert code == 0
     contents = files_of(earlier), files_of(whole)
     assert contents[0] != contents[1]
@@ -166,12 +166,12 @@ def killed_recording(command):
     """The same of a recording: the earlier is none, or a part that is not read and gone on with."""
     place = Path(tempfile.mkdtemp(dir="."))
     whole = place / "whole"
-    count, code = operations_of(lambda: run(command, whole), copied=(whole, place / "killed"))
+    count, code = run_in_fork(lambda: run(command, whole), copied=(whole, place / "killed"))
     assert code == 0
     frames, found = frames_of(whole), Counter()
     for out in (place / "killed" / str(at) for at in range(count)):
         name = {None: "the earlier", frames: "the new"}.get(frames_of(out), "mixed")
-        went_on = operations_of(lambda out=out: run(command, out, "--resume"))[1] == 0
+        went_on = run_in_fork(lambda out=out: run(command, out, "--resume"))[1] == 0
         found[name if went_on and frames_of(out) == frames else "mixed"] += 1
     return count, *(found[name] for name in VERDICTS)
 
@@ -188,10 +188,10 @@ def killed_at_random(kills):
     """Runs in a city, with workers, ended by each signal in turn."""
     place, chance = Path(tempfile.mkdtemp(dir=".")), random.Random(0)
     earlier, whole = place / "earlier", place / "whole"
-    assert operations_of(lambda: run(REAL, earlier, *OTHERWISE))[1] == 0
+    assert run_in_fork(lambda: run(REAL, earlier, *OTHERWISE))[1] == 0
     shutil.copytree(earlier, whole)
     start = time.perf_counter()
-    assert operations_of(lambda: run(REAL, whole))[1] == 0
+    assert run_in_fork(lambda: run(REAL, whole))[1] == 0
     seconds, found = time.perf_counter() - start, {number: Counter() for number in SIGNALS}
     for kill in range(kills):
         out, number = place / str(kill), SIGNALS[kill % len(SIGNALS)]

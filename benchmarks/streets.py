@@ -157,9 +157,14 @@ def met(scene, deeper_m=0.05, within_m=80.0):
 
 
 def accelerations(trajectory, frame_interval_s=0.2):
-    """(K,) times, (K,) speeds, (K,) accelerations ahead and (K,) to the left: of the middle, by three places each.
+    """Compute speed and acceleration by finite differences over three positions.
 
-    They are `frame_interval_s` apart: no closer than what made the trajectory knows, else its straight pieces have kinks.
+    Args:
+        trajectory: Trajectory of a body.
+        frame_interval_s: Time between the positions, not less than that of the source: its linear pieces have kinks.
+
+    Returns:
+        (K,) times, (K,) speeds, (K,) accelerations forward and (K,) to the left, of the middle position.
     """
     times_s = np.arange(trajectory.times_s[0], trajectory.times_s[-1] + 1e-9, frame_interval_s)
     if len(times_s) < 3:

@@ -1,4 +1,4 @@
-"""A process that is killed at any of its file operations."""
+"""Processes that are killed before one of their file operations."""
 
 import itertools
 import os
@@ -7,57 +7,55 @@ import signal
 import sys
 import threading
 
-# A fork may wait without end for a thread that only its parent has.
-LONGEST_S = 300
-# Two at once are more than what locks files can bear.
-FORKING = threading.Lock()
-# Of Python's audit events.
-OPERATIONS = ("open", "os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.truncate")
+MAX_DURATION_S = 300  # a fork may wait forever for a thread that only its parent has
+FORK_LOCK = threading.Lock()  # more than two forks at once are too many for file locks
+FILE_OPERATIONS = ("open", "os.mkdir", "os.rename", "os.remove", "os.rmdir", "os.truncate")  # audit events of Python
 
 
-def operations_of(act, at=None, number=signal.SIGKILL, *, copied=None):
-    """Do something in a fork of this process, and send it a signal just before a file operation.
+def run_in_fork(act, at=None, signal_number=signal.SIGKILL, *, copied=None):
+    """Run a function in a fork of this process, and send the fork a signal before a file operation.
 
     Args:
-        act: What to do; its operations have to be the same each time.
-        at: Before which operation; None for none.
-        number: The signal.
-        copied: A folder, and where it is copied to just before every operation, each time under its number: what a
-            kill there leaves, which lets nobody go on and takes nothing back.
+        act: Function with the same file operations in every call.
+        at: Index of the operation before which the signal is sent; None for no signal.
+        signal_number: The signal.
+        copied: A folder, and the folder for copies of it, one before each operation, named by its index. A copy is
+            what a kill at that operation leaves.
 
     Returns:
-        How many operations there were, and the exit code, minus the signal's number if that has ended it.
+        Number of operations, and the exit code, which is minus the number of a signal that ended the fork.
     """
-    there, here = os.pipe()
-    with FORKING:
+    read_end, write_end = os.pipe()
+    with FORK_LOCK:
         pid = os.fork()
     if pid:
-        os.close(here)
-        with open(there, "rb") as told:
-            count = len(told.read())
-        return count, os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
-    counting, killed_pid = itertools.count(), os.getpid()
+        os.close(write_end)
+        with open(read_end, "rb") as pipe:
+            operation_count = len(pipe.read())
+        return operation_count, os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+    counter, fork_pid = itertools.count(), os.getpid()
     is_copying = False
 
-    def touched(event, arguments):
+    def handle_event(event, arguments):
         nonlocal is_copying
-        if os.getpid() != killed_pid:  # a child of it
+        if os.getpid() != fork_pid:  # a child of the fork
             return
-        # Where a file is opened for reading nothing can break.
-        if event in OPERATIONS and (event != "open" or arguments[1] not in ("r", "rb")) and not is_copying:
-            index = next(counting)
+        # Opening a file for reading changes nothing.
+        is_reading = event == "open" and arguments[1] in ("r", "rb")
+        if event in FILE_OPERATIONS and not is_reading and not is_copying:
+            index = next(counter)
             if index == at:
-                os.kill(os.getpid(), number)
+                os.kill(os.getpid(), signal_number)
             is_copying = True
             if copied and os.path.isdir(copied[0]):
                 shutil.copytree(copied[0], os.path.join(copied[1], str(index)), symlinks=True)
             is_copying = False
-            os.write(here, b".")
+            os.write(write_end, b".")
 
     code = 1
-    signal.alarm(LONGEST_S)
+    signal.alarm(MAX_DURATION_S)
     try:
-        sys.addaudithook(touched)
+        sys.addaudithook(handle_event)
         act()
         code = 0
     finally:

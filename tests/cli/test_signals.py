@@ -10,7 +10,7 @@ import time
 import pytest
 import torch
 
-from tests.killing import operations_of
+from tests.killing import run_in_fork
 from torchcover import Coverage
 from torchcover.cli import app
 from torchcover.coverage import CoverageSums
@@ -122,7 +122,7 @@ def in_a_fork(scenes, log):
         os.dup2(stream, 2)
         run(scenes)
 
-    _, code = operations_of(act)
+    _, code = run_in_fork(act)
     return code, log.read_text()
 
 

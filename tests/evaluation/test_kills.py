@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import torchcover
-from tests.killing import operations_of
+from tests.killing import run_in_fork
 from torchcover import Coverage
 from torchcover.data import Frame, FrameDataset
 from torchcover.files import BadFileError
@@ -38,7 +38,7 @@ def test_kills_leave_the_earlier_or_the_new_result(tmp_path):
     earlier, new = (torchcover.evaluate(frames=Drive(), cell_m=8.0, num_frames=num_frames) for num_frames in (2, 3))
     earlier.save(tmp_path / "out")
     copies = tmp_path / "copies"
-    count, code = operations_of(lambda: new.save(tmp_path / "out"), copied=(tmp_path / "out", copies))
+    count, code = run_in_fork(lambda: new.save(tmp_path / "out"), copied=(tmp_path / "out", copies))
     assert (count > 40, code) == (True, 0)
     saved_frames = []
     for index in range(count):

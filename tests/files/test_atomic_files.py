@@ -13,7 +13,7 @@ import sys
 
 import pytest
 
-from tests.killing import operations_of
+from tests.killing import run_in_fork
 from torchcover.files import RECORDING, WRITING, AtomicOutput, BadFileError, guard_reader, lock_folder, write_atomically
 from torchcover.files.atomic import MAX_MANIFEST_BYTES
 
@@ -126,7 +126,7 @@ def test_published_files_replace_those_of_the_manifest(tmp_path):
 def test_kills_leave_old_new_or_incomplete_results(tmp_path):
     states = write_earlier(tmp_path / "earlier")
     out = shutil.copytree(tmp_path / "earlier", tmp_path / "out")
-    count, code = operations_of(lambda: publish(out, NUMBERS, MAPS), copied=(out, tmp_path / "copies"))
+    count, code = run_in_fork(lambda: publish(out, NUMBERS, MAPS), copied=(out, tmp_path / "copies"))
     assert (count > 40, code) == (True, 0)
     seen = []
     for at in range(count):
@@ -153,7 +153,7 @@ def test_copies_before_operations_equal_states_after_kills(tmp_path, at):
     for name in ("copied", "killed"):
         out = tmp_path / name / "out"
         write_earlier(out)
-        ended = operations_of(
+        ended = run_in_fork(
             lambda out=out: publish(out, NUMBERS, MAPS),
             at if name == "killed" else None,
             copied=(out, tmp_path / name / "copies"),
@@ -345,7 +345,7 @@ def limited(act):
         except OSError as error:
             os.write(here, str(error).encode())
 
-    assert operations_of(write)[1] == 0
+    assert run_in_fork(write)[1] == 0
     os.close(here)
     with open(there, "rb") as pipe:
         return pipe.read().decode()

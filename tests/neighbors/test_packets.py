@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.killing import operations_of
+from tests.killing import run_in_fork
 from torchcover import nearest
 
 ROOT = Path(__file__).parents[2]
@@ -396,6 +396,6 @@ def test_a_forked_process_searches(installed):
             torch.set_num_threads(1)
             assert torch.equal(nearest(*clouds, backend="packets").index, index)
 
-        assert operations_of(search)[1] == 0
+        assert run_in_fork(search)[1] == 0
     finally:
         torch.set_num_threads(threads)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.killing import operations_of
+from tests.killing import run_in_fork
 from torchcover import Rig
 from torchcover.data import RecordedFrames, SimulatedFrames, open_recording, write_recording
 from torchcover.detection import measure_box_visibility
@@ -277,7 +277,7 @@ def test_kill_at_any_file_operation_costs_one_frame(tmp_path, monkeypatch):
     monkeypatch.setattr(writing, "build_frame_record", lambda _, index: made[index])
     monkeypatch.setattr(SimulatedFrames, "content", content)
     whole, copies = tmp_path / "whole", tmp_path / "copies"
-    count, code = operations_of(lambda: write_recording(frames, whole), copied=(whole, copies))
+    count, code = run_in_fork(lambda: write_recording(frames, whole), copied=(whole, copies))
     assert (count > 40, code) == (True, 0)
     kept = set()
     for folder in (copies / str(at) for at in range(count)):
