@@ -12,10 +12,6 @@ if TYPE_CHECKING:
 
 # Largest number of characters that a message quotes from a file.
 MAX_QUOTED = 60
-# Reads no more of a value than it prints: YAML aliases can make nested lists of exponential size.
-_SHORT_REPR = Repr()
-_SHORT_REPR.maxlevel = 2
-_SHORT_REPR.maxstring = _SHORT_REPR.maxlong = _SHORT_REPR.maxother = MAX_QUOTED
 
 # Expected value by type of error of pydantic; names in braces are numbers of the error.
 _NEEDED = {
@@ -128,5 +124,9 @@ def _is_consequence(detail: "ErrorDetails") -> bool:
 
 
 def _shorten(value: Any) -> str:  # noqa: ANN401  (raw content of a file)
-    text = _SHORT_REPR.repr(value)
+    # Reads no more of a value than it prints: YAML aliases can make nested lists of exponential size.
+    short_repr = Repr()
+    short_repr.maxlevel = 2
+    short_repr.maxstring = short_repr.maxlong = short_repr.maxother = MAX_QUOTED
+    text = short_repr.repr(value)
     return text if len(text) <= MAX_QUOTED else f"{text[: MAX_QUOTED - 3]}..."
