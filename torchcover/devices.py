@@ -72,6 +72,7 @@ def ensure_float64(tensor: Tensor) -> Tensor:
 
 
 def _iterate_tensors(values: Iterable[Any]) -> Iterator[Tensor]:
+    """Yield the tensors in values and in their lists and tuples."""
     for value in values:
         if isinstance(value, Tensor):
             yield value

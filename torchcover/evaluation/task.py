@@ -302,7 +302,10 @@ def _build_recording_task(frames: FrameSource, settings: Settings) -> Task[Frame
 
 
 def _find_limits(scenario: Scenario, rigs: Mapping[str, Rig]) -> Region | None:
-    """Find the room around the ego vehicle or the range of its sensors; None if both are large."""
+    """Find the rectangle outside of which no rig can observe anything.
+
+    It is bounded by the largest range of the sensors and by the walls of a closed yard; None if neither is small.
+    """
     ranges_m = []
     for rig in rigs.values():
         for sensor in rig.sensors:

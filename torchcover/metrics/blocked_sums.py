@@ -164,13 +164,13 @@ class BlockedSums(MergeableSums):
     def define_block_sum(
         self, name: str, shape: tuple[int, ...], dtype: torch.dtype = torch.float64, *, is_fine: bool = False
     ) -> None:
-        """Add a state of sums per block, zero at first.
+        """Add a state with one sum per block of frames, zero at first.
 
         Args:
             name: Name of the state, an attribute from here on.
             shape: Shape of the sums of one block; the state is (B, *shape).
             dtype: float64 or int64.
-            is_fine: Use fine blocks.
+            is_fine: Use the shorter blocks of frames, of which a block consists.
         """
         self.define_sum(name, (self.num_fine_blocks if is_fine else self.num_blocks, *shape), dtype)
         if is_fine:
@@ -257,6 +257,7 @@ class BlockedSums(MergeableSums):
             self._merge_block_pairs()
 
     def _copy_states(self, states: Mapping[str, Tensor]) -> dict[str, Any]:
+        """Copy states that are loaded, and check the keys of sparse tables."""
         copies = super()._copy_states(states)
         for name, (num_cells, _, is_fine) in self.sparse_layouts.items():
             keys, end = copies[name][:, 0], num_cells * (self.num_fine_blocks if is_fine else self.num_blocks)

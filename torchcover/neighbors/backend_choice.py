@@ -170,6 +170,7 @@ def _choose_on_device(query: Tensor, points: Tensor, params: BackendParams) -> S
 def _search_on_cpu(
     query: Tensor, points: Tensor, max_distance: float, memory_mb: float, params: BackendParams
 ) -> Tensor:
+    """Search nearest neighbors on the CPU by the fastest implementation, and return the result to the device."""
     cpu_query, cpu_points = query.cpu(), points.cpu()
     search = _choose_on_cpu(cpu_query, cpu_points, params)
     return search(cpu_query, cpu_points, max_distance, memory_mb).to(query.device)
