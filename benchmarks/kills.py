@@ -1,9 +1,9 @@
-"""Are results safe from kills? Every command, killed at each of its file operations, and real runs killed at random.
+"""Results after kills: every command, killed at each of its file operations, and real runs, killed at random.
 
-Every run is a fork of this process, so that it need not import anything, into a folder that holds an earlier result.
-A copy of that folder just before each operation is what a kill leaves there. A reader then finds *the earlier* result,
-*the new* one, perhaps without its maps, or is told that the folder is *incomplete*; anything else is *mixed*. A
-recording has no earlier one; it is mixed if a part of it is read, or `--resume` does not complete it.
+Each run is a fork of this process, which saves the imports, and writes into a folder with an earlier result. A copy of
+the folder before each file operation is what a kill at that operation leaves. A reader of the copy finds the earlier
+result, the new one, perhaps without its maps, or is told that the folder is incomplete; anything else is mixed. There
+is no earlier recording; a recording is mixed if a part of it is read, or if `--resume` does not complete it.
 """
 
 import argparse
@@ -40,7 +40,7 @@ scenario: urban
 free: {top: {x_m: [-0.6, 0.8], z_m: 1.8}}
 objectives: {near: {region: 20m}}
 """
-CHOICE = """name: corners
+SELECTION = """name: corners
 scenario: yard.yaml
 candidates:
   small:
@@ -50,76 +50,61 @@ constraints: {max_sensors: 2}
 prices_eur: {small: 1}
 objectives: {near: {threshold_m: 1.0, band: ground, region: 20m}}
 """
-WORLD = ("--scenario", "yard.yaml")
-SMALL = (*WORLD, "--num-rays", "64", "--set", "cell_m=8", "--num-frames", "2")
-RESULTS = {
-    "evaluate": ("evaluate", "rig.yaml", *SMALL),
-    "evaluate --resume": ("evaluate", "rig.yaml", *SMALL, "--resume"),
-    "compare": ("compare", "rig.yaml", "other.yaml", *SMALL),
+SCENARIO = ("--scenario", "yard.yaml")
+SMALL_RUN = (*SCENARIO, "--num-rays", "64", "--set", "cell_m=8", "--num-frames", "2")
+RESULT_COMMANDS = {
+    "evaluate": ("evaluate", "rig.yaml", *SMALL_RUN),
+    "evaluate --resume": ("evaluate", "rig.yaml", *SMALL_RUN, "--resume"),
+    "compare": ("compare", "rig.yaml", "other.yaml", *SMALL_RUN),
     "targets": ("targets", "rig.yaml", "--raster", "3,5,-1,1,1"),
     "search": ("search", "space.yaml", "--num-evaluations", "2"),
-    "search, a choice": ("search", "choice.yaml", "--num-rays", "256", "--frames-per-scene", "1"),
-    "study": ("study", "rig.yaml", *WORLD, "--num-rays", "64", "--num-rays", "32", "--num-frames", "8"),
+    "search, a selection": ("search", "selection.yaml", "--num-rays", "256", "--frames-per-scene", "1"),
+    "study": ("study", "rig.yaml", *SCENARIO, "--num-rays", "64", "--num-rays", "32", "--num-frames", "8"),
 }
-RECORDINGS = {
-    "record": ("record", "rig.yaml", *WORLD, "--num-rays", "64", "--num-frames", "2"),
-    "record --format kitti": (
-        "record",
-        "rig.yaml",
-        *WORLD,
-        "--num-rays",
-        "64",
-        "--num-frames",
-        "2",
-        "--format",
-        "kitti",
-    ),
-}
-# How an earlier result differs.
-EARLIER = {"evaluate --resume": ("--num-frames", "1")}
-OTHERWISE = ("--seed", "1")
-REAL = ("evaluate", "front_roof_32", "--scenario", "urban", "--num-frames", "4", "--num-workers", "2")
-SIGNALS = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
-VERDICTS = ("the earlier", "the new", "incomplete", "mixed")
+RECORD = ("record", "rig.yaml", *SCENARIO, "--num-rays", "64", "--num-frames", "2")
+RECORDING_COMMANDS = {"record": RECORD, "record --format kitti": (*RECORD, "--format", "kitti")}
+RANDOM_RUN = ("evaluate", "front_roof_32", "--scenario", "urban", "--num-frames", "4", "--num-workers", "2")
+OUTCOMES = ("the earlier", "the new", "incomplete", "mixed")
 DOCUMENTS = {
     "rig": RIG,
     "other": RIG.replace("name: r", "name: other").replace("z_m: 2.0", "z_m: 2.4"),
     "yard": YARD,
     "space": SPACE,
-    "choice": CHOICE,
+    "selection": SELECTION,
 }
-# What a run imports late; a fork has it already.
-IMPORTED = ("torchcover.evaluation.study", "torchcover.cli.printing", "torchcover.recordings", "pykdtree.kdtree")
 
 
 def main():
-    """Print what is there after each kill, and how much is lost of all."""
+    """Print the outcomes after each kill, and the number of mixed results."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--commands", default=";".join([*RECORDINGS, *RESULTS]), help="separated by semicolons")
-    parser.add_argument("--kills", type=int, default=70, help="of real runs, at random")
+    commands = ";".join([*RECORDING_COMMANDS, *RESULT_COMMANDS])
+    parser.add_argument("--commands", default=commands, help="separated by semicolons")
+    parser.add_argument("--kills", type=int, default=70, help="number of real runs that are killed at random")
     options, _ = parser.parse_known_args()
-    for name in IMPORTED:
-        importlib.import_module(name)
-    torch.set_num_threads(1)  # others do not survive a fork
-    with tempfile.TemporaryDirectory() as place:
-        os.chdir(place)
+    # Forks share modules that a run would import late.
+    for name in ("evaluation.study", "cli.printing", "recordings"):
+        importlib.import_module(f"torchcover.{name}")
+    importlib.import_module("pykdtree.kdtree")
+    torch.set_num_threads(1)  # other threads do not survive a fork
+    with tempfile.TemporaryDirectory() as folder:
+        os.chdir(folder)
         for name, text in DOCUMENTS.items():
             Path(f"{name}.yaml").write_text(text)
-        at_random = killed_at_random(options.kills) if options.kills else []
+        random_rows = kill_at_random(options.kills) if options.kills else []
         rows = []
         for name in options.commands.split(";"):
-            killed = killed_result(name) if name in RESULTS else killed_recording(RECORDINGS[name])
-            rows.append((name, *killed))
-            print(f"{name}: {killed}", file=sys.stderr, flush=True)
+            kill = kill_result if name in RESULT_COMMANDS else kill_recording
+            rows.append((name, *kill(name)))
+            print(rows[-1], file=sys.stderr, flush=True)
         os.chdir("/")
-    table(("command", "file operations", *VERDICTS), rows)
+    table(("command", "file operations", *OUTCOMES), rows)
     print()
-    table(("real runs, killed at random", "runs", *VERDICTS), at_random)
-    print(f"\nMixed: {sum(row[-1] for row in (*rows, *at_random))}")
+    table(("real runs, killed at random", "runs", *OUTCOMES), random_rows)
+    print(f"\nMixed: {sum(row[-1] for row in (*rows, *random_rows))}")
 
 
 def make_surface(space, plan, seed, num_scenes):
-    """Make frames with known numbers instead of simulated ones."""
+    """Make frames that score rigs by a known function instead of a simulation."""
     return Surface(seed, num_scenes, plan.frames_per_scene)
 
 
@@ -130,116 +115,133 @@ class SurfacePlan(SearchPlan):
     make_frames: Callable = make_surface
 
 
+def make_blank_maps(*_, **__):
+    return [("map1", Figure((1, 1)))]
+
+
 def run(command, out, *options):
-    """Run the command line in this process, which is to be a fork."""
-    signal.signal(signal.SIGINT, signal.default_int_handler)  # which is ignored where this runs in the background
-    nowhere = os.open(os.devnull, os.O_WRONLY)
-    os.dup2(nowhere, 1)
-    os.dup2(nowhere, 2)
+    """Run the command line in this process, which must be a fork."""
+    # A shell ignores Ctrl-C in background processes.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    devnull = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(devnull, 1)
+    os.dup2(devnull, 2)
     sys.argv = ["torchcover", *command, *options, "--out", str(out)]
-    if "space.yaml" in command:  # frames are made up
+    if "space.yaml" in command:
         search_run.SearchPlan = SurfacePlan
-    if command is not REAL:  # drawing takes most of the time
-        result.plot_maps = lambda *_, **__: [("map1", Figure((1, 1)))]
+    if command is not RANDOM_RUN:  # maps take most of the time
+        result.plot_maps = make_blank_maps
     try:
         app.main()
     except SystemExit as end:
         os._exit(end.code or 0)
 
 
-def killed_result(name):
-    """How many operations a command has, and how often what is there after a kill at each is what."""
-    command = RESULTS[name]
-    place = Path(tempfile.mkdtemp(dir="."))
-    earlier, whole = place / "earlier", place / "whole"
-    assert run_in_fork(lambda: run(command, earlier, *EARLIER.get(name, OTHERWISE)))[1] == 0
-    shutil.copytree(earlier, whole)
-    count, code = run_in_fork(lambda: run(command, whole), copied=(whole, place / "killed"))
+def kill_result(name):
+    """Count the file operations of a command, and the outcomes of kills at each of them."""
+    command, folder = RESULT_COMMANDS[name], Path(tempfile.mkdtemp(dir="."))
+    earlier, complete = folder / "earlier", folder / "complete"
+    changes = ("--num-frames", "1") if "--resume" in command else ("--seed", "1")
+    assert run_in_fork(lambda: run(command, earlier, *changes))[1] == 0
+    shutil.copytree(earlier, complete)
+    count, code = run_in_fork(lambda: run(command, complete), copied=(complete, folder / "killed"))
     assert code == 0
-    contents = files_of(earlier), files_of(whole)
-    assert contents[0] != contents[1]
-    found = Counter(verdict(place / "killed" / str(at), *contents) for at in range(count))
-    return count, *(found[name] for name in VERDICTS)
+    earlier_files, new_files = read_files(earlier), read_files(complete)
+    assert earlier_files != new_files
+    outcomes = Counter()
+    for index in range(count):
+        outcomes[classify_outcome(folder / "killed" / str(index), earlier_files, new_files)] += 1
+    return count, *(outcomes[outcome] for outcome in OUTCOMES)
 
 
-def killed_recording(command):
-    """The same of a recording: the earlier is none, or a part that is not read and gone on with."""
-    place = Path(tempfile.mkdtemp(dir="."))
-    whole = place / "whole"
-    count, code = run_in_fork(lambda: run(command, whole), copied=(whole, place / "killed"))
+def kill_recording(name):
+    """Count the same for a recording, which `--resume` must complete."""
+    command, folder = RECORDING_COMMANDS[name], Path(tempfile.mkdtemp(dir="."))
+    complete = folder / "complete"
+    count, code = run_in_fork(lambda: run(command, complete), copied=(complete, folder / "killed"))
     assert code == 0
-    frames, found = frames_of(whole), Counter()
-    for out in (place / "killed" / str(at) for at in range(count)):
-        name = {None: "the earlier", frames: "the new"}.get(frames_of(out), "mixed")
-        went_on = run_in_fork(lambda out=out: run(command, out, "--resume"))[1] == 0
-        found[name if went_on and frames_of(out) == frames else "mixed"] += 1
-    return count, *(found[name] for name in VERDICTS)
+    num_frames, outcomes = count_frames(complete), Counter()
+    for index in range(count):
+        out = folder / "killed" / str(index)
+        outcome = {None: "the earlier", num_frames: "the new"}.get(count_frames(out), "mixed")
+        _, code = run_in_fork(lambda out=out: run(command, out, "--resume"))
+        is_completed = code == 0 and count_frames(out) == num_frames
+        outcomes[outcome if is_completed else "mixed"] += 1
+    return count, *(outcomes[outcome] for outcome in OUTCOMES)
 
 
-def frames_of(recording):
-    """How many frames are read; None where a reader finds no recording, or is told that it is a part."""
+def count_frames(recording):
+    """Count the frames of a recording; None if there is none or it is incomplete."""
     try:
         return len(open_recording(recording).frame_names)
     except (ValueError, OSError):
         return None
 
 
-def killed_at_random(kills):
-    """Runs in a city, with workers, ended by each signal in turn."""
-    place, chance = Path(tempfile.mkdtemp(dir=".")), random.Random(0)
-    earlier, whole = place / "earlier", place / "whole"
-    assert run_in_fork(lambda: run(REAL, earlier, *OTHERWISE))[1] == 0
-    shutil.copytree(earlier, whole)
-    start = time.perf_counter()
-    assert run_in_fork(lambda: run(REAL, whole))[1] == 0
-    seconds, found = time.perf_counter() - start, {number: Counter() for number in SIGNALS}
-    for kill in range(kills):
-        out, number = place / str(kill), SIGNALS[kill % len(SIGNALS)]
+def kill_at_random(num_kills):
+    """Kill runs in a city with workers by each signal in turn, and count the outcomes by signal."""
+    folder, rng = Path(tempfile.mkdtemp(dir=".")), random.Random(0)
+    earlier, complete = folder / "earlier", folder / "complete"
+    assert run_in_fork(lambda: run(RANDOM_RUN, earlier, "--seed", "1"))[1] == 0
+    shutil.copytree(earlier, complete)
+    start_s = time.perf_counter()
+    assert run_in_fork(lambda: run(RANDOM_RUN, complete))[1] == 0
+    duration_s = time.perf_counter() - start_s
+    signals = (signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+    outcomes = {number: Counter() for number in signals}
+    for kill in range(num_kills):
+        out, number = folder / str(kill), signals[kill % len(signals)]
         shutil.copytree(earlier, out)
-        if not (pid := os.fork()):
-            run(REAL, out)
+        pid = os.fork()
+        if not pid:
+            run(RANDOM_RUN, out)
             os._exit(1)
-        time.sleep(chance.uniform(0.0, seconds))
+        time.sleep(rng.uniform(0.0, duration_s))
         os.kill(pid, number)
         os.waitpid(pid, 0)
-        found[number][verdict(out, files_of(earlier), files_of(whole))] += 1
-        print(f"{number.name}: {dict(found[number])}", file=sys.stderr, flush=True)
+        outcomes[number][classify_outcome(out, read_files(earlier), read_files(complete))] += 1
+        print(f"{number.name}: {dict(outcomes[number])}", file=sys.stderr, flush=True)
         shutil.rmtree(out)
-    return [(one.name, each.total(), *(each[name] for name in VERDICTS)) for one, each in found.items()]
+    rows = []
+    for number, counts in outcomes.items():
+        rows.append((number.name, counts.total(), *(counts[outcome] for outcome in OUTCOMES)))
+    return rows
 
 
 @guard_reader("a file of a result")
-def content(path):
-    """What a reader finds."""
+def read_file(path):
+    """Read a file as a reader of results does."""
     return path.read_bytes()
 
 
-def files_of(out):
-    """The files of a result, as a reader finds them, by name."""
-    names = json.loads(content(out / SUMMARY))["files"]
-    return {name: content(out / name) for name in (*names, SUMMARY)}
+def read_files(out):
+    """Read all files of a result by name."""
+    names = json.loads(read_file(out / SUMMARY))["files"]
+    return {name: read_file(out / name) for name in (*names, SUMMARY)}
 
 
-def verdict(out, earlier, whole):
-    """What a reader finds of all files that the results list."""
-    found, incomplete = {}, False
-    for name in {**earlier, **whole}:
+def classify_outcome(out, earlier, new):
+    """Classify what a reader finds in a folder as one of `OUTCOMES`."""
+    content, is_incomplete = {}, False
+    for name in {**earlier, **new}:
         try:
-            found[name] = content(out / name)
+            content[name] = read_file(out / name)
         except FileNotFoundError:
             continue
         except BadFileError as error:
             if "an incomplete result" not in str(error):
                 return "mixed"
-            incomplete = True
-    if incomplete:
+            is_incomplete = True
+    if is_incomplete:
         return "incomplete"
     manifest = read_manifest(out / SUMMARY) or {"files": {}}
-    found = {name: found.get(name) for name in (*manifest["files"], SUMMARY)}
-    if found == earlier:
+    content = {name: content.get(name) for name in (*manifest["files"], SUMMARY)}
+    if content == earlier:
         return "the earlier"
-    is_mixed = any(text is None or text == earlier.get(name) != whole.get(name) for name, text in found.items())
-    return "mixed" if is_mixed else "the new"
+    for name, data in content.items():
+        if data is None or data == earlier.get(name) != new.get(name):
+            return "mixed"
+    return "the new"
 
 
 if __name__ == "__main__":

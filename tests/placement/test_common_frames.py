@@ -178,7 +178,7 @@ def test_a_world_without_traffic_shows_each_instant_once():
         ({"budget_bytes": 1000.0, "num_workers": 1}, "budget_bytes: 3 scenes"),
         ({"scenarios": [LOT, "courtyard"]}, "the ego vehicles differ"),
         ({"objectives": {"a": Objective(region="21m")}}, "objective 'a': region '21m': give one of 20m, 80m"),
-        ({"objectives": {"a": Objective(region="20m", band="sky")}}, "objective 'a': band 'sky': give 'ground' or 'obst"),
+        ({"objectives": {"a": Objective(region="20m", band="sky")}}, "objective 'a': band 'sky': give 'ground' or"),
         ({"objectives": {"a": Objective(region="20m", band=())}}, "objective 'a': band: got none"),
         (
             {"objectives": {"a": Objective(region="20m"), "b": Objective(region={"20m": BAY["bay"]})}},
