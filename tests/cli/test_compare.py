@@ -2,14 +2,13 @@
 
 import csv
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from torchcover import Coverage
-from torchcover.evaluation import Result
 from torchcover.evaluation import compare as compare_saved
+from torchcover.evaluation.result_page import describe_rendering_cost, estimate_rendering_cost
 from torchcover.evaluation.settings import FILES
 from torchcover.simulation import REFERENCE_SENSORS
 
@@ -238,14 +237,17 @@ def test_pages_of_many_rigs_are_announced_or_rejected(torchcover, scenes, monkey
     code, _, error, out = compare(torchcover, scenes, "low", "both", out="few")
     assert (code, "page and maps" in error) == (0, False)
     few = compare_saved(sorted((out / "coverage").glob("*.npz")))
-    many = replace(few, coverages={str(number): few.coverages["low"] for number in range(200)})
-    assert many.estimate_rendering_cost(FILES) == pytest.approx(100 * np.array(few.estimate_rendering_cost(FILES)))
-    assert many.estimate_rendering_cost(["numbers"]) == (0.0, 0.0)
-    assert "page and maps of 200 rigs take about" in many.describe_rendering_cost("maps,page")
-    assert many.describe_rendering_cost("numbers") == ""
+    many = {str(number): few.coverages["low"] for number in range(200)}
+    expected_cost = 100 * np.array(estimate_rendering_cost(few.coverages, FILES))
+    assert estimate_rendering_cost(many, FILES) == pytest.approx(expected_cost)
+    assert estimate_rendering_cost(many, ["numbers"]) == (0.0, 0.0)
+    assert "page and maps of 200 rigs take about" in describe_rendering_cost(many, "maps,page")
+    assert describe_rendering_cost(many, "numbers") == ""
     for needed_bytes, expected in ((3e9, 0), (1e18, 2)):
         cost = (needed_bytes, 120.0)
-        monkeypatch.setattr(Result, "estimate_rendering_cost", lambda *_, cost=cost: cost)
+        for module in ("result", "result_page"):
+            name = f"torchcover.evaluation.{module}.estimate_rendering_cost"
+            monkeypatch.setattr(name, lambda *_, cost=cost: cost)
         code, _, error, out = compare(torchcover, scenes, "low", "both", out=str(expected))
         assert code == expected
         assert f"page and maps of 2 rigs take about {needed_bytes / 1e9:.2g} GB of memory and 2 min" in error

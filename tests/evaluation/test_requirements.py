@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from tests.targets.scenes import build_lidar, build_rig, build_scenario, write_trajectory
 from torchcover.encounters import Criterion
 from torchcover.encounters.encounter import EncounterSet
-from torchcover.evaluation import Readings, Requirements, check, evaluate, evaluate_encounters, judge_requirements
+from torchcover.evaluation import Readings, Requirements, check, evaluate, evaluate_encounters, judge_bound
 from torchcover.evaluation.requirements import TargetRequirement
 from torchcover.evaluation.target_positions import TargetPositions
 from torchcover.geometry import BoundingBox
@@ -40,8 +40,9 @@ def judge(bound, value, low=None, high=None):
     key, min_value, max_value = bound
     requirement = {"region": "20m", "band": "ground", "number": key}
     requirement |= {"min_value": min_value} if min_value else {"max_value": max_value}
-    (verdict,) = judge_requirements(build_requirements(requirement), [{key: readings}])
-    return verdict
+    (requirement,) = build_requirements(requirement).requirements
+    (bound,) = requirement.bounds
+    return judge_bound(requirement.text, bound, readings)
 
 
 MINIMUM = ("detection_0.4m", 0.9, None)

@@ -274,13 +274,14 @@ def save_and_print(
     """
     from torchcover.cli.printing import print_result
     from torchcover.evaluation import MixedResult
+    from torchcover.evaluation.result_page import describe_rendering_cost
 
     # Every rank has the same result; the first one writes it.
     is_mixed = isinstance(result, MixedResult)
     results = result.scenario_results if isinstance(result, MixedResult) else {"": result}
     if ranks is None or ranks.rank == 0:
         for scenario_result in results.values():
-            if announcement := scenario_result.describe_rendering_cost(file_kinds):
+            if announcement := describe_rendering_cost(scenario_result.coverages, file_kinds):
                 typer.echo(f"torchcover: {announcement}", err=True)
         written = result.save(out, file_kinds=file_kinds)
         print_result(result, written, out, explain=explain)

@@ -47,4 +47,4 @@ from .target_visibility import map_target_visibility as map_target_visibility
 from .target_visibility import save_target_map as save_target_map
 from .verdicts import Readings as Readings
 from .verdicts import Verdict as Verdict
-from .verdicts import judge_requirements as judge_requirements
+from .verdicts import judge_bound as judge_bound

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from itertools import groupby, islice
 from multiprocessing import active_children
 from traceback import format_exc
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch.utils.data import DataLoader, Dataset, get_worker_info
@@ -15,9 +15,6 @@ from torch.utils.data import DataLoader, Dataset, get_worker_info
 from torchcover.evaluation.cpu_cores import count_cores, get_start_method, warn_about_spinning
 from torchcover.files import is_stopped, report_stopped_processes
 from torchcover.frames import BadFrameError
-
-if TYPE_CHECKING:
-    from torchcover.evaluation.pipeline import Frames, MeasuredFrames
 
 # Frames of one task of a worker, at most: all of them wait in memory until the task is done.
 MAX_FRAMES_PER_TASK = 16
@@ -82,7 +79,7 @@ class FramesOrErrors(Dataset[Any]):
         frames: Source of the frames.
     """
 
-    def __init__(self, frames: "Frames | MeasuredFrames | Dataset[Any]") -> None:
+    def __init__(self, frames: Dataset[Any]) -> None:
         self.frames = frames
 
     def __getitem__(self, index: int) -> Any:  # noqa: ANN401  (a frame, or an error)

@@ -78,7 +78,7 @@ class MeasuredFrame(NamedTuple):
     measurement_s: float
 
 
-class MeasuredFrames:
+class MeasuredFrames(Dataset[MeasuredFrame]):
     """Map-style dataset that measures frames where they are made, in this process or in a worker.
 
     Observers with `compute_sums` measure there, except coverage on another device; other observers need the frame.

@@ -19,7 +19,8 @@ from torchcover.evaluation.settings import DEFAULT_SCENARIO, Settings
 from torchcover.evaluation.target_positions import TargetPositions
 from torchcover.evaluation.target_visibility import build_flat_ground, load_rig_and_scenario
 from torchcover.evaluation.task import AnyScenario, build_task, compute_frame_interval_s
-from torchcover.evaluation.verdicts import Float64, Readings, Verdict, judge_requirements
+from torchcover.evaluation.verdicts import Readings, Verdict, judge_bound
+from torchcover.geometry.arrays import Float64
 from torchcover.simulation import Rig, Scenario, Sensor, set_ego
 from torchcover.simulation.camera_sensor import CameraSensor
 from torchcover.simulation.moving_bodies import BodyGeometry
@@ -80,22 +81,24 @@ def check(
         coverage = _measure_regions(
             requirements, rig, scenario, num_frames=num_frames, num_workers=num_workers, progress=progress, **simulation
         )
-        readings: list[Mapping[str, Readings]] = []
+        verdicts[rig.name] = []
         for requirement in requirements.requirements:
+            readings: Mapping[str, Readings]
             if isinstance(requirement, RegionRequirement):
                 assert coverage is not None  # it exists as soon as there is such a requirement
-                readings.append({requirement.number: _read_region(requirement, coverage, rig)})
+                readings = {requirement.number: _read_region(requirement, coverage, rig)}
             elif isinstance(requirement, EncounterRequirement):
-                readings.append(_measure_encounters(requirement, rig, progress=progress, **simulation))
+                readings = _measure_encounters(requirement, rig, progress=progress, **simulation)
             else:
                 positions = requirement.positions
                 if isinstance(positions, str):
                     positions = requirements.position_sets[positions]
                 target = targets[requirement.target]
-                readings.append(
-                    _measure_target(requirement, positions, target, rig, scenario, num_frames=num_frames, **simulation)
+                readings = _measure_target(
+                    requirement, positions, target, rig, scenario, num_frames=num_frames, **simulation
                 )
-        verdicts[rig.name] = judge_requirements(requirements, readings)
+            for bound in requirement.bounds:
+                verdicts[rig.name].append(judge_bound(requirement.text, bound, readings[bound.key]))
     settings = _record_settings(requirements, named_rigs, scenario, {"num_frames": num_frames, **simulation})
     return CheckResult(requirements, verdicts, settings)
 

@@ -1,6 +1,5 @@
 """Result of an evaluation: numbers, maps, page and files of one or several rigs."""
 
-import math
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
@@ -13,16 +12,27 @@ from numpy.typing import NDArray
 from torchcover import __version__
 from torchcover.coverage import Coverage, Region
 from torchcover.coverage.quantities import make_area_quantity
-from torchcover.evaluation.omissions import Omission
+from torchcover.evaluation.omissions import Omission, build_omissions_table
 from torchcover.evaluation.pipeline import Run
 from torchcover.evaluation.progress import defer_signals
 from torchcover.evaluation.result_notes import (
-    collect_notes,
     describe_failure,
+    describe_perfect_depth,
+    describe_reference,
     describe_scan_periods,
     describe_sensor_models,
+    describe_test_targets,
+    describe_weather,
 )
-from torchcover.evaluation.result_page import COSTS, build_page, build_result_tables, build_sensor_views
+from torchcover.evaluation.result_page import (
+    build_region_outline,
+    build_result_tables,
+    build_sensor_views,
+    collect_facts,
+    estimate_rendering_cost,
+    format_facts,
+    format_rig_yaml,
+)
 from torchcover.evaluation.settings import FILES, parse_file_kinds
 from torchcover.evaluation.target_error import TargetError, summarize_target_error
 from torchcover.files import AtomicOutput
@@ -31,14 +41,15 @@ from torchcover.report import (
     RENDERERS,
     CoverageTable,
     Page,
+    PageRig,
     PageTable,
     build_file_stems,
+    build_page_maps,
     build_table_dict,
     plot_maps,
     render_page,
     summarize_findings,
 )
-from torchcover.report.map_layers import list_map_quantities
 from torchcover.report.records import build_records
 from torchcover.report.sensor_failures import get_main_quantity
 from torchcover.simulation import Sensor
@@ -133,7 +144,18 @@ class Result:
     @property
     def notes(self) -> list[str]:
         """Notes on the run, the rigs and the reference sensor, as sentences."""
-        return collect_notes(self)
+        notes = [self.cut_short] if self.cut_short else []
+        if self.vehicle:
+            notes.append(f"Vehicle: {self.vehicle}.")
+        notes += describe_sensor_models(self.source.get("sensor_model"))
+        notes += describe_weather(self.source.get("weather"))
+        notes += describe_perfect_depth(self.sensors)
+        notes += describe_scan_periods(self.sensors)
+        is_recording = bool(self.source.get("frames"))
+        notes += describe_test_targets(self._first_coverage, self.regions, is_recording=is_recording)
+        if self.run is not None and self.used_reference is not None:
+            notes += describe_reference(self.used_reference, self.run, self._first_coverage)
+        return notes
 
     @property
     def verdict(self) -> tuple[str, ...]:
@@ -203,7 +225,24 @@ class Result:
     @property
     def page(self) -> Page:
         """Page with tables, maps, rigs, settings and omissions."""
-        return build_page(self)
+        source = self.source.get("frames") or self.source.get("scenario") or "saved results"
+        location = ", on ".join(format_facts({"source": source, "vehicle": self.vehicle}).values())
+        rigs = []
+        for name in self.rigs:
+            sensors = self.sensors.get(name, ())
+            rigs.append(PageRig(name, build_sensor_views(sensors), format_rig_yaml(name, sensors)))
+        return Page(
+            title=(" vs. " if len(rigs) == 2 else ", ").join(self.rigs),
+            lead=f"Blind spots and coverage in {location}, measured by torchcover.",
+            findings=self.verdict,
+            tables=self.tables,
+            maps=list(build_page_maps(self.coverages)) if self.coverages else [],
+            rigs=rigs,
+            ego_outline_m=self.ego_outline_m,
+            outlines=[build_region_outline(region) for region in self.regions],
+            facts=collect_facts(self.record, self.rigs, self.table.first_conditions.counts["num_frames"]),
+            more_tables=[build_omissions_table(self.omissions)] if self.omissions else [],
+        )
 
     def plot(self, layer: str | None = None) -> Figure:
         """Plot one map in the first height band, several rigs next to each other.
@@ -278,39 +317,6 @@ class Result:
             output.publish(record)  # again, now with the files of the page and the maps
         return output.paths
 
-    def estimate_rendering_cost(self, file_kinds: Container[str]) -> tuple[float, float]:
-        """Estimate the cost of the page and the maps.
-
-        Args:
-            file_kinds: Requested files; only "maps" and "page" have a cost.
-
-        Returns:
-            Memory in bytes and time in seconds.
-        """
-        grid, num_rigs = self._first_coverage.grid, len(self.coverages)
-        num_quantities = len(list_map_quantities(self._first_coverage))
-        needed_bytes = seconds = 0.0
-        if "maps" in file_kinds or "page" in file_kinds:
-            bytes_per_cell = COSTS.bytes_per_cell + COSTS.bytes_per_value * num_quantities
-            needed_bytes = float(num_rigs * grid.num_cells * bytes_per_cell)
-        if "maps" in file_kinds:
-            seconds = 3 * COSTS.seconds_per_map * num_rigs * num_quantities * len(grid.heights)
-        return needed_bytes, seconds
-
-    def describe_rendering_cost(self, file_kinds: str | Iterable[str]) -> str:
-        """Describe the cost of the page and the maps in one sentence; empty if it is small.
-
-        Args:
-            file_kinds: Requested files, as in `save`.
-        """
-        needed_bytes, seconds = self.estimate_rendering_cost(parse_file_kinds(file_kinds))
-        if needed_bytes < COSTS.min_announced_bytes and seconds < COSTS.min_announced_s:
-            return ""
-        return (
-            f"page and maps of {len(self.coverages)} rigs take about {needed_bytes / 1e9:.2g} GB of memory and "
-            f"{math.ceil(seconds / 60)} min, after the numbers are saved; omit them with `--files numbers`"
-        )
-
     def add_page_and_maps(self, output: AtomicOutput, file_kinds: Container[str], folder: str = "") -> None:
         """Write the page and the maps if they are requested.
 
@@ -323,7 +329,7 @@ class Result:
             ValueError: There is not enough memory.
         """
         advice = "the numbers are saved; omit page and maps with `--files numbers`, or compare fewer rigs"
-        needed_bytes, _ = self.estimate_rendering_cost(file_kinds)
+        needed_bytes, _ = estimate_rendering_cost(self.coverages, file_kinds)
         check_memory_fits(f"page and maps of {len(self.coverages)} rigs", needed_bytes, advice)
         if "page" in file_kinds:
             output.add_text(f"{folder}report.html", render_page(self.page))

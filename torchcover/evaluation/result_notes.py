@@ -1,50 +1,15 @@
 """Notes on a result: an early end, sensor models, weather, test targets, the reference sensor and repeated frames."""
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from torchcover.coverage import Coverage, Region
 from torchcover.estimation import MIN_BLOCKS
+from torchcover.evaluation.pipeline import Run
 from torchcover.simulation import CameraSensor, Sensor
 from torchcover.simulation.sensor import ScanTimes
-
-if TYPE_CHECKING:
-    from torchcover.evaluation.pipeline import Run
-    from torchcover.evaluation.result import Result
-
-
-def collect_notes(result: "Result") -> list[str]:
-    """Collect the notes below the tables of a result.
-
-    Args:
-        result: The result.
-
-    Returns:
-        Sentences: first on the run and the rigs, then on the reference sensor.
-    """
-    notes = [result.cut_short] if result.cut_short else []
-    if result.vehicle:
-        notes.append(f"Vehicle: {result.vehicle}.")
-    notes += describe_sensor_models(result.source.get("sensor_model"))
-    notes += describe_weather(result.source.get("weather"))
-    notes += describe_perfect_depth(result.sensors)
-    notes += describe_scan_periods(result.sensors)
-    notes += _describe_test_targets(result)
-    record = result.used_reference
-    if record is None:
-        return notes
-    if "frame_interval_s" not in record:  # a recording
-        return [*notes, *record["notes"]]
-    notes.append(
-        f"Reference sensor: {record['sensor']}, {record['rays_per_frame']:,} rays per frame; frame interval "
-        f"{record['frame_interval_s']:g} s."
-    )
-    notes += record["notes"]
-    if result.run is not None:
-        notes += _describe_resampled_poses(result.run.counts)
-        notes += _describe_repeated_frames(result.run, has_errors=_has_errors(result))
-    return notes
 
 
 def describe_failure(failure: BaseException, num_frames: int) -> str:
@@ -180,18 +145,45 @@ def _get_scan_period_s(sensor: Sensor) -> float:
     return timing.period_s if timing else 0.0
 
 
-def _describe_test_targets(result: "Result") -> list[str]:
-    """Describe where test targets were placed, or why a recording has none."""
-    target_sums = next(iter(result.coverages.values())).target_sums
-    if target_sums is not None:
-        num_frames = int(target_sums.frame_counts.sum())
+def describe_test_targets(coverage: Coverage, regions: Sequence[Region], *, is_recording: bool) -> list[str]:
+    """Describe where test targets were placed, or why a recording has none.
+
+    Args:
+        coverage: Coverage of a rig.
+        regions: Regions of the numbers.
+        is_recording: Whether the frames are recorded.
+    """
+    if coverage.target_sums is not None:
+        num_frames = int(coverage.target_sums.frame_counts.sum())
         return [
             f"Test targets: in {num_frames:,} frame{'s' * (num_frames != 1)}, one at a time, at random positions whose "
             "center is in the region; they occlude nothing else."
         ]
-    if result.source.get("frames") and any(region.bands for region in result.regions):
+    if is_recording and any(region.bands for region in regions):
         return ["No test targets in the near field: a recording has no scene to place them in."]
     return []
+
+
+def describe_reference(record: Mapping[str, Any], run: Run, coverage: Coverage) -> list[str]:
+    """Describe the reference points of a run, and how many frames of a simulation are distinct.
+
+    Args:
+        record: Source of the reference points, see `Result.used_reference`.
+        run: Outcome of the run.
+        coverage: Coverage of a rig.
+    """
+    if "frame_interval_s" not in record:  # a recording
+        return list(record["notes"])
+    sensor = (
+        f"Reference sensor: {record['sensor']}, {record['rays_per_frame']:,} rays per frame; frame interval "
+        f"{record['frame_interval_s']:g} s."
+    )
+    return [
+        sensor,
+        *record["notes"],
+        *_describe_resampled_poses(run.counts),
+        *_describe_repeated_frames(run, coverage),
+    ]
 
 
 def _describe_resampled_poses(counts: Mapping[str, int], min_share: float = 0.2) -> list[str]:
@@ -206,20 +198,16 @@ def _describe_resampled_poses(counts: Mapping[str, int], min_share: float = 0.2)
     ]
 
 
-def _describe_repeated_frames(run: "Run", *, has_errors: bool) -> list[str]:
+def _describe_repeated_frames(run: Run, coverage: Coverage) -> list[str]:
     """Note that frames repeat earlier time steps of the scenario, which adds no information."""
     repeated = run.counts["repeated_frames"]
     if not repeated:
         return []
     distinct = run.num_frames - repeated
+    block_sums: Any = coverage.block_sums
+    has_errors = block_sums is not None and int((block_sums.frame_counts > 0).sum()) >= MIN_BLOCKS
     if distinct == 1:
         limit = ", so confidence intervals only cover the sampling of reference poses" if has_errors else ""
         return [f"All {run.num_frames:,} frames show the same time step{limit}."]
     effect = ", and confidence intervals account for this" if has_errors else ""
     return [f"{run.num_frames:,} frames show {distinct:,} distinct time steps: the scenario repeats{effect}."]
-
-
-def _has_errors(result: "Result") -> bool:
-    """Test whether there are enough blocks for confidence intervals."""
-    block_sums: Any = next(iter(result.coverages.values())).block_sums
-    return block_sums is not None and int((block_sums.frame_counts > 0).sum()) >= MIN_BLOCKS

@@ -1,33 +1,29 @@
 """Page of a result: tables, maps, rigs, settings and facts on the run."""
 
+import math
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import PackageNotFoundError, version
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from pydantic import BaseModel
 
-from torchcover.coverage import Region
-from torchcover.evaluation.omissions import build_omissions_table
+from torchcover.coverage import Coverage, Region
+from torchcover.evaluation.settings import parse_file_kinds
 from torchcover.files import to_yaml
 from torchcover.report import (
     BOLD_MARKS,
     MapLine,
-    Page,
-    PageRig,
     PageTable,
     SensorView,
-    build_page_maps,
     build_page_tables,
 )
+from torchcover.report.map_layers import list_map_quantities
 from torchcover.report.table import CoverageTable
 from torchcover.report.table_notes import explain_marks, list_notes
 from torchcover.simulation import Sensor, compute_vertical_fov_deg
-
-if TYPE_CHECKING:
-    from torchcover.evaluation.result import Result
 
 # Keys of the record that the page shows under "Run".
 RUN_FACTS = ("torchcover", "duration_s", "complete", "device", "skipped_frames")
@@ -59,32 +55,40 @@ class RenderingCosts:
 COSTS = RenderingCosts()
 
 
-def build_page(result: "Result") -> Page:
-    """Build the page of a result.
+def estimate_rendering_cost(coverages: Mapping[str, Coverage], file_kinds: Container[str]) -> tuple[float, float]:
+    """Estimate the cost of the page and the maps of a result.
 
     Args:
-        result: The result.
+        coverages: Name of each rig -> its coverage.
+        file_kinds: Requested files; only "maps" and "page" have a cost.
 
     Returns:
-        Page with the findings, tables, maps, rigs, settings and omissions.
+        Memory in bytes and time in seconds.
     """
-    rigs = {name: result.sensors.get(name, ()) for name in result.rigs}
-    source = result.source.get("frames") or result.source.get("scenario") or "saved results"
-    location = ", on ".join(format_facts({"source": source, "vehicle": result.vehicle}).values())
-    page_rigs = []
-    for name, sensors in rigs.items():
-        page_rigs.append(PageRig(name, build_sensor_views(sensors), format_rig_yaml(name, sensors)))
-    return Page(
-        title=(" vs. " if len(rigs) == 2 else ", ").join(rigs),
-        lead=f"Blind spots and coverage in {location}, measured by torchcover.",
-        findings=result.verdict,
-        tables=result.tables,
-        maps=list(build_page_maps(result.coverages)) if result.coverages else [],
-        rigs=page_rigs,
-        ego_outline_m=result.ego_outline_m,
-        outlines=[build_region_outline(region) for region in result.regions],
-        facts=collect_facts(result.record, result.rigs, result.table.first_conditions.counts["num_frames"]),
-        more_tables=[build_omissions_table(result.omissions)] if result.omissions else [],
+    first_coverage = next(iter(coverages.values()))
+    grid, num_quantities = first_coverage.grid, len(list_map_quantities(first_coverage))
+    needed_bytes = seconds = 0.0
+    if "maps" in file_kinds or "page" in file_kinds:
+        bytes_per_cell = COSTS.bytes_per_cell + COSTS.bytes_per_value * num_quantities
+        needed_bytes = float(len(coverages) * grid.num_cells * bytes_per_cell)
+    if "maps" in file_kinds:
+        seconds = 3 * COSTS.seconds_per_map * len(coverages) * num_quantities * len(grid.heights)
+    return needed_bytes, seconds
+
+
+def describe_rendering_cost(coverages: Mapping[str, Coverage], file_kinds: str | Iterable[str]) -> str:
+    """Describe the cost of the page and the maps of a result in one sentence; empty if it is small.
+
+    Args:
+        coverages: Name of each rig -> its coverage.
+        file_kinds: Requested files, as in `Result.save`.
+    """
+    needed_bytes, seconds = estimate_rendering_cost(coverages, parse_file_kinds(file_kinds))
+    if needed_bytes < COSTS.min_announced_bytes and seconds < COSTS.min_announced_s:
+        return ""
+    return (
+        f"page and maps of {len(coverages)} rigs take about {needed_bytes / 1e9:.2g} GB of memory and "
+        f"{math.ceil(seconds / 60)} min, after the numbers are saved; omit them with `--files numbers`"
     )
 
 

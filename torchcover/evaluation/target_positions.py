@@ -6,8 +6,8 @@ import numpy as np
 import shapely
 from pydantic import Field, PositiveFloat, model_validator
 
-from torchcover.evaluation.verdicts import Float64
 from torchcover.geometry import BoundingBox
+from torchcover.geometry.arrays import Float64
 from torchcover.simulation.documents import Bounds, Coordinate, Document
 from torchcover.targets import SIDES
 from torchcover.targets.placing import find_sides

@@ -1,15 +1,12 @@
 """Verdicts on requirements: bounds, measured numbers with their confidence intervals, and the comparison of both."""
 
-from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from collections.abc import Sequence
+from typing import Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from torchcover.evaluation.requirements import Requirements
+from torchcover.geometry.arrays import Float64
 
-Float64 = NDArray[np.float64]
 State = Literal["met", "not met", "not decided"]
 
 # Numbers whose keys need words in tables.
@@ -86,39 +83,29 @@ class Verdict(NamedTuple):
     occupied_count: int = 0
 
 
-def judge_requirements(requirements: "Requirements", readings: Sequence[Mapping[str, Readings]]) -> list[Verdict]:
-    """Judge every bound: met if every interval meets it completely, not met if one interval misses it completely.
+def judge_bound(
+    requirement: str, bound: Bound, readings: Readings, *, rounding: float = 1e-9, max_locations: int = 5
+) -> Verdict:
+    """Judge a bound: met if every interval meets it completely, not met if one interval misses it completely.
 
     Any other bound is not decided.
 
     Args:
-        requirements: The requirements.
-        readings: Key of the number of each bound -> its values, for each requirement in order. A bound whose values are
-            empty is not decided.
+        requirement: Text of the requirement.
+        bound: One of its bounds.
+        readings: Values of the number; the bound is not decided if there are none.
+        rounding: Error that a mean over frames may have from rounding.
+        max_locations: Maximum number of worst locations.
 
     Returns:
-        One verdict for each bound, in the order of the requirements.
+        The verdict.
 
     Example:
-        >>> from torchcover.evaluation import Requirements
-        >>> child = {"target": "child", "positions": {"within_m": 2.0}, "points": 5}
-        >>> requirements, points = Requirements.model_validate({"requirements": [child]}), np.array([9.0, 3.0])
-        >>> values = {"points": Readings(points, points, points, ["ahead", "behind"])}
-        >>> verdict, = judge_requirements(requirements, [values])
+        >>> points = np.array([9.0, 3.0])
+        >>> verdict = judge_bound("child", Bound("points", 5.0), Readings(points, points, points, ["ahead", "behind"]))
         >>> verdict.state, verdict.margin, verdict.worst_locations
         ('not met', -2.0, ('behind',))
     """
-    verdicts = []
-    for requirement, numbers in zip(requirements.requirements, readings, strict=True):
-        for bound in requirement.bounds:
-            verdicts.append(_judge_bound(requirement.text, bound, numbers[bound.key]))
-    return verdicts
-
-
-def _judge_bound(
-    requirement: str, bound: Bound, readings: Readings, rounding: float = 1e-9, max_locations: int = 5
-) -> Verdict:
-    """Judge one bound; `rounding` is the error that a mean over frames may have from rounding."""
     sign = 1.0 if bound.is_minimum else -1.0
     margin = sign * (readings.value - bound.value)
     margin_of_low, margin_of_high = sign * (readings.low - bound.value), sign * (readings.high - bound.value)

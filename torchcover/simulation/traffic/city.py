@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import shapely
@@ -12,13 +12,10 @@ from torchcover.geometry.arrays import Float64
 from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.traffic.alignment import Alignment, StreetCorridor
 from torchcover.simulation.traffic.fleet import Fleet
-from torchcover.simulation.traffic.frontage import StreetSide, Zone, place_scenery
+from torchcover.simulation.traffic.frontage import RoadsideDensity, StreetSide, Zone, place_scenery
 from torchcover.simulation.traffic.hills import BlockParams, Bounds, BuildingSite, Hills
 from torchcover.simulation.traffic.scenery import Scenery, build_ground_plane, build_sidewalk, merge_by_kind
 from torchcover.simulation.traffic.streets import STREETS, StreetPlan
-
-if TYPE_CHECKING:
-    from torchcover.simulation.traffic.urban import UrbanTraffic
 
 # Weights of the kinds of parked cars.
 PARKED_KINDS = {"suv": 3.0, "sedan": 3.0, "hatchback": 3.0, "pickup": 0.8, "van": 1.0}
@@ -108,7 +105,9 @@ class CityBuilder(NamedTuple):
         corridor: Area around the main street.
         hills: Ground heights.
         fleet: Bodies; receives the parked cars.
-        settings: Shares of buildings and parked cars, and density of roadside objects.
+        built_share: Share of the block sides that have houses.
+        parked_share: Share of the parking bays that are occupied.
+        roadside_density: Factor on the density of roadside objects, or factors for some kinds.
         generator: Random generator of objects and parked cars.
         layout_generator: Random generator of blocks.
     """
@@ -117,7 +116,9 @@ class CityBuilder(NamedTuple):
     corridor: StreetCorridor
     hills: Hills
     fleet: Fleet
-    settings: "UrbanTraffic"
+    built_share: float
+    parked_share: float
+    roadside_density: RoadsideDensity
     generator: np.random.Generator
     layout_generator: np.random.Generator
 
@@ -133,8 +134,7 @@ class CityBuilder(NamedTuple):
         sides: list[StreetSide] = []
         frontages = self._list_frontages(visible_span_m)
         for site, frontage in frontages:
-            built_share = self.settings.built_share
-            is_built = built_share == 1.0 or self.layout_generator.random() < built_share
+            is_built = self.built_share == 1.0 or self.layout_generator.random() < self.built_share
             depth_m = CITY.block_depth_m if frontage.junction_indices else CITY.corner_depth_m
             depth_m = depth_m if is_built else sidewalk_m
             block, outline = site.build_block(frontage.span_m, frontage.side, frontage.curb_offset_m, depth_m)
@@ -161,8 +161,8 @@ class CityBuilder(NamedTuple):
         blocks.append(build_sidewalk(apron_outlines, self.hills.compute_heights_m))
         self._park_cars(frontages)
         areas = (streets, streets_with_sidewalks, shapely.get_parts(sidewalks))
-        heights, density = self.hills.compute_heights_m, self.settings.roadside_density
-        roadside = place_scenery(sides, *areas, heights, density, self.generator)
+        heights = self.hills.compute_heights_m
+        roadside = place_scenery(sides, *areas, heights, self.roadside_density, self.generator)
         ground_meshes = (self._build_ground(visible_span_m), *merge_by_kind(blocks))
         return Scenery((*ground_meshes, *merge_by_kind(*roadside)), tuple(range(len(ground_meshes))))
 
@@ -316,7 +316,7 @@ class CityBuilder(NamedTuple):
             kind = self.fleet.sample_kind(PARKED_KINDS)
             length_m = self.fleet.get_length_m(kind) + CITY.parking_gap_m + uniform(0.0, 0.5)
             end_m = start_m + length_m
-            if self.generator.random() < self.settings.parked_share and end_m < last_m:
+            if self.generator.random() < self.parked_share and end_m < last_m:
                 slack_m = max((bay_m - self.fleet.get_width_m(kind)) / 2 - 0.08, 0.0)
                 left_m = frontage.side * (frontage.curb_offset_m - bay_m / 2 + uniform(0.0, slack_m))
                 yaw_deg = (0.0 if frontage.side == -1 else 180.0) + uniform(-0.4, 0.4)

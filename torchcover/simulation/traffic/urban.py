@@ -149,7 +149,8 @@ class UrbanTraffic(ProceduralTraffic):
         ego = build_ego_actor(times_s, bodies, flow, 0, fleet.meshes[EGO], generator, hills)
         pedestrians = simulate_crossing_pedestrians(streets, flow, times_s, visible_span_m, fleet, generator)
         corridor = StreetCorridor(streets.main_alignment, built_span_m)
-        city = CityBuilder(streets, corridor, hills, fleet, self, generator, layout_generator)
+        densities = self.built_share, self.parked_share, self.roadside_density
+        city = CityBuilder(streets, corridor, hills, fleet, *densities, generator, layout_generator)
         scenery = city.build_static_scenery(visible_span_m)
         return scenery, ego, build_nearby_actors(times_s, [bodies, pedestrians], ego, fleet, hills)
 
