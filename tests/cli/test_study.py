@@ -31,7 +31,7 @@ def test_study_prints_tables_and_recommendations(torchcover, tmp_path, monkeypat
             return None, ""
 
     def run(words):
-        assert words[:3] == [sys.executable, "-m", "torchcover"]
+        assert words[:2] == [sys.executable, "-c"]
         monkeypatch.setattr(sys, "argv", words[2:])
         with pytest.raises(SystemExit) as stop:
             app.main()

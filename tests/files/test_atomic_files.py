@@ -397,3 +397,10 @@ def test_an_unfinished_recording_is_gone_on_with(tmp_path):
             files.add_text("a/lost.txt", "half")
     assert list_files(tmp_path) == {"a/b/0.txt", "a/b/1.txt", "a/b/2.txt", RECORDING}
     assert set(json.loads((tmp_path / RECORDING).read_text())["files"]) == {f"a/b/{part}.txt" for part in range(3)}
+
+
+def test_huge_summaries_above_a_file_are_not_parsed(tmp_path):
+    (tmp_path / "a.txt").write_text("content")
+    entry = {"bytes": 1, "sha256": "0"}
+    (tmp_path / "summary.json").write_text(json.dumps({"files": {"a.txt": entry}, "rest": "x" * 16_000_000}))
+    assert guard_reader("a text")(lambda path: path.read_text())(tmp_path / "a.txt") == "content"

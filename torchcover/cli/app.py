@@ -9,7 +9,7 @@ import time
 import traceback
 import warnings
 from collections.abc import Callable, Sequence
-from contextlib import suppress
+from contextlib import chdir, suppress
 from enum import IntEnum
 from pathlib import Path
 from typing import Annotated, Any, TextIO
@@ -65,6 +65,7 @@ def main() -> None:
             warnings.showwarning = _print_warning
             # The last line of the program reports the interruption.
             warnings.filterwarnings("ignore", "The run was cut short", RuntimeWarning)
+            ignore_local_matplotlibrc()
             code = run_command(sys.argv[1:])
             sys.stdout.flush()
     except (Exception, KeyboardInterrupt) as error:
@@ -130,6 +131,18 @@ def open_closed_streams() -> None:
             os.set_inheritable(number, True)
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, mode, encoding="utf-8"))  # noqa: SIM115  (open as long as the process)
+
+
+def ignore_local_matplotlibrc() -> None:
+    """Import matplotlib without the `matplotlibrc` of the working directory, which may name programs to start.
+
+    The working directory may be a downloaded data set. The user's own settings and MATPLOTLIBRC apply.
+    """
+    file = Path("matplotlibrc")
+    if os.path.lexists(file):
+        warnings.warn(f"{file}: not read in the working directory; set MATPLOTLIBRC to use it", stacklevel=1)
+        with chdir(Path(__file__).parent):
+            import matplotlib  # noqa: F401  (reads its settings at import)
 
 
 def flush_or_discard(stream: TextIO) -> None:

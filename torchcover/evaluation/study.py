@@ -350,7 +350,9 @@ def measure_command_s(plan: StudyPlan) -> float:
     arguments = [*plan.command, "--num-frames=1"]
     start_s = time.perf_counter()
     with TemporaryDirectory() as folder:
-        command = [sys.executable, "-m", "torchcover", *arguments, f"--out={folder}"]
+        # With `-m`, modules in the working directory would be imported instead of packages.
+        program = f"import sys; sys.path[:] = {sys.path!r}; from torchcover.cli.app import main; main()"
+        command = [sys.executable, "-c", program, *arguments, f"--out={folder}"]
         process = subprocess.Popen(
             command,
             text=True,

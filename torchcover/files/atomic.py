@@ -104,11 +104,12 @@ def list_written(start_s: float) -> list[Path]:
     return [path for path in visible if path.lstat().st_mtime >= start_s]
 
 
-def read_manifest(path: Path) -> dict[str, Any] | None:
+def read_manifest(path: Path, max_bytes: int = MAX_MANIFEST_BYTES) -> dict[str, Any] | None:
     """Read a manifest.
 
     Args:
         path: File.
+        max_bytes: Size limit; larger files are no manifests.
 
     Returns:
         Record with `files` by name, each with `bytes` and `sha256`, without hidden files and files outside of the
@@ -118,7 +119,7 @@ def read_manifest(path: Path) -> dict[str, Any] | None:
         status = path.lstat()
     except OSError:
         return None
-    if not stat.S_ISREG(status.st_mode) or status.st_size > MAX_MANIFEST_BYTES:
+    if not stat.S_ISREG(status.st_mode) or status.st_size > max_bytes:
         return None
     return _parse_manifest(path, status.st_ino, status.st_size, status.st_mtime_ns)
 
@@ -190,8 +191,10 @@ def check_manifest_entry(path: Path) -> None:
         UserWarning: The content of a YAML document differs, which may be an intended edit.
     """
     path = path.absolute()
+    # Results have far fewer files than recordings. Three manifests of this size take 1.4 GB when parsed.
+    max_summary_bytes = 16_000_000
     for folder in path.parents[:3]:  # manifests list files at most this deep
-        manifest = read_manifest(folder / SUMMARY)
+        manifest = read_manifest(folder / SUMMARY, max_summary_bytes)
         name = path.relative_to(folder).as_posix()
         entry = manifest["files"].get(name) if manifest else None
         if manifest and manifest.get(WRITING) and (entry is not None or name == SUMMARY):

@@ -1,8 +1,14 @@
 """Compilation of loops over arrays by numba (extra `fast`); importing this module fails without numba."""
 
+import os
 from collections.abc import Callable
 from typing import Any, TypeAlias, TypeVar
 
+NUMBA_CONFIG = ".numba_config.yaml"  # numba reads it in the working directory at import and at each compilation
+
+# The file may name a cache folder, whose pickles would run as code. The working directory may be untrusted.
+if os.path.lexists(NUMBA_CONFIG):
+    raise ImportError(f"{NUMBA_CONFIG} in the working directory is not trusted; use environment variables instead")
 try:
     import numba
 except ModuleNotFoundError as error:
