@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from torchcover import Region, evaluate
+from torchcover import Coverage, Region, evaluate
 from torchcover.contrib import score_placements
 from torchcover.contrib.placement_scores import build_circle_region
 from torchcover.data import RegionsOfInterest
@@ -22,9 +22,9 @@ def test_coverage_scores_equal_those_of_evaluate():
         list(RIGS.values()), "courtyard", regions=RegionsOfInterest.model_validate(request), num_frames=8, seed=3
     )
     actual = {one.name: one for one in scores.rankings}
-    for measure, words in (("area", "visible surface"), ("cells", "observed cells")):
+    for estimate, words in ((Coverage.estimate, "visible surface"), (Coverage.paper_mean, "observed cells")):
         each = [
-            [float(coverage.estimate(region, band, measure).value[1]) for coverage in result.coverages.values()]
+            [float(estimate(coverage, region, band).value[1]) for coverage in result.coverages.values()]
             for band in ("ground", "obstacle")
         ]
         for name, expected in zip(("ground", "obstacle", "both bands"), (*each, np.mean(each, axis=0)), strict=True):

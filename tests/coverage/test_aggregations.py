@@ -22,6 +22,7 @@ from torchcover.coverage import (
     SumState,
     parse_aggregation,
 )
+from torchcover.coverage.number import estimate_number, list_number_keys
 from torchcover.estimation import Estimate, Quantity
 from torchcover.report import RENDERERS, CoverageTable
 
@@ -218,7 +219,7 @@ def test_any_number_of_a_result_has_an_estimate():
         return metric.compute()
 
     one, other = measured(0.0), measured(0.1)
-    keys = [quantity.key for quantity in one.all_quantities]
+    keys = list_number_keys(one)
     assert {"cells_radius_m", "radius_m_without_a", "radius_q0.9_m", "detected_by_two_0.4m"} < set(keys)
     row = one.summary()[0]
     values = {
@@ -227,7 +228,7 @@ def test_any_number_of_a_result_has_an_estimate():
         **row.redundancy.detecting_sensors,
     }
     for key in keys:
-        result, compared = (each.estimate_number(key, NEAR, "all") for each in (one, other))
+        result, compared = (estimate_number(each, key, NEAR, "all") for each in (one, other))
         assert [quantity.key for quantity in result.quantities] == [key]
         if key in values:
             assert float(result.value) == values[key].value
@@ -236,7 +237,7 @@ def test_any_number_of_a_result_has_an_estimate():
         assert math.isnan(result.error)
         assert compared.subtract(result).compute_errors(3).isnan().tolist() == [key == "radius_maximum_m"]
     with pytest.raises(ValueError, match=r"radius_q0\.8_m: the result has no such number; it has radius_q0"):
-        one.estimate_number("radius_q0.8_m", NEAR, "all")
+        estimate_number(one, "radius_q0.8_m", NEAR, "all")
 
 
 # Custom aggregations

@@ -55,7 +55,7 @@ def test_area_average_is_independent_of_the_cells(cell):
     steps = steps_of(9)
     coverage = metric_over(steps, cell_m=cell).compute()
     for height, band in HEIGHTS.items():
-        estimate = coverage.estimate(REGION, height, "area")
+        estimate = coverage.estimate(REGION, height)
         torch.testing.assert_close(estimate.value, by_hand(steps, *band), rtol=1e-6, atol=1e-9)
         assert estimate.error.isnan().all()
 
@@ -63,7 +63,7 @@ def test_area_average_is_independent_of_the_cells(cell):
 def test_jackknife_values_equal_runs_without_the_block():
     steps = steps_of(40)
     coverage = metric_over(steps, num_blocks=16).compute()
-    estimate = coverage.estimate(REGION, "low", "area")
+    estimate = coverage.estimate(REGION, "low")
     assert estimate.frame_counts.tolist() == [4] * 10
     for block in range(10):
         kept = [number for number in range(40) if number // 4 != block]
@@ -75,7 +75,7 @@ def test_jackknife_values_equal_runs_without_the_block():
 def test_points_that_are_split_up_change_nothing():
     whole = steps_of(8)
     halves = [(sensor, reference.repeat(4, 1), m2.repeat(4) / 4) for sensor, reference, m2 in whole]
-    values = [metric_over(steps).compute().estimate(REGION, "low", "area").value for steps in (whole, halves)]
+    values = [metric_over(steps).compute().estimate(REGION, "low").value for steps in (whole, halves)]
     torch.testing.assert_close(*values, rtol=1e-9, atol=0)
 
 
@@ -92,7 +92,7 @@ def test_area_sums_merge_and_load_exactly(tmp_path, blocks):
     coverage.save(tmp_path / "coverage.npz")
     loaded = Coverage.load(tmp_path / "coverage.npz")
     for other, exact in ((first.compute(), 1e-12), (loaded, 0.0)):
-        one, two = (each.estimate(REGION, "high", "area") for each in (coverage, other))
+        one, two = (each.estimate(REGION, "high") for each in (coverage, other))
         torch.testing.assert_close(one.value, two.value, rtol=exact, atol=0)
         torch.testing.assert_close(one.jackknife_values, two.jackknife_values, rtol=exact, atol=0)
     assert torch.equal(loaded.layers["radius_area_m"].values, coverage.layers["radius_area_m"].values)
@@ -183,7 +183,7 @@ def test_other_regions_need_bounds_on_cell_edges(tmp_path):
             match=r"'later': its points were not summed, and its bounds are not edges of the cells of 0\.32 m",
         ):
             loaded.estimate(other, "low")
-        assert loaded.estimate(other, "low", "cells").value.isfinite().all()
+        assert loaded.paper_mean(other, "low").value.isfinite().all()
 
 
 def test_cells_have_the_ratio_of_their_sums():
@@ -191,16 +191,16 @@ def test_cells_have_the_ratio_of_their_sums():
     band = coverage.area_sums.sum_blocks()[0, 0]
     radius = coverage.layers["radius_area_m"].values[0]
     detection = coverage.layers["detection_area_0.8m"].values[0]
-    value = coverage.estimate(REGION, "low", "area").value
+    value = coverage.estimate(REGION, "low").value
     assert ((radius * band).sum() / band.sum()).item() == pytest.approx(value[0].item(), rel=1e-12)
     assert ((detection * band).sum() / band.sum()).item() == pytest.approx(value[2].item(), rel=1e-12)
 
 
 def test_regions_without_surface_are_unknown():
     sensor, nowhere, none = torch.zeros(1, 3), torch.zeros(0, 3), torch.zeros(0)
-    assert metric_over([(sensor, nowhere, none)]).compute().estimate(REGION, "low", "area").value.isnan().all()
+    assert metric_over([(sensor, nowhere, none)]).compute().estimate(REGION, "low").value.isnan().all()
     one = (torch.zeros(0, 3), torch.tensor([[1.0, 1.0, 0.5]]), torch.tensor([2.0]))
-    value = metric_over([one]).compute().estimate(REGION, "low", "area").value
+    value = metric_over([one]).compute().estimate(REGION, "low").value
     assert value.tolist() == [math.inf, 0.0, 0.0]
 
 
@@ -208,10 +208,6 @@ def test_it_needs_has_area_weights():
     sensor, reference, _ = steps_of(1)[0]
     with pytest.raises(ValueError, match="weights: the area of each reference point in m2 is needed"):
         CoverageMetric(grid(), has_area_weights=True).update(sensor, reference)
-    plain = CoverageMetric(grid())
-    plain.update(sensor, reference)
-    with pytest.raises(ValueError, match="no average over area: the reference points have no area weights"):
-        plain.compute().estimate(REGION, "low", "area")
     with pytest.raises(ValueError, match="different has_area_weights"):
         metric_over(steps_of(1)).merge_state(CoverageMetric(grid(), (0.4, 0.8)))
 
@@ -237,7 +233,7 @@ def simulated(region, reference_sensor, steps):
     for frame in SimulatedFrames("courtyard", "front_roof_32", num_frames=steps, reference_sensor=reference_sensor):
         metric.update(frame.sensor, frame.reference, weights=frame.reference_weights, block_index=frame.index)
     coverage = metric.compute()
-    estimates = {height: coverage.estimate(region, height, "area") for height in ("ground", "obstacle")}
+    estimates = {height: coverage.estimate(region, height) for height in ("ground", "obstacle")}
     return {
         height: list(zip(result.value.tolist(), result.error.tolist(), strict=True))
         for height, result in estimates.items()

@@ -109,7 +109,7 @@ def test_a_plot_shows_the_values():
     [
         (("detection_2m", NEAR, "low"), r"quantity: one of radius_m, detection_0.4m, detection_1m is needed; got"),
         (("observed_share", NEAR, "low"), r"quantity: one of radius_m"),
-        (("radius_m", NEAR, "ground"), r"height: one of low, high is needed; got 'ground'"),
+        (("radius_m", NEAR, "ground"), r"height 'ground': the grid has low, high"),
         (("radius_m", Region("wide", (0.0, 9.0), (-2.0, 2.0)), "low"), r"region 'wide' spans"),
     ],
 )

@@ -71,5 +71,5 @@ def test_unknown_layers_and_bands_are_refused():
     metric = metric_over(AHEAD, AHEAD)
     with pytest.raises(ValueError, match=r"layer: one of radius_m, detection_0.4m is needed; got 'detection'"):
         metric.plot(quantity_key="detection")
-    with pytest.raises(ValueError, match=r"height: one of low, high is needed; got 'ground'"):
+    with pytest.raises(ValueError, match=r"height 'ground': the grid has low, high"):
         metric.plot(band="ground")

@@ -6,6 +6,7 @@ import torch
 
 from tests.placement.worlds import held, lidar, rig
 from torchcover.coverage import CoverageMetric, Maximum, Quantiles
+from torchcover.coverage.number import estimate_number
 from torchcover.estimation import Estimate
 from torchcover.evaluation import CoverageObserver
 from torchcover.placement import Objective
@@ -109,7 +110,7 @@ def test_failure_numbers_use_the_same_cells_as_evaluate(several):
     for frame in several.iterate_frames(TWO):
         observer.update(frame)
     for key in ("detection_0.4m", "radius_m", "detected_by_two_0.4m", "detection_0.4m_without_top"):
-        assert by_cells[key] == float(observer.compute().estimate_number(key, region, "ground").value)
+        assert by_cells[key] == float(estimate_number(observer.compute(), key, region, "ground").value)
         assert by_cells[key] != by_area[key]
     # An aggregation is over all points of the region, whatever the means are over.
     assert by_cells["radius_q0.9_m"] == by_area["radius_q0.9_m"]

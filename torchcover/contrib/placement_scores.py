@@ -12,7 +12,6 @@ from torchcover.contrib.comparison import MetricComparison
 from torchcover.contrib.ranks import BASELINE, LEAST, OWN, Ranking, build_rankings
 from torchcover.contrib.registry import PUBLISHED
 from torchcover.coverage import Coverage, Region
-from torchcover.coverage.averages import Average
 from torchcover.estimation import Quantity
 from torchcover.evaluation.evaluating import evaluate
 from torchcover.evaluation.rig_names import AnyRig, load_rig
@@ -151,12 +150,11 @@ def _build_regions_of_interest(region: Region) -> RegionsOfInterest:
 
 def _rank_by_coverage(coverages: Sequence[Coverage], region: Region, seed: int) -> Iterator[Ranking]:
     """Rank by the detection rate over visible surface and observed cells, in each band and as mean of both bands."""
-    averages: tuple[tuple[Average, str], ...] = (("area", "visible surface"), ("cells", "observed cells"))
-    for average, description in averages:
+    for estimate, description in ((Coverage.estimate, "visible surface"), (Coverage.paper_mean, "observed cells")):
         name = f"detection {DETECTION_THRESHOLD_M:g} m, {{}}, {region.name}, {description}"
         band_rankings = []
         for band in coverages[0].grid.heights:
-            estimates = [coverage.estimate(region, band, average)[1:] for coverage in coverages]
+            estimates = [estimate(coverage, region, band)[1:] for coverage in coverages]
             numbers = [list(estimate.to_numbers().values()) for estimate in estimates]
             (ranking,) = build_rankings(OWN, numbers, estimates, seed)
             band_rankings.append(ranking._replace(name=name.format(band)))

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -37,9 +37,6 @@ from torchcover.files import (
 )
 from torchcover.metrics.blocked_sums import FINE_BLOCKS_PER_BLOCK
 
-if TYPE_CHECKING:
-    from torchcover.coverage.result import Coverage
-
 Arrays = dict[str, NDArray[Any]]
 
 # Raised whenever a header key, an array name or the meaning of an array changes.
@@ -52,62 +49,62 @@ TARGET_ARRAYS = ("target_frame_counts", "target_sums", "target_position_counts")
 AGGREGATED_ARRAYS = ("region_numbers", "region_numbers_jackknife")
 
 
-def write_coverage(coverage: "Coverage", path: Path) -> None:
+def write_coverage(attributes: Mapping[str, Any], path: Path) -> None:
     """Write a coverage to one compressed file, with the standard errors of its maps for readers without torchcover.
 
     Args:
-        coverage: Result to be saved.
+        attributes: Attributes of the `Coverage`, with its `sparse_errors`.
         path: File to be written.
     """
-    arrays: dict[str, Any] = {name: tensor.cpu().numpy() for name, tensor in _collect_tensors(coverage).items()}
-    arrays["cell"] = _shrink_indices(arrays["cell"], coverage.grid.num_cells)
-    if coverage.block_sums is not None:
-        arrays |= _convert_block_sums(coverage.block_sums, BLOCK_ARRAYS)
-    if coverage.area_sums is not None:
-        arrays |= _convert_block_sums(coverage.area_sums, AREA_ARRAYS)
-    write_npz(path, {"header": np.array(json.dumps(_build_header(coverage))), **arrays})
+    arrays: dict[str, Any] = {name: tensor.cpu().numpy() for name, tensor in _collect_tensors(attributes).items()}
+    arrays["cell"] = _shrink_indices(arrays["cell"], attributes["grid"].num_cells)
+    if attributes["block_sums"] is not None:
+        arrays |= _convert_block_sums(attributes["block_sums"], BLOCK_ARRAYS)
+    if attributes["area_sums"] is not None:
+        arrays |= _convert_block_sums(attributes["area_sums"], AREA_ARRAYS)
+    write_npz(path, {"header": np.array(json.dumps(_build_header(attributes))), **arrays})
 
 
-def _build_header(coverage: "Coverage") -> dict[str, Any]:
+def _build_header(attributes: Mapping[str, Any]) -> dict[str, Any]:
     """Collect all parts of a coverage that are no arrays, as JSON values."""
-    aggregated, redundancy = coverage.aggregated_numbers, coverage.redundancy
+    aggregated, redundancy = attributes["aggregated_numbers"], attributes["redundancy"]
     aggregated_quantities = () if aggregated is None else aggregated.quantities
     redundancy_layers = () if redundancy is None else redundancy.sparse_layers.values()
     return {
         "format": FORMAT_VERSION,
-        "grid": asdict(coverage.grid),
-        "shape": coverage.grid.shape,
-        "thresholds_m": coverage.thresholds_m,
-        "max_radius_m": coverage.max_radius_m,
-        "layers": [layer.quantity._asdict() for layer in coverage.sparse_layers.values()],
-        "counts": coverage.counts,
-        "num_blocks": 1 if coverage.block_sums is None else len(coverage.block_sums.frame_counts),
-        "has_area_weights": coverage.area_sums is not None,
-        "regions": [asdict(region) for region in coverage.regions],
-        "has_region_sums": coverage.region_sums is not None,
+        "grid": asdict(attributes["grid"]),
+        "shape": attributes["grid"].shape,
+        "thresholds_m": attributes["thresholds_m"],
+        "max_radius_m": attributes["max_radius_m"],
+        "layers": [layer.quantity._asdict() for layer in attributes["sparse_layers"].values()],
+        "counts": attributes["counts"],
+        "num_blocks": 1 if attributes["block_sums"] is None else len(attributes["block_sums"].frame_counts),
+        "has_area_weights": attributes["area_sums"] is not None,
+        "regions": [asdict(region) for region in attributes["regions"]],
+        "has_region_sums": attributes["region_sums"] is not None,
         "aggregated_quantities": [quantity._asdict() for quantity in aggregated_quantities],
         "sensor_names": None if redundancy is None else redundancy.sensor_names,
         "redundancy_layers": [layer.quantity._asdict() for layer in redundancy_layers],
-        "targets": None if coverage.target_sums is None else coverage.target_sums.to_record(),
+        "targets": None if attributes["target_sums"] is None else attributes["target_sums"].to_record(),
     }
 
 
-def _collect_tensors(coverage: "Coverage") -> dict[str, Tensor]:
+def _collect_tensors(attributes: Mapping[str, Any]) -> dict[str, Tensor]:
     """Collect the tensors of a coverage by the name of their array, except for sums in blocks."""
-    observed, targets = coverage.observed_cells, coverage.target_sums
+    observed, targets = attributes["observed_cells"], attributes["target_sums"]
     tensors = {
         "cell": observed.cell_indices,
         "observed_frames": observed.observed_frames,
         "point_counts": observed.point_counts,
     }
-    tensors |= {layer.quantity.key: layer.values for layer in coverage.sparse_layers.values()}
-    tensors |= {f"{key}_error": error for key, error in coverage.sparse_errors.items()}
-    if coverage.aggregated_numbers is not None:
-        tensors |= dict(zip(AGGREGATED_ARRAYS, coverage.aggregated_numbers[1:], strict=True))
-    if coverage.redundancy is not None:
-        tensors |= {key: layer.values for key, layer in coverage.redundancy.sparse_layers.items()}
-    if coverage.region_sums is not None:
-        tensors |= dict(zip(REGION_ARRAYS, coverage.region_sums, strict=True))
+    tensors |= {layer.quantity.key: layer.values for layer in attributes["sparse_layers"].values()}
+    tensors |= {f"{key}_error": error for key, error in attributes["sparse_errors"].items()}
+    if attributes["aggregated_numbers"] is not None:
+        tensors |= dict(zip(AGGREGATED_ARRAYS, attributes["aggregated_numbers"][1:], strict=True))
+    if attributes["redundancy"] is not None:
+        tensors |= {key: layer.values for key, layer in attributes["redundancy"].sparse_layers.items()}
+    if attributes["region_sums"] is not None:
+        tensors |= dict(zip(REGION_ARRAYS, attributes["region_sums"], strict=True))
     if targets is not None:
         target_tensors = (targets.frame_counts, targets.sums, targets.position_counts)
         tensors |= dict(zip(TARGET_ARRAYS, target_tensors, strict=True))

@@ -142,6 +142,12 @@ class BevGrid:
         """(Y,) float64 cell centers along y."""
         return _compute_centers(self.y_m, self.cell_m)
 
+    def get_band_index(self, band: str) -> int:
+        """Return the index of a height band; ValueError if it does not exist."""
+        if band not in self.heights:
+            raise ValueError(f"height {band!r}: the grid has {', '.join(self.heights)}")
+        return list(self.heights).index(band)
+
     def find_cells(self, points: Tensor, heights_m: Tensor | None = None) -> Tensor:
         """Find the cell of each point, in a grid whose bands do not overlap.
 

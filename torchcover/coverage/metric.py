@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from torchcover.coverage.frame_input import Clouds, SensorClouds, to_list
-from torchcover.coverage.plotting import plot_coverage
 from torchcover.coverage.result import Coverage
 from torchcover.coverage.sums import CoverageSums
 from torchcover.metrics import MergeableMetric, get_figure
@@ -125,7 +124,14 @@ class CoverageMetric(MergeableMetric, CoverageSums):
 
         Returns:
             The figure and its axes.
+
+        Raises:
+            TypeError: `val` is not a single `Coverage`.
+            ValueError: The layer or the band does not exist.
         """
         fig, ax = get_figure(ax)
-        plot_coverage(self.compute() if val is None else val, ax, quantity_key, band)
+        coverage = self.compute() if val is None else val
+        if not isinstance(coverage, Coverage):
+            raise TypeError(f"val: one Coverage, as compute() returns it, is needed; got {type(coverage).__name__}")
+        coverage.plot(quantity_key, band, ax)
         return fig, ax

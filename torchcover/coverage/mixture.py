@@ -3,7 +3,6 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
-from torchcover.coverage.averages import Average, estimate_redundancy
 from torchcover.coverage.regions import Region, list_region_bands
 from torchcover.coverage.result import Coverage
 from torchcover.coverage.summary import RegionSummary, convert_to_cell_numbers, summarize_redundancy
@@ -46,15 +45,14 @@ class CoverageMixture:
         """Combine the estimates of all scenarios."""
         return Estimate.from_strata([(weight, estimate(coverage)) for weight, coverage in self.weighted_coverages])
 
-    def estimate(self, region: Region, band: str, average: Average | None = None) -> Estimate:
+    def estimate(self, region: Region, band: str) -> Estimate:
         """Estimate the weighted mean of `Coverage.estimate`.
 
         Args:
             region: As in `Coverage.estimate`.
             band: As in `Coverage.estimate`.
-            average: As in `Coverage.estimate`.
         """
-        return self._mix(lambda coverage: coverage.estimate(region, band, average))
+        return self._mix(lambda coverage: coverage.estimate(region, band))
 
     def estimate_aggregated(self, region: Region, band: str) -> Estimate:
         """Estimate the weighted mean of `Coverage.estimate_aggregated`.
@@ -86,12 +84,12 @@ class CoverageMixture:
         estimates = (
             self.estimate(region, band),
             self.estimate_aggregated(region, band),
-            self.estimate(region, band, "cells"),
+            self._mix(lambda coverage: coverage.paper_mean(region, band)),
         )
         numbers, aggregated_numbers, cell_averages = convert_to_cell_numbers(estimates, observed_cells)
         redundancy = None
         if rows[0].redundancy and rows[0].redundancy.failure_numbers:
-            estimate = self._mix(lambda coverage: estimate_redundancy(coverage, region, band))
+            estimate = self._mix(lambda coverage: coverage.estimate_redundancy(region, band))
             redundancy = summarize_redundancy(tuple(rows[0].redundancy.failure_numbers), self.thresholds_m, estimate)
         return replace(
             rows[0],

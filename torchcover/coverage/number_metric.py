@@ -60,8 +60,7 @@ class CoverageNumberMetric(CoverageMetric):
         quantities = {quantity.key: quantity for quantity in MeanOfMeans(self.thresholds_m).quantities}
         if quantity_key not in quantities:
             raise ValueError(f"quantity: one of {', '.join(quantities)} is needed; got {quantity_key!r}")
-        if band not in grid.heights:
-            raise ValueError(f"height: one of {', '.join(grid.heights)} is needed; got {band!r}")
+        grid.get_band_index(band)  # raises for an unknown band
         self.quantity = quantities[quantity_key]
         self.region = region
         self.band = band

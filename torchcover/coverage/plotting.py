@@ -1,55 +1,38 @@
-"""Map of one layer on matplotlib axes, for `CoverageMetric.plot`; maps of whole runs are in `torchcover.report`."""
+"""Map of one layer on matplotlib axes, for `Coverage.plot`; maps of whole runs are in `torchcover.report`."""
 
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from torchcover.coverage.quantities import make_area_quantity
-from torchcover.coverage.result import Coverage
+from torchcover.coverage.aggregations import Layer
+from torchcover.coverage.grid import BevGrid
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 
-def plot_coverage(coverage: object, ax: "Axes", quantity_key: str | None, band: str | None) -> None:
+def plot_layer(ax: "Axes", layer: Layer, grid: BevGrid, band: str, num_frames: int) -> None:
     """Plot one layer in one height band in bird's-eye view: x to the right, y up, the vehicle at the origin.
 
     Dark cells are blind, gray cells unobserved. Values beyond the color scale, such as an infinite radius, have its
     last color.
 
     Args:
-        coverage: Result of a `CoverageMetric`.
         ax: Axes to plot on.
-        quantity_key: Key of the layer; by default the detection at the first threshold, or the radius without
-            thresholds, by area if the result is.
-        band: Name of the height band; by default the first.
-
-    Raises:
-        TypeError: `coverage` is not a single `Coverage`.
-        ValueError: The layer or the band does not exist.
+        layer: (H, Y, X) layer.
+        grid: Cells and height bands.
+        band: Name of the height band.
+        num_frames: Number of frames, for the title.
     """
-    if not isinstance(coverage, Coverage):
-        raise TypeError(f"val: one Coverage, as compute() returns it, is needed; got {type(coverage).__name__}")
-    bands = list(coverage.grid.heights)
-    if quantity_key is None:
-        quantity = coverage.quantities[min(1, len(coverage.thresholds_m))]
-        quantity_key = (quantity if coverage.average == "cells" else make_area_quantity(quantity)).key
-    if quantity_key not in coverage.layers:
-        raise ValueError(f"layer: one of {', '.join(coverage.layers)} is needed; got {quantity_key!r}")
-    if band is None:
-        band = bands[0]
-    if band not in bands:
-        raise ValueError(f"height: one of {', '.join(bands)} is needed; got {band!r}")
-    layer = coverage.layers[quantity_key]
-    quantity, values = layer.quantity, layer.values[bands.index(band)].cpu().numpy()
+    quantity, values = layer.quantity, layer.values[grid.get_band_index(band)].cpu().numpy()
     finite = values[np.isfinite(values)]
     vmax = 1.0
     if quantity.unit == "m" and len(finite):
         # The largest 2 % lie in a few cells far behind obstacles, and would compress the color scale.
         vmax = float(np.percentile(finite, 98)) or 1.0
     values = np.where(np.isinf(values), 2 * vmax, values)  # matplotlib would treat infinite cells as unobserved
-    (x_low, x_high), (y_low, y_high) = coverage.grid.x_m, coverage.grid.y_m
-    _, rows, columns = coverage.grid.shape
+    (x_low, x_high), (y_low, y_high) = grid.x_m, grid.y_m
+    _, rows, columns = grid.shape
     mesh = ax.pcolormesh(
         np.linspace(x_low, x_high, columns + 1),
         np.linspace(y_low, y_high, rows + 1),
@@ -67,7 +50,7 @@ def plot_coverage(coverage: object, ax: "Axes", quantity_key: str | None, band: 
         aspect="equal",
         xlabel="x forward (m)",
         ylabel="y left (m)",
-        title=f"{quantity.title}, {band}, {coverage.counts['num_frames']} frames (gray: unobserved)",
+        title=f"{quantity.title}, {band}, {num_frames} frames (gray: unobserved)",
     )
     label = f"{quantity.title} (m)" if quantity.unit == "m" else quantity.title
     ax.figure.colorbar(mesh, ax=ax, label=label, shrink=0.7, extend="max" if (values > vmax).any() else "neither")

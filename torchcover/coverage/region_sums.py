@@ -26,6 +26,21 @@ class AggregatedNumbers(NamedTuple):
     values: Tensor
     jackknife_values: Tensor
 
+    def estimate(self, region_band_index: int | None, frame_counts: Tensor | None) -> Estimate:
+        """Estimate the numbers of one region and band; NaN without an index.
+
+        Args:
+            region_band_index: Index of the pair.
+            frame_counts: (B,) frames in each block; 0 in unused blocks, None without blocks.
+        """
+        if region_band_index is None:
+            return Estimate.from_values(self.quantities, torch.full_like(self.values[0], math.nan))
+        values = self.values[region_band_index]
+        if frame_counts is None:
+            return Estimate.from_values(self.quantities, values)
+        used = frame_counts > 0
+        return Estimate(self.quantities, values, self.jackknife_values[used, region_band_index], frame_counts[used])
+
 
 class RegionSums(NamedTuple):
     """Sums over the visible surface of P pairs of region and band, in B fine blocks of frames.

@@ -212,9 +212,8 @@ class RegionBands:
         Returns:
             Index, or None if the region is not among the regions.
         """
-        if region not in self.regions:
-            return None
-        return self.regions.index(region) * len(self.grid.heights) + list(self.grid.heights).index(band)
+        band_index = self.grid.get_band_index(band)
+        return self.regions.index(region) * len(self.grid.heights) + band_index if region in self.regions else None
 
     def assign_points(self, points: Tensor, cell_indices: Tensor) -> tuple[Tensor, Tensor]:
         """Find the regions of points; a point may lie in several.

@@ -1,9 +1,7 @@
 """Result of a coverage metric: maps over the grid and numbers of regions."""
 
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
-from difflib import get_close_matches
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
@@ -12,21 +10,16 @@ import torch
 from torch import Tensor
 
 from torchcover.coverage.aggregations import Layer, MeanOfMeans
-from torchcover.coverage.averages import (
-    Average,
-    estimate_area_average,
-    estimate_cell_average,
-    estimate_cell_errors,
-    estimate_redundancy,
-)
+from torchcover.coverage.averages import Average, estimate_cell_average, estimate_cell_errors
 from torchcover.coverage.coverage_file import read_coverage, write_coverage
 from torchcover.coverage.grid import BandFrame, BevGrid
-from torchcover.coverage.quantities import RADIUS, make_area_quantity, make_cells_quantity
-from torchcover.coverage.redundancy import Redundancy, expand_layers, list_redundancy_quantities
+from torchcover.coverage.plotting import plot_layer
+from torchcover.coverage.quantities import RADIUS, make_area_quantity
+from torchcover.coverage.redundancy import Redundancy, expand_layers
 from torchcover.coverage.region_sums import AggregatedNumbers, RegionSums
 from torchcover.coverage.regions import Region, RegionBands, check_regions, get_paper_regions, list_region_bands
 from torchcover.coverage.sparse_sums import BlockSums, LazyMaps, ObservedCells
-from torchcover.coverage.summary import RegionSummary, summarize_region
+from torchcover.coverage.summary import RegionSummary, convert_to_cell_numbers, summarize_redundancy
 from torchcover.coverage.target_sums import TargetSums
 from torchcover.estimation import Estimate, Quantity
 from torchcover.files import write_atomically
@@ -35,6 +28,7 @@ from torchcover.notebooks import build_dataframe, build_result_html, build_xarra
 if TYPE_CHECKING:
     import pandas
     import xarray
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 
@@ -103,7 +97,7 @@ class Coverage:
         self.aggregated_numbers = aggregated_numbers
         self.redundancy = redundancy
         self.target_sums = target_sums
-        self._estimates: dict[tuple[Region, str, Average], Estimate] = {}
+        self._paper_means: dict[tuple[Region, str], Estimate] = {}
 
     def __repr__(self) -> str:
         observed_share = len(self.observed_cells.cell_indices) / self.grid.num_cells
@@ -113,23 +107,30 @@ class Coverage:
     def _repr_html_(self) -> str:
         return build_result_html([repr(self)], self.plot())
 
-    def plot(self, quantity_key: str | None = None, band: str | None = None) -> "Figure":
-        """Plot one layer in one height band in bird's-eye view, in a new figure that pyplot does not manage.
+    def plot(self, quantity_key: str | None = None, band: str | None = None, ax: "Axes | None" = None) -> "Figure":
+        """Plot one layer in one height band in bird's-eye view (`torchcover.coverage.plotting.plot_layer`).
 
         Args:
-            quantity_key: Key of `layers`; by default the detection at the first threshold.
+            quantity_key: Key of `layers`; by default the detection at the first threshold, or the radius without
+                thresholds, by area if the result is.
             band: Name of the height band; by default the first.
+            ax: Axes to plot on; by default those of a new figure that pyplot does not manage.
 
         Raises:
             ValueError: The layer or the band does not exist.
         """
-        from matplotlib.figure import Figure
+        if quantity_key is None:
+            quantity = self.quantities[min(1, len(self.thresholds_m))]
+            quantity_key = (quantity if self.average == "cells" else make_area_quantity(quantity)).key
+        if quantity_key not in self.layers:
+            raise ValueError(f"layer: one of {', '.join(self.layers)} is needed; got {quantity_key!r}")
+        band = next(iter(self.grid.heights)) if band is None else band
+        if ax is None:
+            from matplotlib.figure import Figure
 
-        from torchcover.coverage.plotting import plot_coverage
-
-        figure = Figure(figsize=(9.0, 4.5), layout="constrained")
-        plot_coverage(self, figure.subplots(), quantity_key, band)
-        return figure
+            ax = Figure(figsize=(9.0, 4.5), layout="constrained").subplots()
+        plot_layer(ax, self.layers[quantity_key], self.grid, band, self.counts["num_frames"])
+        return ax.figure  # type: ignore[return-value]  # the figure around a subfigure is not needed
 
     def to_dataframe(self, regions: Sequence[Region] | None = None) -> "pandas.DataFrame":
         """Convert the numbers of `scalars` to a table with one row per region and height band or test target.
@@ -231,36 +232,104 @@ class Coverage:
             ValueError: A region reaches beyond the grid, or contains no cell center.
         """
         region_bands = list_region_bands(self.regions if regions is None else regions, self.grid)
-        return [summarize_region(self, region, band) for region, band in region_bands]
+        return [self._summarize_region(region, band) for region, band in region_bands]
 
     @property
     def average(self) -> Average:
         """Average of the numbers: "area" for means over the visible surface, else "cells"."""
         return "cells" if self.area_sums is None else "area"
 
-    def estimate(self, region: Region, band: str, average: Average | None = None) -> Estimate:
+    def _summarize_region(self, region: Region, band: str) -> RegionSummary:
+        """Compute the numbers of one region in one height band."""
+        observed_cells = int(self.mask_observed_cells(region, band).sum())
+        is_by_area, num_frames = self.average == "area", self.counts["num_frames"]
+        redundancy = None  # by area it is known only for the regions that the metric summed
+        if self.redundancy is not None and (not is_by_area or region in self.regions):
+            estimate = self.estimate_redundancy(region, band)
+            redundancy = summarize_redundancy(self.redundancy.sensor_names, self.thresholds_m, estimate)
+        visible_m2 = math.nan
+        if is_by_area and num_frames:
+            visible_m2 = float(self._sum_area_by_block(region, band)[1][:, 0].sum()) / num_frames
+        estimates = self.estimate(region, band), self.estimate_aggregated(region, band), self.paper_mean(region, band)
+        numbers, aggregated_numbers, cell_averages = convert_to_cell_numbers(estimates, observed_cells)
+        return RegionSummary(
+            region=region.name,
+            band=band,
+            num_cells=int(self.get_cell_mask(region).sum()),
+            observed_cells=observed_cells,
+            average=self.average,
+            numbers=numbers | aggregated_numbers,
+            cell_averages=cell_averages,
+            visible_m2=visible_m2,
+            redundancy=redundancy,
+        )
+
+    def estimate(self, region: Region, band: str) -> Estimate:
         """Estimate the numbers of one region in one band, with jackknife values for errors of differences.
+
+        By area, the mean R = E[ sum of r dA ] / E[ sum of dA ] of a quantity r is a ratio of additive sums: it does not
+        depend on the number of points, the cell size or the share of observed cells.
 
         Args:
             region: Region within the grid.
             band: Name of the height band.
-            average: "area" for the mean over the visible surface (`torchcover.coverage.averages.sum_area_by_block`), or
-                "cells" for the unweighted mean of the paper over observed cells; by default that of this result.
+
+        Returns:
+            Estimate of `quantities`: the mean over the visible surface, or `paper_mean` without area weights.
+
+        Raises:
+            ValueError: The region reaches beyond the grid or contains no cell center, the band does not exist; or by
+                area, the metric did not sum the region, and its bounds are not cell edges.
+        """
+        if self.average == "cells":
+            return self.paper_mean(region, band)
+        check_regions([region], self.grid)
+        frame_counts, sums = self._sum_area_by_block(region, band)
+        return Estimate.from_ratios(self.quantities, sums[:, 0], sums[:, 1:], frame_counts)
+
+    def paper_mean(self, region: Region, band: str) -> Estimate:
+        """Estimate the unweighted mean over the observed cells of a region in one band (Uecker & Zöllner 2024).
+
+        It depends on the number of reference points: results of different numbers cannot be compared.
+
+        Args:
+            region: Region within the grid.
+            band: Name of the height band.
 
         Returns:
             Estimate of `quantities`.
 
         Raises:
-            ValueError: The region reaches beyond the grid or contains no cell center, the band does not exist, or the
-                average is "area" without area weights, or for a region that the metric did not sum and whose bounds
-                are not cell edges.
+            ValueError: The region reaches beyond the grid or contains no cell center, or the band does not exist.
         """
-        key = region, band, average or self.average
-        if key not in self._estimates:
+        key = region, band
+        if key not in self._paper_means:
             check_regions([region], self.grid)
-            estimate_average = estimate_area_average if key[2] == "area" else estimate_cell_average
-            self._estimates[key] = estimate_average(self, region, band)
-        return self._estimates[key]
+            values = torch.stack([self.sparse_layers[quantity.key].values for quantity in self.quantities])
+            cell_mask, band_index = self.get_cell_mask(region), self.grid.get_band_index(band)
+            self._paper_means[key] = estimate_cell_average(
+                self.quantities, self.observed_cells, values, self.block_sums, cell_mask, band_index
+            )
+        return self._paper_means[key]
+
+    def _sum_area_by_block(self, region: Region, band: str) -> tuple[Tensor, Tensor]:
+        """Return (B,) frames per block and (B, 1 + Q) sums over the visible surface: area in m2, area times values.
+
+        Either the metric assigned the points to the region by their position, or its bounds are cell edges, so that its
+        cells contain the same points.
+        """
+        assert self.area_sums is not None
+        index, region_sums = self.find_region_band(region, band), self.region_sums
+        if region_sums is not None and index is not None:
+            sums = region_sums.sums[:, : len(self.quantities), index]
+            return region_sums.frame_counts, torch.cat([region_sums.areas_m2[:, index, None], sums], dim=1)
+        if not region.has_whole_cells(self.grid):
+            raise ValueError(
+                f"region {region.name!r}: its points were not summed, and its bounds are not edges of the cells of "
+                f"{self.grid.cell_m:g} m; give the region to the metric, or move its bounds to cell edges"
+            )
+        sums = self.area_sums.sum_cells(self.get_cell_mask(region), self.grid.get_band_index(band))
+        return self.area_sums.frame_counts, sums
 
     def estimate_aggregated(self, region: Region, band: str) -> Estimate:
         """Estimate the numbers of other aggregations than the mean of means in one region and band.
@@ -274,57 +343,31 @@ class Coverage:
         """
         if self.aggregated_numbers is None:
             return self.estimate(region, band)[:0]
-        quantities, values, jackknife_values = self.aggregated_numbers
-        index = self.find_region_band(region, band)
-        if index is None:
-            return Estimate.from_values(quantities, torch.full_like(values[0], math.nan))
-        if self.block_sums is None:
-            return Estimate.from_values(quantities, values[index])
-        used = self.block_sums.frame_counts > 0
-        return Estimate(quantities, values[index], jackknife_values[used, index], self.block_sums.frame_counts[used])
+        frame_counts = None if self.block_sums is None else self.block_sums.frame_counts
+        return self.aggregated_numbers.estimate(self.find_region_band(region, band), frame_counts)
 
-    def estimate_number(self, quantity_key: str, region: Region, band: str) -> Estimate:
-        """Estimate a single number by its column name in `summary.csv`.
+    def estimate_redundancy(self, region: Region, band: str) -> Estimate:
+        """Estimate the numbers of a region with all sensors, followed by its redundancy (`list_redundancy_quantities`).
 
         Args:
-            quantity_key: "radius_m" or "detection_0.4m"; "cells_detection_0.4m" over observed cells in a result by
-                area; "radius_maximum_m" of an aggregation; "radius_m_without_roof" and "detected_by_two_0.4m" of
-                redundancy.
             region: Region within the grid.
             band: Name of the height band.
 
-        Raises:
-            ValueError: The number does not exist, or as in `estimate`.
+        Returns:
+            By area, numbers are NaN for regions that the metric did not sum. Over cells, numbers have no errors.
         """
-        for quantities, estimate in self._estimators.items():
-            for index, quantity in enumerate(quantities):
-                if quantity.key == quantity_key:
-                    return replace(estimate(region, band)[index : index + 1], quantities=(quantity,))
-        available = [quantity.key for quantity in self.all_quantities]
-        suggestions = get_close_matches(quantity_key, available, n=1) or available
-        raise ValueError(f"{quantity_key}: the result has no such number; it has {', '.join(suggestions)}")
-
-    @property
-    def all_quantities(self) -> tuple[Quantity, ...]:
-        """Quantities of all numbers that `estimate_number` can estimate."""
-        return tuple(quantity for quantities in self._estimators for quantity in quantities)
-
-    @property
-    def _estimators(self) -> dict[tuple[Quantity, ...], Callable[[Region, str], Estimate]]:
-        """Estimators by the quantities that they estimate."""
-        estimators: dict[tuple[Quantity, ...], Callable[[Region, str], Estimate]] = {self.quantities: self.estimate}
-        if self.aggregated_numbers is not None:
-            estimators[self.aggregated_numbers.quantities] = self.estimate_aggregated
+        assert self.redundancy is not None
+        layers = self.redundancy.sparse_layers.values()
+        quantities = (*self.quantities, *(layer.quantity for layer in layers))
+        index = self.find_region_band(region, band)
+        if self.region_sums is not None and index is not None:
+            return self.region_sums.estimate(quantities, index)
         if self.average == "area":
-            cells_quantities = tuple(make_cells_quantity(quantity) for quantity in self.quantities)
-            estimators[cells_quantities] = partial(self.estimate, average="cells")
-        if self.redundancy is not None:
-            quantities = list_redundancy_quantities(self.redundancy.sensor_names, self.thresholds_m)
-            estimators[quantities] = self._estimate_redundancy
-        return estimators
-
-    def _estimate_redundancy(self, region: Region, band: str) -> Estimate:
-        return estimate_redundancy(self, region, band)[len(self.quantities) :]
+            unknown = torch.full((len(quantities),), math.nan, dtype=torch.float64, device="cpu")
+            return Estimate.from_values(quantities, unknown)
+        observed = self.mask_observed_cells(region, band)
+        means = torch.stack([layer.values[observed].mean() for layer in layers])
+        return Estimate.from_values(quantities, torch.cat([self.paper_mean(region, band).value, means]))
 
     def scalars(self, regions: Sequence[Region] | None = None) -> dict[str, float]:
         """Convert the summary to a flat dict for a logger.
@@ -352,7 +395,7 @@ class Coverage:
         Args:
             path: File; it is replaced atomically.
         """
-        write_atomically(Path(path), partial(write_coverage, self))
+        write_atomically(Path(path), partial(write_coverage, vars(self) | {"sparse_errors": self.sparse_errors}))
 
     @classmethod
     def load(cls, path: str | Path) -> "Coverage":
@@ -369,8 +412,7 @@ class Coverage:
         return cls(**read_coverage(path))
 
     def find_region_band(self, region: Region, band: str) -> int | None:
-        """Find the index of a pair of region and band as `RegionBands.find_index`; ValueError without such a band."""
-        self.get_band_index(band)
+        """Find the index of a pair of region and band as `RegionBands.find_index`."""
         return RegionBands(self.regions, self.grid).find_index(region, band)
 
     def get_cell_mask(self, region: Region) -> Tensor:
@@ -379,13 +421,7 @@ class Coverage:
 
     def mask_observed_cells(self, region: Region, band: str) -> Tensor:
         """Return a (K,) bool mask of the observed cells of a region in a band."""
-        return self.observed_cells.mask_cells(self.get_cell_mask(region), self.get_band_index(band))
-
-    def get_band_index(self, band: str) -> int:
-        """Return the index of a height band; ValueError if it does not exist."""
-        if band not in self.grid.heights:
-            raise ValueError(f"height {band!r}: the grid has {', '.join(self.grid.heights)}")
-        return list(self.grid.heights).index(band)
+        return self.observed_cells.mask_cells(self.get_cell_mask(region), self.grid.get_band_index(band))
 
 
 # Allows `torch.load` with weights_only=True, its default.

@@ -3,17 +3,12 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 from torchcover.coverage.aggregations import MeanOfMeans
-from torchcover.coverage.averages import Average, estimate_redundancy, sum_area_by_block
+from torchcover.coverage.averages import Average
 from torchcover.coverage.quantities import make_failure_quantity
 from torchcover.coverage.redundancy import list_redundancy_quantities
-from torchcover.coverage.regions import Region
 from torchcover.estimation import Difference, Estimate, Number
-
-if TYPE_CHECKING:
-    from torchcover.coverage.result import Coverage
 
 
 @dataclass(frozen=True)
@@ -97,42 +92,6 @@ class RegionSummary:
         return values
 
 
-def summarize_region(coverage: "Coverage", region: Region, band: str) -> RegionSummary:
-    """Compute the numbers of one region in one height band.
-
-    Args:
-        coverage: Result of a metric.
-        region: Region within the grid.
-        band: Name of the height band.
-    """
-    observed_cells = int(coverage.mask_observed_cells(region, band).sum())
-    is_by_area, num_frames = coverage.average == "area", coverage.counts["num_frames"]
-    redundancy = None  # by area it is known only for the regions that the metric summed
-    if coverage.redundancy is not None and (not is_by_area or region in coverage.regions):
-        estimate = estimate_redundancy(coverage, region, band)
-        redundancy = summarize_redundancy(coverage.redundancy.sensor_names, coverage.thresholds_m, estimate)
-    visible_m2 = math.nan
-    if is_by_area and num_frames:
-        visible_m2 = float(sum_area_by_block(coverage, region, band)[1][:, 0].sum()) / num_frames
-    estimates = (
-        coverage.estimate(region, band),
-        coverage.estimate_aggregated(region, band),
-        coverage.estimate(region, band, "cells"),
-    )
-    numbers, aggregated_numbers, cell_averages = convert_to_cell_numbers(estimates, observed_cells)
-    return RegionSummary(
-        region=region.name,
-        band=band,
-        num_cells=int(coverage.get_cell_mask(region).sum()),
-        observed_cells=observed_cells,
-        average=coverage.average,
-        numbers=numbers | aggregated_numbers,
-        cell_averages=cell_averages,
-        visible_m2=visible_m2,
-        redundancy=redundancy,
-    )
-
-
 def convert_to_cell_numbers(estimates: Sequence[Estimate], observed_cells: int) -> list[dict[str, Number]]:
     """Convert estimates of a region to numbers that name the count of observed cells.
 
@@ -151,7 +110,7 @@ def summarize_redundancy(
     Args:
         sensor_names: Names of the sensors.
         thresholds_m: Detection thresholds in meters.
-        estimate: Result of `estimate_redundancy`.
+        estimate: Result of `Coverage.estimate_redundancy`.
     """
     rig_quantities = MeanOfMeans(tuple(thresholds_m)).quantities
     count_quantities = list_redundancy_quantities((), thresholds_m)

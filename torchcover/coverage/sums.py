@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from torchcover.coverage.aggregations import Aggregation, AreaAverage, MeanOfMeans
-from torchcover.coverage.averages import Average
 from torchcover.coverage.frame_input import (
     Clouds,
     FrameInput,
@@ -356,20 +355,19 @@ class CoverageSums(BlockedSums):
         values = torch.cat([sums[name]["sums"] for name in names]).movedim(0, 1)
         return RegionSums(self.fine_block_frame_counts.clone(), sums[AreaAverage.name]["m2"], values)
 
-    def estimate_regions(self, region_bands: Sequence[tuple[Region, str]], average: Average) -> list[Estimate]:
+    def estimate_regions(self, region_bands: Sequence[tuple[Region, str]]) -> list[Estimate]:
         """Compute the numbers of regions over all added frames as `compute().estimate`, without computing maps.
 
         Args:
             region_bands: Regions within the grid, each with the name of a band.
-            average: "area" or "cells", as in `Coverage.estimate`.
 
         Raises:
             ValueError: As in `Coverage.estimate`.
         """
         sums = self._build_region_sums()
         indices = [self._region_bands.find_index(region, band) for region, band in region_bands]
-        if average == "area" and sums and None not in indices:
+        if sums and None not in indices:
             quantities = MeanOfMeans(self.thresholds_m).quantities
             return [sums.estimate(quantities, index) for index in indices if index is not None]
         coverage = self.compute()
-        return [coverage.estimate(region, band, average) for region, band in region_bands]
+        return [coverage.estimate(region, band) for region, band in region_bands]

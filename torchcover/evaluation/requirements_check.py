@@ -8,6 +8,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from torchcover.coverage import AGGREGATIONS, Coverage
+from torchcover.coverage.number import estimate_number
 from torchcover.encounters import StagedEncounter
 from torchcover.evaluation.check_result import CheckResult
 from torchcover.evaluation.encounter_evaluation import evaluate_encounters
@@ -201,7 +202,7 @@ def _read_region(requirement: RegionRequirement, coverage: Coverage, rig: Rig) -
     failing_sensors = requirement.find_failing_sensors(rig.sensor_names)
     rows, locations = [], []
     for suffix in ("", *(f"_without_{name}" for name in failing_sensors)):
-        estimate = coverage.estimate_number(requirement.number + suffix, region, requirement.band)
+        estimate = estimate_number(coverage, requirement.number + suffix, region, requirement.band)
         (number,) = estimate.to_numbers().values()
         # An error of NaN despite enough blocks means that all blocks have the same value: it is exact.
         is_exact = np.isnan(number.error) and estimate.has_intervals[0]

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchcover.coverage import AGGREGATIONS, Aggregation, Average, BevGrid, CoverageSums, MeanOfMeans, Region
 from torchcover.coverage.grid import PAPER_HEIGHTS
+from torchcover.coverage.number import estimate_number, list_number_keys
 from torchcover.coverage.quantities import RADIUS, make_detection_quantity, make_failure_quantity
 from torchcover.estimation import Estimate
 from torchcover.evaluation import CoverageObserver
@@ -140,7 +141,7 @@ class Queries(NamedTuple):
         queries = self._replace(thresholds_m=self.thresholds_m or (DEFAULT_THRESHOLD_M,))
         with warnings.catch_warnings(action="ignore"):  # the observer has no frames
             coverage = queries.build_observer(rig, "area").compute()
-        keys = [quantity.key for quantity in coverage.all_quantities]
+        keys = list_number_keys(coverage)
         quantities = (RADIUS, *(make_detection_quantity(threshold_m) for threshold_m in queries.thresholds_m))
         keys += [quantity.key for quantity in quantities]
         keys += [make_failure_quantity(ANY, quantity).key for quantity in quantities]
@@ -215,30 +216,30 @@ class Queries(NamedTuple):
         if metric.has_area_weights and all(objective.key in mean_keys for objective in self.objectives.values()):
             region_bands = self._list_region_bands()
             pairs = [(self.regions[region], band) for region, band in region_bands]
-            area_estimates = dict(zip(region_bands, metric.estimate_regions(pairs, "area"), strict=True))
+            area_estimates = dict(zip(region_bands, metric.estimate_regions(pairs), strict=True))
 
-            def estimate_number(key: str, region: str, band: str) -> Estimate:
+            def estimate_key(key: str, region: str, band: str) -> Estimate:
                 estimates = area_estimates[region, band]
                 index = [quantity.key for quantity in estimates.quantities].index(key)
                 return estimates[index : index + 1]
         else:
             coverage = metric.compute()
 
-            def estimate_number(key: str, region: str, band: str) -> Estimate:
+            def estimate_key(key: str, region: str, band: str) -> Estimate:
                 key = key if metric.has_area_weights else key.removeprefix("cells_")
-                return coverage.estimate_number(key, self.regions[region], band)
+                return estimate_number(coverage, key, self.regions[region], band)
 
         def estimate_part(key: str, region: str, band: str) -> Estimate:
             """Estimate a number in one region and band; the failure of any sensor is the worst of all failures."""
             failure = FAILURE_KEY.match(key)
             number, sensor = failure.groups() if failure else (key, "")
             if sensor == ANY:
-                failures = [estimate_number(f"{number}_without_{name}", region, band) for name in metric.sensor_names]
+                failures = [estimate_key(f"{number}_without_{name}", region, band) for name in metric.sensor_names]
                 worst = _select_worst(failures)
                 title = worst.quantities[0].title.removesuffix(metric.sensor_names[0]) + "any one sensor"
                 return replace(worst, quantities=(worst.quantities[0]._replace(title=title),))
             # A sensor that the rig does not have cannot fail.
-            return estimate_number(key if sensor in ("", *metric.sensor_names) else number, region, band)
+            return estimate_key(key if sensor in ("", *metric.sensor_names) else number, region, band)
 
         parts = {}
         for name, objective in self.objectives.items():
