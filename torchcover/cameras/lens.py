@@ -1,4 +1,4 @@
-"""Lens models: charts of directions and distortions of these charts; fisheye lenses are in `fisheye`.
+"""Lens models: charts of directions and distortions of these charts; unified and fisheye lenses are in `models`.
 
 A *chart* maps a direction (x, y, z) to a plane (`a`, `b`); the *distortion* moves that point to the normalized image
 (`u`, `v`); focal lengths and principal point convert it to pixels. Every model is such a pair, so that the inverse of a

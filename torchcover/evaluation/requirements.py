@@ -242,7 +242,7 @@ class RegionRequirement(_Requirement):
         """Raise ValueError for an unknown number, or a bound in the wrong direction or out of range."""
         threshold_m = self.threshold_m or THRESHOLD_M
         main_quantities = RADIUS, make_detection_quantity(threshold_m)
-        quantities = {quantity.key: quantity for quantity in self._list_quantities(threshold_m)}
+        quantities = {quantity.key: quantity for quantity in self._list_quantities(main_quantities, threshold_m)}
         _check_names("number of a region", [self.number], quantities)
         quantity = quantities[self.number]
         better, right, wrong = ("more", "min_value", "max_value")
@@ -260,9 +260,8 @@ class RegionRequirement(_Requirement):
             )
         return self
 
-    def _list_quantities(self, threshold_m: float) -> list[Quantity]:
+    def _list_quantities(self, main_quantities: Sequence[Quantity], threshold_m: float) -> list[Quantity]:
         """List all quantities of a region at a threshold."""
-        main_quantities = [RADIUS, make_detection_quantity(threshold_m)]
         quantities = [
             *main_quantities,
             *(make_cells_quantity(quantity) for quantity in main_quantities),

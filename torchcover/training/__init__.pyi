@@ -1,9 +1,9 @@
+from .batches import convert_batch_dict as convert_batch_dict
+from .batches import convert_data_batch as convert_data_batch
 from .counting import FrameDeduplicator as FrameDeduplicator
 from .counting import find_shard as find_shard
 from .figures import log_maps as log_maps
 from .figures import log_result as log_result
 from .lightning import CoverageCallback as CoverageCallback
-from .mmdetection3d import convert_data_batch as convert_data_batch
 from .mmengine import MMEngineCoverage as MMEngineCoverage
 from .mmengine import PackWithReference as PackWithReference
-from .openpcdet import convert_batch_dict as convert_batch_dict

@@ -15,9 +15,8 @@ from mmengine.dist import get_comm_device, get_dist_info
 
 from torchcover.coverage import BevGrid, Coverage, CoverageMetric, Region
 from torchcover.frames import Frame
-from torchcover.training.batches import UNKNOWN_INDEX, extract_frames
+from torchcover.training.batches import UNKNOWN_INDEX, convert_data_batch, extract_frames
 from torchcover.training.counting import FrameDeduplicator, Shard
-from torchcover.training.mmdetection3d import convert_data_batch
 
 
 @TRANSFORMS.register_module()

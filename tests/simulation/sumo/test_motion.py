@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import shapely
 
-from torchcover.simulation.sumo.collisions import drop_colliding_users
+from torchcover.simulation.sumo.crowd import drop_colliding_users
 from torchcover.simulation.sumo.floating import SumoTrack
 from torchcover.simulation.sumo.ground import Sidewalks, build_ground
 from torchcover.simulation.sumo.motion import PARAMS, RoadUser, compute_motions

@@ -14,8 +14,7 @@ from torchcover.files import BadFileError
 from torchcover.geometry.arrays import Bools, Float64
 from torchcover.recordings.unsupported_formats import find_remedy
 from torchcover.simulation.documents import RelativePath
-from torchcover.simulation.sumo.collisions import drop_colliding_users
-from torchcover.simulation.sumo.crowd import read_vehicle_types, select_road_users
+from torchcover.simulation.sumo.crowd import drop_colliding_users, read_vehicle_types, select_road_users
 from torchcover.simulation.sumo.floating import (
     FloatingCarData,
     TimeWindow,
