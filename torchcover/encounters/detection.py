@@ -97,10 +97,8 @@ class MountedRig:
             sensors = []
             for sensor in self.rig.sensors:
                 # Without the durations of scans, all rays of a scan are cast at the same time.
-                if getattr(sensor, "scan", None) is None:
-                    sensors.append(sensor)
-                else:
-                    sensors.append(sensor.model_copy(update={"scan": None}))  # type: ignore[attr-defined]
+                has_scan = getattr(sensor, "scan", None) is not None
+                sensors.append(sensor.model_copy(update={"scan": None}) if has_scan else sensor)  # type: ignore[attr-defined]
             rig = self.rig.model_copy(update={"sensors": sensors, "weather": weather})
             self._sensors_by_weather[key] = mount_sensors(scene, self._scenario, self.rig.name, rig)
         return self._sensors_by_weather[key]
