@@ -188,15 +188,14 @@ def test_sidewalks_leave_no_narrow_gaps(seed, built_share):
     generator, shapes = np.random.default_rng(seed), np.random.default_rng(seed)
     seen_m, span_m = (-120.0, 700.0), (-440.0, 1020.0)
     streets = sample_street_plan(CrossSection(2), 25.0, 0.5, span_m, 1200.0, generator, shapes)
-    settings = UrbanTraffic(parked_share=0.0, built_share=built_share, roadside_density=0.0)
+    densities = built_share, 0.0, 0.0  # houses, parked cars and roadside objects
     territory, level, fleet = (
         StreetCorridor(streets.main_alignment, span_m),
         Hills(0.0, shapes),
         Fleet(load_bodies(), None, generator),
     )
-    _, pavement, *_ = CityBuilder(streets, territory, level, fleet, settings, generator, shapes).build_static_scenery(
-        seen_m
-    )[0]
+    city = CityBuilder(streets, territory, level, fleet, *densities, generator, shapes)
+    _, pavement, *_ = city.build_static_scenery(seen_m)[0]
     triangles_m = pavement.vertices_m[pavement.faces]
     up = np.cross(triangles_m[:, 1] - triangles_m[:, 0], triangles_m[:, 2] - triangles_m[:, 0])[:, 2] > 1e-6
     paved = shapely.union_all(shapely.polygons(triangles_m[up][..., :2])).buffer(0.02)
