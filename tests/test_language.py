@@ -14,18 +14,17 @@ import pytest
 ROOT = Path(__file__).parents[1]
 MAX_TEST_NAME_WORDS = 8
 LIMITS = {
-    "functions that begin with a verb (%)": (">=", 0.0),
-    "names that name nothing (%)": ("<=", 100.0),
-    "names with a word that the glossary replaces (%)": ("<=", 100.0),
-    "texts that open with a riddle (%)": ("<=", 100.0),
-    "texts with a phrase that no engineer writes (%)": ("<=", 100.0),
-    "constants per 1,000 code lines": ("<=", 100.0),
-    "constants assigned in tuples": ("<=", 1000.0),
-    "comprehensions, lambdas, map, filter per 1,000 code lines": ("<=", 100.0),
-    "public functions that document their parameters (%)": (">=", 0.0),
-    "docstrings and comments per 1,000 code lines": (">=", 0.0),
+    "functions that begin with a verb (%)": (">=", 95.0),
+    "names that name nothing (%)": ("<=", 0.2),
+    "names with a word that the glossary replaces (%)": ("<=", 0.05),
+    "texts that open with a riddle (%)": ("<=", 0.3),
+    "texts with a phrase that no engineer writes (%)": ("<=", 0.4),
+    "constants per 1,000 code lines": ("<=", 10.5),
+    "constants assigned in tuples": ("<=", 0.0),
+    "comprehensions, lambdas, map, filter per 1,000 code lines": ("<=", 48.0),
+    "public functions that document their parameters (%)": (">=", 83.0),
+    "docstrings and comments per 1,000 code lines": (">=", 129.0),
 }
-MAX_LONG_TEST_NAMES = 10_000
 
 # First words of functions, names that name nothing, and words that the glossary replaces.
 VERBS, VAGUE_NAMES, REPLACED_WORDS = (
@@ -179,7 +178,7 @@ def test_figure_is_within_its_limit(values, name):
 
 def test_names_of_tests_are_short():
     long_names = find_long_test_names(ROOT / "tests")
-    assert len(long_names) <= MAX_LONG_TEST_NAMES, "\n".join(long_names)
+    assert not long_names, "\n".join(long_names)
 
 
 def test_figures_of_a_small_package(tmp_path):

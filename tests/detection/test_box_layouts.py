@@ -13,7 +13,7 @@ from torchcover.geometry import build_transform, convert_euler_to_rotation
 RANDOM = np.random.default_rng(11)
 
 
-def test_upright_boxes_keep_their_places_and_headings_in_another_frame():
+def test_upright_boxes_keep_centers_and_headings_when_transformed():
     center_m, size_m = RANDOM.normal(size=(6, 3)), RANDOM.uniform(1.0, 5.0, (6, 3))
     yaw = RANDOM.uniform(-3.0, 3.0, 6)
     heading = np.stack([np.cos(yaw), np.sin(yaw), np.zeros(6)], axis=1)
@@ -27,7 +27,7 @@ def test_upright_boxes_keep_their_places_and_headings_in_another_frame():
     assert np.cos(turned[:, 6] - yaw - np.pi / 2) == pytest.approx(1.0)
 
 
-def test_numbers_of_few_bits_turn_into_a_heading_as_exact_as_they_are():
+def test_headings_keep_the_precision_of_short_numbers():
     heading = np.array([[0.6, 0.8, 0.0]], dtype=np.float16)
     (row,) = build_upright_rows(np.ones((1, 3), np.float16), np.ones((1, 3), np.float16), heading, None)
     assert row[6].item() == pytest.approx(math.atan2(*map(float, heading[0, 1::-1])), abs=1e-6)
@@ -51,7 +51,7 @@ def test_what_is_no_list_of_boxes_is_refused(at, value, message):
         build_upright_rows(*given, None)
 
 
-def test_a_label_of_kitti_is_a_box_that_stands_on_its_bottom():
+def test_kitti_labels_give_the_bottom_center():
     # Height 1.5, width 1.8, length 4.2; bottom at x right 2, y down 1.6, z ahead 20; turned to the camera's right.
     label = [0.0, 0.0, 0.0, 0, 0, 10, 10, 1.5, 1.8, 4.2, 2.0, 1.6, 20.0, 0.0]
     axes = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
@@ -64,7 +64,7 @@ def test_a_label_of_kitti_is_a_box_that_stands_on_its_bottom():
     assert torch.equal(Boxes.from_rows(row[None]).rows[0], row)
 
 
-def test_levels_of_occlusion_in_labels_of_kitti_are_shares_that_are_seen():
+def test_kitti_occlusion_levels_become_visible_shares():
     labels = np.ones((5, 14))
     labels[:, 1] = 0, 1, 2, 3, -1  # fully visible, partly and largely occluded, unknown
     visibility = Boxes.from_kitti_label(labels).visibility

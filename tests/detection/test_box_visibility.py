@@ -62,7 +62,7 @@ def test_weights_that_are_all_equal_change_nothing():
     torch.testing.assert_close(plain.share, weighted.share, equal_nan=True)
 
 
-def test_a_box_that_only_the_rig_saw_is_known_by_the_sides_that_face_the_vehicle():
+def test_rig_points_alone_judge_sides_facing_the_vehicle():
     # Ahead, to the left and turned, low enough to be seen from above; and one that nobody saw.
     rows = [
         [10.0, 0, 1, 4, 2, 2, 0],
@@ -89,7 +89,7 @@ def test_a_box_that_only_the_rig_saw_is_known_by_the_sides_that_face_the_vehicle
 
 
 @pytest.mark.parametrize("turn_rad", [0.3, 1.2, 2.5, -0.7])
-def test_of_a_box_that_only_the_rig_saw_as_much_is_seen_wherever_it_stands_around_the_vehicle(turn_rad):
+def test_rig_points_alone_give_equal_shares_all_around(turn_rad):
     """In the middles of both of its sides that face the vehicle, and beside it at the same distance elsewhere."""
     row, sides = [12.0, 3.0, 1.0, 4.0, 2.0, 2.0, 0.4], torch.tensor([[-2.0, 0.0, 0.0], [0.0, 1.0, 0.0]]).double()
 
@@ -109,7 +109,7 @@ def test_of_a_box_that_only_the_rig_saw_as_much_is_seen_wherever_it_stands_aroun
     assert found[1].mean_radius_m.item() == pytest.approx(found[0].mean_radius_m.item(), rel=1e-6)
 
 
-def test_the_nearest_sensor_point_may_lie_outside_the_box():
+def test_nearest_sensor_point_may_lie_outside_the_box():
     """At 0.3 m in front of the box, below the threshold: seen, although no point of the rig is in the box."""
     seen = unweighted(torch.tensor([[7.7, 0.0, 1.0]]), torch.tensor([[8.0, 0.0, 1.0]]), TWO)
     assert seen.share[0] == 1.0
@@ -118,7 +118,7 @@ def test_the_nearest_sensor_point_may_lie_outside_the_box():
 
 
 @pytest.mark.parametrize("threshold", [0.5, 0.0])
-def test_a_radius_of_exactly_the_threshold_counts_as_seen(threshold):
+def test_radius_equal_to_the_threshold_counts_as_visible(threshold):
     sensor = torch.tensor([[8.0 + threshold, 0.0, 1.0]])
     assert unweighted(sensor, torch.tensor([[8.0, 0.0, 1.0]]), TWO, threshold_m=threshold).share[0] == 1.0
 
@@ -135,7 +135,7 @@ def test_no_boxes_give_an_empty_answer():
     assert seen.share.dtype == torch.float64
 
 
-def test_a_box_that_points_were_drawn_on_and_none_seen_is_hidden_and_one_without_is_not_sampled():
+def test_sampled_boxes_without_visible_points_are_hidden():
     boxes = Boxes.from_rows(TWO.rows.repeat(2, 1), sampled_points=torch.tensor([0, 7, 9, 0]))
     seen = unweighted(torch.rand(5, 3), torch.tensor([[10.0, 0.0, 1.0]]), boxes)
     assert seen.observed.tolist() == [True, False, True, False]
@@ -157,17 +157,17 @@ def test_selecting_keeps_the_columns_together():
     assert one.reference_points.tolist() == [1]
 
 
-def test_a_frame_in_which_nobody_looked_for_objects_is_an_error_that_says_what_to_do():
+def test_frames_without_boxes_raise_with_a_remedy():
     with pytest.raises(TypeError, match=r"boxes: Boxes are needed, .* got NoneType; SimulatedFrames\(.*boxes=True"):
         unweighted(torch.rand(5, 3), torch.rand(5, 3), None)
 
 
-def test_a_frame_without_a_reference_is_an_error_that_says_what_to_do():
+def test_frames_without_reference_raise_with_a_remedy():
     with pytest.raises(ValueError, match="reference: the frame has none, and visibility is measured against it; use"):
         unweighted(torch.rand(5, 3), None, TWO)
 
 
-def test_without_a_point_in_it_a_box_is_unknown_and_so_is_one_that_the_vehicle_stands_in():
+def test_boxes_without_points_or_around_vehicles_are_unknown():
     around = Boxes.from_rows(torch.cat([TWO.rows, torch.tensor([[0.0, 0.0, 1.0, 4.0, 4.0, 4.0, 0.0]])]))
     seen = unweighted(torch.tensor([[0.5, 0.5, 1.0]]), torch.empty(0, 3), around)
     assert seen.share.isnan().all()
@@ -193,7 +193,7 @@ def test_bad_input_is_refused(changes, message):
         measure_box_visibility(**{**good, **changes})
 
 
-def test_in_a_simulated_frame_what_lies_behind_the_rig_is_blind_and_what_is_seen_holds_points():
+def test_simulated_boxes_behind_the_rig_are_hidden():
     # Level, it sees all around.
     reference = PaperReference(rows=512, columns=512, max_tilt_deg=0.0)
     frame = SimulatedFrames("highway", "front_roof_128", num_frames=1, seed=1, reference_sensor=reference, boxes=True)[

@@ -52,7 +52,7 @@ def test_points_in_boxes_are_those_of_the_definition(seed):
 
 
 @pytest.mark.parametrize("far_m", [30.0, 3e4, 1e30])
-def test_boxes_may_be_far_apart_and_of_any_size(far_m):
+def test_boxes_have_any_distance_and_size(far_m):
     """More cells than there may be, of which some boxes fill many; points beyond all, and none at all."""
     generator = torch.Generator().manual_seed(5)
     rows = random_boxes(12, generator, reach=6.0).rows.double()
@@ -69,7 +69,7 @@ def test_boxes_may_be_far_apart_and_of_any_size(far_m):
     assert torch.equal(points.nan_to_num(), given.nan_to_num())
 
 
-def test_sides_and_top_are_closed_and_the_ground_below_is_outside():
+def test_sides_and_top_are_closed_bottom_is_open():
     box = Boxes.from_rows(torch.tensor([[10.0, -3.0, 1.0, 4.0, 2.0, 2.0, 0.0]]))
     in_it = [
         [12.0, -3.0, 1.0],
@@ -84,7 +84,7 @@ def test_sides_and_top_are_closed_and_the_ground_below_is_outside():
     assert inside.point_indices.sort().values.tolist() == list(range(len(in_it)))
 
 
-def test_every_point_of_a_turned_box_s_surface_is_in_it_although_coordinates_are_rounded():
+def test_surface_points_of_rotated_boxes_are_inside():
     generator = np.random.default_rng(3)
     rows = torch.tensor([[180.0, -140.0, 0.9, 12.0, 2.5, 1.8, 0.7]])
     on_face = generator.uniform(-0.5, 0.5, (500, 3))
@@ -96,7 +96,7 @@ def test_every_point_of_a_turned_box_s_surface_is_in_it_although_coordinates_are
     assert len(find_points_in_boxes(torch.from_numpy(points).float(), Boxes.from_rows(rows)).point_indices) == 500
 
 
-def test_a_point_may_lie_in_two_boxes_and_nothing_in_none():
+def test_a_point_may_lie_in_two_boxes():
     twice = Boxes.from_rows(torch.tensor([[0.0, 0, 1, 2, 2, 2, 0]] * 2))
     assert find_points_in_boxes(torch.tensor([[0.0, 0.0, 1.0]]), twice).box_indices.tolist() == [0, 1]
     assert len(find_points_in_boxes(torch.rand(9, 3), NONE).box_indices) == 0
@@ -110,7 +110,7 @@ def test_other_types_of_clouds_are_compared_exactly(dtype):
     assert set(find_points_in_boxes(points, boxes).point_indices.tolist()) == {p for _, p in slow_inside(points, boxes)}
 
 
-def test_membership_does_not_change_when_everything_is_moved_together():
+def test_membership_is_invariant_to_rigid_transforms():
     generator = torch.Generator().manual_seed(9)
     boxes, points = random_boxes(8, generator, 5.0), torch.rand(400, 3, generator=generator).double() * 12 - 6
     shift = torch.tensor([31.0, -17.0, 2.0], dtype=torch.float64)
@@ -159,7 +159,7 @@ def test_rows_of_another_width_are_refused():
         Boxes.from_rows(torch.zeros(2, 9))
 
 
-def test_a_yaw_in_degrees_is_warned_about_once_at_a_place():
+def test_yaw_in_degrees_warns_once_per_line():
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("default")
         for _ in range(3):
@@ -169,7 +169,7 @@ def test_a_yaw_in_degrees_is_warned_about_once_at_a_place():
     rows(yaw_rad=torch.tensor([-2 * math.pi, 2 * math.pi]))  # a full turn is none
 
 
-def test_unknown_velocities_are_nan_unknown_names_empty_and_nothing_was_drawn():
+def test_unknown_velocities_are_nan_and_names_empty():
     made = rows()
     assert made.velocity_mps.isnan().all()
     assert made.ids == made.categories == ("", "")
@@ -222,7 +222,7 @@ def same(a, b):
     )
 
 
-def test_boxes_do_not_depend_on_order_or_workers_and_leave_the_clouds_alone(frames):
+def test_boxes_do_not_depend_on_order_or_workers(frames):
     late_first = frames[6]
     there = [f for b in DataLoader(frames, batch_size=3, num_workers=2, collate_fn=collate_frames) for f in b.frames]
     assert all(same(frames[index].boxes, there[index].boxes) for index in range(8))
@@ -234,7 +234,7 @@ def test_boxes_do_not_depend_on_order_or_workers_and_leave_the_clouds_alone(fram
     assert same(pickle.loads(pickle.dumps(frames))[6].boxes, late_first.boxes)
 
 
-def test_an_object_keeps_its_name_and_moves_as_its_velocity_says(frames):
+def test_objects_keep_names_and_move_with_their_velocity(frames):
     first, second = frames[2].boxes, frames[3].boxes
     world = frames.simulator.get_scene_geometry(0)[0].scene
     poses = [world.ego.trajectory.interpolate(0.5 * step) for step in (2, 3)]
@@ -256,7 +256,7 @@ def test_an_object_keeps_its_name_and_moves_as_its_velocity_says(frames):
     assert any(name.startswith("parked") for name in first.ids)
 
 
-def test_hits_are_the_points_in_the_box_and_no_body_sticks_out_of_its_box(frames):
+def test_hits_on_a_body_lie_in_its_box(frames):
     frame = frames[1]
     inside = find_points_in_boxes(frame.sensor, frame.boxes)
     assert torch.equal(torch.bincount(inside.box_indices, minlength=len(frame.boxes)), frame.boxes.points_in_box["r"])
@@ -269,7 +269,7 @@ def test_hits_are_the_points_in_the_box_and_no_body_sticks_out_of_its_box(frames
     assert len(just_outside) < 0.02 * len(inside.point_indices)
 
 
-def test_a_batch_gives_boxes_in_a_list_padded_and_points_with_their_frame_s_number(frames):
+def test_batches_give_lists_padded_boxes_and_frame_numbers(frames):
     batch = collate_frames([frames[0], frames[5]])
     assert [len(boxes) for boxes in batch.boxes] == [len(frames[0].boxes), len(frames[5].boxes)]
     padded = batch.pad_boxes(["pedestrian", "car"])
@@ -286,7 +286,7 @@ def test_a_batch_gives_boxes_in_a_list_padded_and_points_with_their_frame_s_numb
     assert torch.equal(stacked, batch.stack_points("r"))
 
 
-def test_frames_without_objects_pad_to_nothing_and_frames_without_boxes_say_what_to_do():
+def test_frames_without_objects_pad_without_boxes_raise():
     empty = Frame({"r": torch.zeros(2, 3)}, torch.zeros(2, 3), 0, "night 7", boxes=NONE)
     assert collate_frames([empty, empty]).pad_boxes(["car"]).shape == (2, 0, 8)
     nobody_looked = Frame({"r": torch.zeros(2, 3)}, torch.zeros(2, 3), 0, "night 8")
@@ -296,7 +296,7 @@ def test_frames_without_objects_pad_to_nothing_and_frames_without_boxes_say_what
         _ = collate_frames([empty, nobody_looked]).boxes
 
 
-def test_a_world_without_objects_has_no_boxes_which_is_not_the_same_as_none():
+def test_scenes_without_objects_have_empty_boxes():
     frame = SimulatedFrames("courtyard", "front_roof_32", num_frames=1, reference_sensor=SMALL, boxes=True)[0]
     assert len(frame.boxes) == 0
     assert frame.boxes.points_in_box["front_roof_32"].shape == (0,)
@@ -332,13 +332,13 @@ def test_boxes_move_with_their_frame():
         ),
     ],
 )
-def test_an_array_of_numpy_is_refused_by_its_name(call, name):
+def test_numpy_arrays_are_rejected_by_name(call, name):
     rows = torch.ones(2, 7)
     with pytest.raises(TypeError, match=rf"^{name}: .* got a NumPy array of float32; torch.from_numpy\(array\) makes"):
         call(rows.numpy(), rows, Boxes.from_rows(rows))
 
 
-def test_a_warning_of_degrees_names_the_line_that_made_the_boxes():
+def test_warning_of_degrees_names_the_callers_line():
     numbers = torch.tensor([[4.0, 2.0, 1.5]])
     with pytest.warns(UserWarning, match="beyond a full turn, so it may be in degrees") as told:
         Boxes(numbers, numbers, torch.tensor([90.0]))
@@ -346,7 +346,7 @@ def test_a_warning_of_degrees_names_the_line_that_made_the_boxes():
     Boxes(numbers, numbers, torch.tensor([-2 * math.pi]))
 
 
-def test_boxes_and_what_was_seen_of_them_stay_as_they_are():
+def test_boxes_and_visibility_survive_a_round_trip():
     boxes = Boxes.from_rows(torch.tensor([[5.0, 0.0, 0.75, 4.0, 2.0, 1.5, 0.0]]))
     one = torch.ones(1)
     for made, name in ((boxes, "center_m"), (BoxVisibility(one, one, one, one, one, 0.4), "share")):
@@ -354,7 +354,7 @@ def test_boxes_and_what_was_seen_of_them_stay_as_they_are():
             setattr(made, name, one)
 
 
-def test_the_skin_is_of_the_top_and_not_of_the_bottom():
+def test_margin_extends_the_top_not_the_bottom():
     boxes = Boxes.from_rows(torch.tensor([[0.0, 0.0, 0.0, 8.0, 4.0, 2.0, 0.0]]).double())
     heights_m = [1.0 + SKIN_M, 1.0 + SKIN_M + 1e-9, SKIN_M - 1.0, SKIN_M - 1.0 + 1e-9]
     points = torch.tensor([[0.5, -0.5, height_m] for height_m in heights_m]).double()

@@ -23,7 +23,7 @@ def row(x, y, length=4.0, width=2.0, yaw=0.0):
 # Overlap seen from above.
 
 
-def test_overlap_of_boxes_along_the_axes_in_closed_form():
+def test_axis_aligned_overlap_equals_its_closed_form():
     generator = np.random.default_rng(0)
     a, b = (np.column_stack([generator.uniform(-3, 3, (60, 2)), generator.uniform(0.5, 6, (60, 2))]) for _ in range(2))
     rows = [torch.tensor([row(*box) for box in boxes.tolist()], dtype=torch.float64) for boxes in (a, b)]
@@ -47,7 +47,7 @@ def test_overlap_of_boxes_along_the_axes_in_closed_form():
     np.testing.assert_allclose(compute_bev_iou(rows[0], quarter).numpy(), expected, atol=1e-12)
 
 
-def test_boxes_whose_circles_do_not_meet_are_not_compared_any_further(monkeypatch):
+def test_boxes_with_separate_circles_are_not_compared(monkeypatch):
     asked = []
     monkeypatch.setattr(
         matching, "_compute_intersection_m2", lambda a, b: asked.append(len(a)) or torch.zeros(len(a)).double()
@@ -76,14 +76,14 @@ def test_overlap_of_turned_boxes_against_a_fine_raster():
     torch.testing.assert_close(found, expected.double(), atol=0.02, rtol=0)
 
 
-def test_a_square_and_itself_turned_by_45_degrees_share_an_octagon():
+def test_squares_rotated_by_45_degrees_share_an_octagon():
     square = torch.tensor([row(0, 0, 1, 1)])
     octagon = 2 * (math.sqrt(2) - 1)
     turned = torch.tensor([row(0, 0, 1, 1, math.pi / 4)], dtype=torch.float64)
     assert compute_bev_iou(square, turned).item() == pytest.approx(octagon / (2 - octagon), abs=1e-12)
 
 
-def test_overlap_is_symmetric_one_with_itself_and_nothing_without_area():
+def test_overlap_is_symmetric_and_one_with_itself():
     boxes = torch.rand(50, 7, dtype=torch.float64) * torch.tensor([5.0, 5, 1, 4, 3, 1, 7]) + 0.1
     boxes[:, 0] += 3e4  # far away, nothing is lost
     found = compute_bev_iou(boxes, boxes)
@@ -132,7 +132,7 @@ def test_matches_are_those_of_a_slow_twin(by, threshold, seed):
     assert (found >= 0).sum() >= 6
 
 
-def test_the_higher_score_chooses_first_even_if_the_other_is_nearer():
+def test_higher_scores_match_before_nearer_detections():
     truth = torch.tensor([row(0.0, 0.0), row(3.0, 0.0)])
     detections = torch.tensor([row(0.1, 0.0), row(1.0, 0.0)])
     # The second detection takes object 0; the first, nearer to it, is left with none within 2 m.
@@ -140,7 +140,7 @@ def test_the_higher_score_chooses_first_even_if_the_other_is_nearer():
     assert match_detections(detections, torch.tensor([0.9, 0.5]), truth, "distance", 2.01).tolist() == [0, 1]
 
 
-def test_of_all_overlaps_only_that_of_the_box_itself_is_one():
+def test_only_the_box_itself_has_overlap_one():
     truth = torch.tensor([row(0.0, 0.0), row(20.0, 0.0)])
     metric = RecallByVisibility(match_by="iou", threshold=1.0)
     moved = truth + torch.tensor([0, 0, 0, 0, 0, 0, 0.01]) * torch.tensor([[0.0], [1.0]])
@@ -148,7 +148,7 @@ def test_of_all_overlaps_only_that_of_the_box_itself_is_one():
     assert metric.compute().compute_overall().recall.value.item() == 0.5
 
 
-def test_a_distance_of_exactly_the_threshold_is_too_far_and_an_overlap_of_exactly_it_is_enough():
+def test_distance_excludes_and_overlap_includes_the_threshold():
     truth = torch.tensor([row(0.0, 0.0)])
     assert match_detections(torch.tensor([row(2.0, 0.0)]), torch.ones(1), truth, "distance", 2.0).tolist() == [-1]
     # 2 of 6 square metres, as exact in binary as 1/3 can be.
@@ -156,7 +156,7 @@ def test_a_distance_of_exactly_the_threshold_is_too_far_and_an_overlap_of_exactl
     assert match_detections(torch.tensor([row(2.0, 0.0)]), torch.ones(1), truth, "iou", third).tolist() == [0]
 
 
-def test_matching_by_something_else_or_without_a_score_for_each_is_refused():
+def test_invalid_criteria_and_missing_scores_are_rejected():
     boxes = torch.tensor([row(0, 0), row(9, 0)])
     with pytest.raises(ValueError, match="match_by: 'distance' or 'iou' is needed; got 'centre'"):
         match_detections(boxes, torch.ones(2), boxes, "centre", 2.0)
@@ -235,7 +235,7 @@ def test_counts_are_those_of_a_slow_twin():
     assert all(count.sum() > 20 for count in expected)
 
 
-def test_a_lower_threshold_only_adds_so_matching_once_is_enough():
+def test_lower_thresholds_only_add_matches():
     """Matches of the detections above a score are those of the full list, since the higher score chooses first."""
     only_high = [(d[s >= 0.5], boxes, share, s[s >= 0.5], own[s >= 0.5]) for d, boxes, share, s, own in FRAMES]
     both, high = filled(FRAMES).compute(), filled(only_high).compute()
@@ -243,7 +243,7 @@ def test_a_lower_threshold_only_adds_so_matching_once_is_enough():
         assert torch.equal(getattr(both, name)[1], getattr(high, name)[0])
 
 
-def test_a_reset_under_inference_mode_as_in_lightning_s_validation_does_no_harm():
+def test_reset_works_under_inference_mode():
     metric = filled(FRAMES[:3])
     with torch.inference_mode():
         metric.reset()
@@ -252,7 +252,7 @@ def test_a_reset_under_inference_mode_as_in_lightning_s_validation_does_no_harm(
     assert counts_of(metric) == counts_of(filled(FRAMES[4:6]))
 
 
-def test_recall_and_precision_are_quotients_of_the_counts_with_nan_where_there_are_none():
+def test_recall_and_precision_are_quotients_of_counts():
     objects, found, detected, true = slow_counts(FRAMES, (0.0, 0.5))
     result = filled(FRAMES).compute()
     for axis, summed in {"visibility": 2, "distance": 1}.items():
@@ -269,7 +269,7 @@ def test_recall_and_precision_are_quotients_of_the_counts_with_nan_where_there_a
     assert result.compute_overall().recall.value[0, 0] == found[0].sum() / objects.sum()
 
 
-def test_bins_are_half_open_and_the_last_ones_reach_to_one_and_to_infinity():
+def test_bins_are_half_open_except_the_last():
     metric = RecallByVisibility(visibility_borders=(0.5,), distance_borders=(10.0,))
     boxes = Boxes.from_rows(torch.tensor([row(10.0, 0.0), row(0.0, -9.99), row(6.0, 8.0), row(500.0, 0.0)]))
     metric.update(torch.empty(0, 7), boxes, torch.tensor([0.5, 0.499999, 1.0, math.nan]))
@@ -279,7 +279,7 @@ def test_bins_are_half_open_and_the_last_ones_reach_to_one_and_to_infinity():
     assert result.distance_bins == ("0-10 m", "over 10 m")
 
 
-def test_without_visibility_of_detections_their_precision_is_known_over_distance_only():
+def test_precision_over_visibility_needs_visibility_of_detections():
     metric = RecallByVisibility()
     detections, boxes, share, scores, _ = FRAMES[1]
     metric.update(detections, boxes, share, scores)
@@ -289,7 +289,7 @@ def test_without_visibility_of_detections_their_precision_is_known_over_distance
     assert result.compute_curve("distance").precision.trials.sum() == len(detections)
 
 
-def test_without_scores_all_detections_count_and_the_first_chooses_first():
+def test_without_scores_the_first_detection_matches_first():
     metric = RecallByVisibility(score_thresholds=(0.9,))
     truth = Boxes.from_rows(torch.tensor([row(5.0, 0.0)]))
     metric.update(torch.tensor([row(6.0, 0.0), row(5.0, 0.0)]), truth, torch.tensor([0.9]))
@@ -307,7 +307,7 @@ def test_a_score_of_exactly_the_threshold_counts():
 
 
 @pytest.mark.parametrize("count", [0, 3])
-def test_frames_without_objects_or_detections_are_counted_and_break_nothing(count):
+def test_frames_without_objects_or_detections_are_counted(count):
     metric = RecallByVisibility()
     none = Boxes.from_rows(torch.empty(0, 7))
     metric.update(torch.rand(count, 7), none, torch.empty(0), torch.rand(count))
@@ -317,7 +317,7 @@ def test_frames_without_objects_or_detections_are_counted_and_break_nothing(coun
     assert result.compute_overall().precision.trials.item() == count
 
 
-def test_scalars_are_flat_floats_that_say_how_much_they_rest_on():
+def test_scalars_are_floats_with_their_counts():
     scalars = RecallByVisibility(visibility_borders=(0.5,), distance_borders=())
     scalars.update(torch.tensor([row(5.0, 0.0)]), Boxes.from_rows(torch.tensor([row(5.0, 0.0)])), torch.tensor([0.7]))
     flat = scalars.compute().to_scalars()
@@ -390,7 +390,7 @@ def test_one_bad_number_of_a_detection_is_enough(column, bad):
         ({"boxes": []}, "one entry for each frame is needed in every list; got 1, 0, 1, 1, 1 entries"),
     ],
 )
-def test_bad_frames_are_refused_and_leave_the_state_alone(changes, message):
+def test_invalid_frames_do_not_change_the_state(changes, message):
     metric = RecallByVisibility()
     good = {
         "detections": torch.tensor([row(0, 0)] * 2),
@@ -402,19 +402,19 @@ def test_bad_frames_are_refused_and_leave_the_state_alone(changes, message):
     assert int(metric.num_frames) == 0
 
 
-def test_a_frame_in_which_nobody_looked_for_objects_is_refused():
+def test_frames_without_boxes_are_rejected():
     with pytest.raises(TypeError, match=r"boxes: Boxes are needed, .* got NoneType"):
         RecallByVisibility().update(torch.empty(0, 7), None, torch.empty(0))
 
 
-def test_intervals_of_all_and_of_none_end_at_one_and_at_zero_however_they_are_rounded():
+def test_intervals_end_at_zero_and_one():
     trials = torch.arange(1, 20_000)
     every, none = (RatioWithInterval.from_counts(successes, trials) for successes in (trials, torch.zeros_like(trials)))
     assert every.high.max() == 1.0
     assert none.low.min() == 0.0
 
 
-def test_a_plot_of_recall_has_a_point_and_its_wilson_interval_for_every_bin_with_objects():
+def test_recall_plot_shows_wilson_intervals_of_occupied_bins():
     metric = RecallByVisibility(visibility_borders=(0.5,), score_thresholds=(0.0, 0.5))
     rows = torch.tensor([row(10 * k, 0) for k in range(1, 4)])
     metric.update(rows[:2], Boxes.from_rows(rows), torch.tensor([0.9, 0.1, math.nan]), torch.tensor([0.9, 0.3]))
@@ -435,7 +435,7 @@ def test_a_plot_of_recall_has_a_point_and_its_wilson_interval_for_every_bin_with
         metric.plot(score_threshold=0.4)
 
 
-def test_boxes_whose_z_is_that_of_the_bottom_are_warned_of_once():
+def test_bottom_centers_instead_of_centers_warn_once():
     """As MMDetection3D has them; 24 objects in 3 frames."""
     rows = torch.rand(8, 7) * 30 + torch.tensor([0.0, 0, 0, 4, 2, 1.5, 0])
     rows[:, 5], rows[:, 6] = 1.5, 0.0

@@ -82,7 +82,7 @@ def test_velocity_points_where_the_box_goes(move, factor):
 
 
 @pytest.mark.parametrize(("move", "factor"), MOVES.values(), ids=MOVES)
-def test_square_metres_scale_with_a_scaling_and_counts_stay(move, factor):
+def test_area_weights_scale_and_counts_stay(move, factor):
     frame = make_frame()
     frame = replace(
         frame, boxes=replace(frame.boxes, sampled_points=torch.arange(9)), reference_weights=torch.rand(700)
@@ -92,7 +92,7 @@ def test_square_metres_scale_with_a_scaling_and_counts_stay(move, factor):
     assert torch.equal(moved.boxes.sampled_points, torch.arange(9))
 
 
-def test_twice_a_flip_and_back_and_forth_is_nothing():
+def test_inverse_augmentations_restore_the_frame():
     frame = make_frame()
     for there_and_back in (flip(flip(frame)), rotate(rotate(frame, 0.7), -0.7), scale(scale(frame, 1.25), 0.8)):
         torch.testing.assert_close(there_and_back.reference, frame.reference, atol=1e-5, rtol=1e-5)
@@ -117,7 +117,7 @@ def test_known_cases():
         torch.testing.assert_close(moved[name].boxes.velocity_mps, torch.tensor([velocity]), msg=name)
 
 
-def test_an_augmentation_depends_on_seed_epoch_and_index_only():
+def test_augmentations_depend_on_seed_epoch_and_index():
     augment = Augmentation(seed=3)
     first = augment(make_frame(index=5), epoch=1).clouds["a"]
     augment(make_frame(index=6), epoch=2)

@@ -35,7 +35,7 @@ def content(folder, **settings):
     return json.dumps(SimulatedFrames(folder / "road.yaml", folder / "low.yaml", **settings).content)
 
 
-def test_of_a_simulation_it_is_what_stands_in_the_files(tmp_path):
+def test_content_of_simulations_is_that_of_files(tmp_path):
     before = content(written(tmp_path))
     for name, old, new in (
         ("low.yaml", "z_m: 0.8", "z_m: 0.9"),
@@ -56,7 +56,7 @@ def test_of_a_simulation_it_is_what_stands_in_the_files(tmp_path):
     assert content(tmp_path, num_frames=9) == before
 
 
-def test_where_the_files_are_and_what_they_say_of_themselves_does_not_matter(tmp_path):
+def test_content_ignores_paths_and_descriptions(tmp_path):
     before = content(written(tmp_path))
     (tmp_path / "moved").mkdir()
     after = written(tmp_path / "moved")
@@ -74,7 +74,7 @@ def test_traffic_has_its_vehicles_in_it(monkeypatch):
 
 
 @pytest.mark.parametrize("change", ["size", "time", "name", "pose"])
-def test_of_a_recording_it_is_names_sizes_times_and_poses(tmp_path, change):
+def test_content_of_recordings_is_names_times_poses(tmp_path, change):
     folder = tmp_path / "recording"
     for place in ("rigs/a", "rigs/b", "reference"):
         (folder / place).mkdir(parents=True)

@@ -54,7 +54,7 @@ def by_area(_):
 
 
 @pytest.mark.parametrize("make", [simulated, by_area, recorded, recorded_rigs, chosen])
-def test_a_source_is_a_map_style_dataset_that_knows_whose_frames_they_are(tmp_path, make):
+def test_sources_are_map_style_datasets_of_rigs(tmp_path, make):
     source = make(tmp_path)
     assert isinstance(source, FrameSource)
     assert len(source) == 2
@@ -83,7 +83,7 @@ def test_a_source_is_a_map_style_dataset_that_knows_whose_frames_they_are(tmp_pa
 
 
 @pytest.mark.parametrize("scenario", ["courtyard", "parking"])
-def test_the_outline_of_a_simulation_is_that_of_its_ego_and_needs_no_world(monkeypatch, scenario):
+def test_ego_outline_needs_no_scene(monkeypatch, scenario):
     expected = Scenario.load(scenario).build_scene().ego.mesh.vertices_m[:, :2]
     monkeypatch.setattr(Scenario, "build_scene", lambda *_: pytest.fail("a world was built"))
     outline_m = SimulatedFrames(scenario, "front_roof_32", num_frames=1).ego_outline_m
@@ -91,7 +91,7 @@ def test_the_outline_of_a_simulation_is_that_of_its_ego_and_needs_no_world(monke
     np.testing.assert_allclose(outline_m.min(axis=0), expected.min(axis=0))
 
 
-def test_the_format_of_a_recording_is_recognised_or_named(tmp_path):
+def test_formats_of_recordings_are_detected_or_given(tmp_path):
     folder = folder_of(tmp_path / "recording", ["sensor", "reference"])
     assert isinstance(open_recording(str(folder)), FolderRecording)
     assert isinstance(open_recording(folder, RecordingSettings(format="folder")), FolderRecording)
@@ -121,7 +121,7 @@ def test_another_format_is_a_class_and_a_line(tmp_path, monkeypatch):
     assert isinstance(open_recording(tmp_path / "drive.one"), Single)
 
 
-def test_rigs_are_chosen_in_any_order_under_any_name_with_what_belongs_to_them():
+def test_rigs_are_selected_in_any_order_and_name():
     rigs = {"a": "front_roof_32", "b": "front_grille_128"}
     reference_sensor = PaperReference(16, 16)
     both = SimulatedFrames("parking", rigs=rigs, num_frames=1, boxes=True, reference_sensor=reference_sensor)
@@ -136,13 +136,13 @@ def test_rigs_are_chosen_in_any_order_under_any_name_with_what_belongs_to_them()
         RigSubset(both, {"b": "c"})
 
 
-def test_a_batch_without_the_rig_that_is_asked_for_says_what_it_has(tmp_path):
+def test_batches_without_the_requested_rig_list_theirs(tmp_path):
     batch = collate_frames([recorded_rigs(tmp_path)[0]])
     with pytest.raises(ValueError, match="frame 'f0' has no rig 'c'; it has a, b"):
         batch.get_clouds("c")
 
 
-def test_a_batch_has_weights_of_all_its_frames_or_of_none():
+def test_batches_have_weights_of_all_or_none():
     points, weights = torch.zeros(3, 3), torch.ones(3)
     area = Frame({"rig": points}, points, 0, "a", reference_weights=weights)
     none = Frame({"rig": points}, points, 0, "b")
@@ -155,7 +155,7 @@ def test_a_batch_has_weights_of_all_its_frames_or_of_none():
             _ = collate_frames(mixed).weights
 
 
-def test_blocks_of_a_source_end_where_its_frames_show_something_else(tmp_path):
+def test_blocks_end_where_the_scene_changes(tmp_path):
     traffic = SimulatedFrames(
         "urban", "front_roof_32", num_frames=3, frame_interval_s=10.0, reference_sensor=PaperReference(4, 4)
     )

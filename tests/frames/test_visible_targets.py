@@ -30,7 +30,7 @@ def a_frame(**others):
 @pytest.mark.parametrize(
     ("least", "kept"), [(0.0, PLACES_M[:2] + PLACES_M[3:]), (0.25, PLACES_M[:2]), (0.26, PLACES_M[:1]), (0.8, ())]
 )
-def test_what_is_less_visible_or_unknown_is_left_out_and_counted(least, kept):
+def test_less_visible_and_unknown_boxes_are_counted(least, kept):
     (frame,) = VisibleBoxes([a_frame()], least, threshold_m=0.1)
     assert frame.boxes.center_m[:, 0].tolist() == list(kept)
     assert frame.boxes.visibility.tolist() == [{10.0: 0.75, 20.0: 0.25, 40.0: 0.0}[x] for x in kept]
@@ -38,14 +38,14 @@ def test_what_is_less_visible_or_unknown_is_left_out_and_counted(least, kept):
     assert len(frame.boxes.points_in_box["rig"]) == len(frame.boxes.categories) == len(kept)
 
 
-def test_shares_go_with_their_boxes_through_loaders_and_augmentation():
+def test_shares_follow_boxes_through_loaders_and_augmentation():
     loader = DataLoader(VisibleBoxes([a_frame()] * 3, 0.2, threshold_m=0.1), batch_size=2, collate_fn=collate_frames)
     frames = [Augmentation(max_yaw_rad=1.0)(frame, 0) for batch in loader for frame in batch.frames]
     assert [frame.boxes.visibility.tolist() for frame in frames] == [[0.75, 0.25]] * 3
     assert frames[0].boxes.select_categories("van").visibility.tolist() == [0.25]
 
 
-def test_of_a_simulation_they_are_those_of_box_visibility():
+def test_simulated_shares_equal_box_visibility():
     frames = SimulatedFrames("urban", "front_roof_32", num_frames=2, frame_interval_s=15.0, boxes=True)
     for frame, kept in zip(frames, VisibleBoxes(frames, 0.3), strict=True):
         seen = measure_box_visibility(

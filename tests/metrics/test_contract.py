@@ -81,7 +81,7 @@ def test_every_metric_of_the_package_is_asked():
 
 
 @EVERY
-def test_before_any_step_it_answers_and_says_that_it_knows_nothing(case):
+def test_metrics_without_frames_return_unknown_values(case):
     metric = case.make()
     with pytest.warns(UserWarning, match="was called before the ``update`` method"):
         metric.compute()
@@ -107,7 +107,7 @@ def test_the_inputs_are_as_they_were(case):
 
 @EVERY
 @pytest.mark.parametrize("in_a_list", [False, True])
-def test_an_array_of_numpy_is_refused_by_its_name_and_nothing_is_added(case, in_a_list):
+def test_numpy_arrays_are_rejected_and_not_added(case, in_a_list):
     metric = case.over(case.frames[:1])
     before, step = states(metric), case.frames[1]
     given_as_arrays = with_arrays(step)
@@ -186,7 +186,7 @@ BEFORE = {
 
 @EVERY
 @pytest.mark.parametrize("before", BEFORE.values(), ids=list(BEFORE))
-def test_steps_are_added_under_inference_mode_and_after_it(case, before):
+def test_frames_are_added_under_and_after_inference_mode(case, before):
     metric = case.make()
     with torch.inference_mode():
         before(case, metric)
@@ -197,7 +197,7 @@ def test_steps_are_added_under_inference_mode_and_after_it(case, before):
 
 
 @EVERY
-def test_a_metric_that_was_made_under_inference_mode_takes_steps_after_it(case):
+def test_metrics_made_under_inference_mode_still_update(case):
     with torch.inference_mode():
         metric = case.over(case.frames[:1])
     metric.update(**case.frames[1])
@@ -216,7 +216,7 @@ def test_what_the_sums_start_from_takes_no_memory(case):
 
 
 @EVERY
-def test_the_state_has_a_fixed_size_but_for_its_tables(case):
+def test_states_except_tables_have_fixed_size(case):
     metric = case.make()
 
     def sizes():
@@ -311,7 +311,7 @@ def test_a_state_dict_goes_round_without_aliases(case, inside):
 
 
 @EVERY
-def test_a_fresh_metric_that_loads_steps_computes_without_a_warning(case):
+def test_loaded_metrics_compute_without_a_warning(case):
     fresh, saved = case.make(), case.over(case.frames[:3])
     saved.persistent(True)
     fresh.load_state_dict(saved.state_dict())
@@ -320,7 +320,7 @@ def test_a_fresh_metric_that_loads_steps_computes_without_a_warning(case):
 
 
 @EVERY
-def test_a_state_rounded_on_the_way_does_not_make_the_sums_short(case):
+def test_rounded_states_keep_float64_sums(case):
     metric = case.make()
     metric.persistent(True)
     types = {name: value.dtype for name, value in metric.metric_state.items()}
@@ -330,7 +330,7 @@ def test_a_state_rounded_on_the_way_does_not_make_the_sums_short(case):
 
 
 @EVERY
-def test_the_state_is_part_of_the_state_dict_only_if_asked_for(case):
+def test_states_are_in_state_dicts_on_request(case):
     """As in torchmetrics: a checkpoint of a model loads into one with another metric, or with none."""
     metric = case.over(case.frames[:1])
     assert not metric.state_dict()
@@ -353,7 +353,7 @@ def test_the_state_is_part_of_the_state_dict_only_if_asked_for(case):
 
 @pytest.mark.parametrize("cut", [0, 1])
 @EVERY
-def test_merged_parts_are_the_whole_in_any_order_and_leave_the_other_alone(case, cut):
+def test_merged_parts_equal_the_whole_in_any_order(case, cut):
     parts = case.over(case.frames[:cut]), case.over(case.frames[cut:])
     whole, result = case.whole
     for last_first, as_dict in itertools.product([False, True], repeat=2):
@@ -392,7 +392,7 @@ def test_merging_is_associative(case):
 
 
 @EVERY
-def test_a_metric_merged_into_itself_has_every_step_twice(case):
+def test_merging_a_metric_with_itself_doubles_it(case):
     metric = case.over(case.frames[:5])
     metric.merge_state(metric)
     assert_same(states(metric), states(case.over([*case.frames[:5], *case.frames[:5]])))
@@ -402,7 +402,7 @@ def test_a_metric_merged_into_itself_has_every_step_twice(case):
 
 
 @EVERY_CHANGE
-def test_sums_that_mean_something_else_are_not_merged_or_loaded(case, change):
+def test_sums_of_other_parameters_are_not_merged(case, change):
     metric, other = case.over(case.frames[:1]), case.over(case.frames[:1], **case.changes[change])
     parameter = change.replace(",", " ").split()[0]
     before = states(metric)
@@ -422,7 +422,7 @@ def of_every_case():
 
 
 @EVERY
-def test_other_metrics_and_things_that_are_none_are_not_merged(case, of_every_case):
+def test_other_classes_are_not_merged(case, of_every_case):
     metric = case.over(case.frames[:1])
     before = states(metric)
     for other in (SumMetric(), *(other for other in of_every_case if type(other) is not type(metric))):
@@ -439,7 +439,7 @@ def test_other_metrics_and_things_that_are_none_are_not_merged(case, of_every_ca
 
 
 @EVERY
-def test_a_state_that_lacks_something_or_has_another_shape_is_refused(case):
+def test_states_with_gaps_or_other_shapes_raise(case):
     metric, other = case.over(case.frames[:2]), case.over(case.frames[2:4])
     before = states(metric)
     for name, value in other.metric_state.items():
@@ -465,7 +465,7 @@ def test_resampling_points_instead_of_frames_is_refused(case):
 
 
 @EVERY
-def test_a_collection_keeps_metrics_apart_that_agree_at_first(case):
+def test_collections_keep_initially_equal_metrics_apart(case):
     """torchmetrics lets metrics share one state if theirs are equal after the first step (its issue 2596)."""
     wanted = {"one": {}, "the same": {}, **case.changes}
     collection = MetricCollection({name: case.make(**changes) for name, changes in wanted.items()})
@@ -496,7 +496,7 @@ def answers(tmp_path_factory):
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_two_processes_equal_one_and_each_keeps_its_own_sums(answers, name):
+def test_two_processes_equal_one(answers, name):
     case = CASES[name]
     more = flat(case.over([*case.frames, case.frames[0], case.frames[0]]).compute())
     for answer in (of_rank[name] for of_rank in answers):
@@ -507,7 +507,7 @@ def test_two_processes_equal_one_and_each_keeps_its_own_sums(answers, name):
 
 
 @EVERY_CHANGE
-def test_ranks_whose_sums_mean_different_things_all_say_so(answers, case, change):
+def test_ranks_with_other_parameters_all_raise(answers, case, change):
     name = next(name for name, other in CASES.items() if other is case)
     for answer in answers:
         assert "has other parameters on rank 1 than on rank 0" in (answer[name]["complaints"][change] or "no complaint")

@@ -63,7 +63,7 @@ def test_cells_are_spread_to_every_third_bit():
 
 
 @pytest.mark.parametrize("height_m", [0.0, 1e5])
-def test_many_equal_points_do_not_coarsen_the_order_of_the_others(height_m):
+def test_equal_points_do_not_coarsen_the_order(height_m):
     above = torch.tensor([0.0, 0.0, height_m])
     sizes = leaf_sizes(torch.cat([random_cloud(3000, 3), torch.zeros(250_000, 3)]) + above)
     assert sizes[sizes > 0].mean() < 50
@@ -81,7 +81,7 @@ def test_equal_points_keep_their_order():
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
-def test_what_lies_far_beyond_a_crowd_is_at_that_end_of_the_curve(sign):
+def test_outliers_are_at_an_end_of_the_curve(sign):
     cloud = torch.cat([sign * torch.full((1, 3), 1e6), random_cloud(2000, 5)])
     order = compute_morton_order(cloud)
     assert order[-1 if sign > 0 else 0] == 0

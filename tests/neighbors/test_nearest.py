@@ -83,7 +83,7 @@ def test_every_backend_agrees_with_brute_force(seed, counts, offset, scale, dtyp
 
 
 @backends
-def test_ties_have_one_distance_and_name_one_of_the_points(backend):
+def test_ties_return_one_of_the_nearest_points(backend):
     points = cloud([1, 0, 0], [-1, 0, 0], [0, 1, 0], [5, 5, 5])
     distance, index = nearest(cloud([0, 0, 0]), points, backend=backend)
     assert distance.item() == 1.0
@@ -107,7 +107,7 @@ def test_duplicates_among_other_points(backend):
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_a_tree_is_built_of_distinct_points_where_many_are_equal(monkeypatch, dtype):
+def test_trees_of_many_equal_points_use_distinct_ones(monkeypatch, dtype):
     """It cannot split equal points, and queries near them would look through all of them."""
     built = []
 
@@ -180,7 +180,7 @@ def test_views_with_any_strides(backend):
         (1e-310, torch.float64),  # subnormal
     ],
 )
-def test_extents_whose_squares_leave_the_range_of_the_type(backend, scale, dtype):
+def test_extents_with_overflowing_squares_are_exact(backend, scale, dtype):
     query, points = random_cloud(30, 8, dtype=torch.float64), random_cloud(400, 9, dtype=torch.float64)
     query, points = (query * scale).to(dtype), (points * scale).to(dtype)
     # Scaled back to 1 by powers of two, without rounding.
@@ -193,7 +193,7 @@ def test_extents_whose_squares_leave_the_range_of_the_type(backend, scale, dtype
 
 
 @pytest.mark.parametrize("scale", [2.0**exponent for exponent in (-1000, -600, -599, 300, 301, 1000)])
-def test_what_is_scaled_for_the_search_is_scaled_by_a_power_of_two(scale):
+def test_search_scales_by_powers_of_two(scale):
     """Not a bit is rounded, so that not a tie is broken."""
     query, points = (random_cloud(count, count, dtype=torch.float32).double() for count in (30, 40))
     *scaled, reach = _rescale(query * scale, points * scale, 3.0 * scale)
@@ -204,7 +204,7 @@ def test_what_is_scaled_for_the_search_is_scaled_by_a_power_of_two(scale):
 
 
 @backends
-def test_one_point_far_away_does_not_spoil_the_others(backend):
+def test_a_far_point_does_not_spoil_the_others(backend):
     points = cloud([2, 0, 0], [1, 0, 0], [1e30, 0, 0])
     assert nearest(cloud([0, 0, 0]), points, backend=backend).distance.item() == 1.0
     wide = cloud([0, 0, 0], [1e200, 0, 0], dtype=torch.float64)
@@ -214,13 +214,13 @@ def test_one_point_far_away_does_not_spoil_the_others(backend):
 
 @backends
 @pytest.mark.parametrize(("far", "dtype"), [(3e38, torch.float32), (1.7e308, torch.float64)])
-def test_a_distance_beyond_the_type_is_infinite_and_still_found(backend, far, dtype):
+def test_overflowing_distances_are_infinite_and_still_found(backend, far, dtype):
     distance, index = nearest(cloud([far, 0, 0], dtype=dtype), cloud([-far, 0, 0], dtype=dtype), backend=backend)
     assert (distance.item(), index.item()) == (math.inf, 0)
 
 
 @backends
-def test_fine_detail_near_the_origin_of_a_wide_cloud(backend):
+def test_wide_clouds_keep_fine_detail_near_origins(backend):
     """Centring the cloud would round the small coordinates away."""
     detail = random_cloud(2000, 10, scale=1e-6)
     points = torch.cat([detail, random_cloud(3000, 11, scale=1.0) + 100.0])
@@ -254,7 +254,7 @@ def test_max_distance_is_inclusive(backend, limit, dtype):
 
 @backends
 @pytest.mark.parametrize("limit", [0.5, 2.0, 8.0, 1e300])
-def test_max_distance_only_masks_what_the_whole_search_finds(backend, limit):
+def test_max_distance_only_masks_results(backend, limit):
     query, points = random_cloud(200, 15), random_cloud(800, 16)
     everything = nearest(query, points, backend=backend)
     bounded = nearest(query, points, max_distance=limit, backend=backend)
@@ -284,7 +284,7 @@ def rotation(seed):
 
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 2**32), backend=st.sampled_from(INSTALLED))
-def test_distances_do_not_depend_on_the_frame_or_the_order(seed, backend):
+def test_distances_are_invariant_to_frame_and_order(seed, backend):
     query, points = random_cloud(30, seed, dtype=torch.float64), random_cloud(300, seed + 1, dtype=torch.float64)
     turn, shift = rotation(seed + 2), random_cloud(1, seed + 3, dtype=torch.float64)
     expected = nearest(query, points, backend=backend).distance
@@ -326,7 +326,7 @@ def test_backends_agree_under_autocast():
         ((16, 700_000), torch.float32, "packets"),
     ],
 )
-def test_auto_takes_packets_in_float32_where_a_call_gains_its_share_of_loading_them(counts, dtype, chosen, monkeypatch):
+def test_auto_chooses_packets_where_loading_pays(counts, dtype, chosen, monkeypatch):
     """Stood in for by what any machine has: which is chosen, not what it finds."""
     monkeypatch.setattr(backend_choice, "_can_search", lambda *_: True)
     for name in BACKENDS.keys() - {chosen}:
@@ -337,7 +337,7 @@ def test_auto_takes_packets_in_float32_where_a_call_gains_its_share_of_loading_t
 
 
 @pytest.mark.parametrize(("scale", "chosen"), [((1, 0, 0), False), ((1, 1, 0), False), ((1, 1, 1), True)])
-def test_packets_do_not_pay_around_points_on_a_line_or_in_a_plane(scale, chosen, monkeypatch):
+def test_packets_do_not_pay_around_lines_or_planes(scale, chosen, monkeypatch):
     """All of a packet's queries are compared with what is near any of them; flat boxes of the tree are soon passed."""
     monkeypatch.setattr(backend_choice, "_can_search", lambda *_: True)
     query, points = random_cloud(100_000, 22), random_cloud(300_000, 23) * torch.tensor(scale, dtype=torch.float32)
@@ -345,20 +345,20 @@ def test_packets_do_not_pay_around_points_on_a_line_or_in_a_plane(scale, chosen,
     assert backend_choice.choose_shared_backend(points, [points]) == "packets"  # queries among them are near few
 
 
-def test_packets_that_do_not_pay_in_one_cloud_do_in_many(monkeypatch):
+def test_packets_pay_in_many_clouds(monkeypatch):
     monkeypatch.setattr(backend_choice, "_can_search", lambda *_: True)
     query, points = random_cloud(2_000, 24), random_cloud(100, 25)
     assert backend_choice.choose_shared_backend(query, [points]) != "packets"
     assert backend_choice.choose_shared_backend(query, [points] * 20) == "packets"
 
 
-def test_packets_lose_nothing_to_the_tree_where_queries_and_points_are_in_one_plane():
+def test_packets_are_fast_within_one_plane():
     query, points = (random_cloud(10_000, seed) * torch.tensor([1.0, 1.0, 0.0]) for seed in (28, 29))
     assert backend_choice._estimate_packet_loss_s(query, points) == 0.0
 
 
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
-def test_what_packets_lose_around_points_in_a_plane_does_not_hang_on_the_unit_of_length(scale):
+def test_estimated_loss_does_not_depend_on_units(scale):
     query, points = random_cloud(10_000, 26), random_cloud(10_000, 27) * torch.tensor([1.0, 1.0, 0.0])
     lost_s = backend_choice._estimate_packet_loss_s(query, points)
     assert lost_s > 0.0
@@ -366,7 +366,7 @@ def test_what_packets_lose_around_points_in_a_plane_does_not_hang_on_the_unit_of
 
 
 @pytest.mark.parametrize("counts", [(0, 700_000), (17_000, 0)])
-def test_without_a_query_or_a_point_nothing_is_lost_whatever_is_chosen(counts, monkeypatch):
+def test_empty_clouds_have_no_estimated_loss(counts, monkeypatch):
     monkeypatch.setattr(backend_choice, "_can_search", lambda *_: True)
     query, points = (torch.zeros(count, 3) for count in counts)
     assert backend_choice.choose_shared_backend(query, [points]) == "packets"
@@ -389,7 +389,7 @@ def box_of(extent, count, low=(5.0, -20.0, 300.0)):
         ((20.0, 50.0, 1000.0), (0.0, 0.0, 100.0), (20.0, 20.0, 1.0625), 0.0),
     ],
 )
-def test_what_packets_lose_around_points_in_a_plane_or_on_a_line_by_hand(asked, at, extent, share):
+def test_estimated_loss_equals_a_hand_computation(asked, at, extent, share):
     """64 of 64,000 queries are 10 m wide, the farthest points 90 m away: the next 10 + sqrt(2 * 45 * 10) m are near."""
     query = box_of(asked, 64_000)
     points = box_of(extent, 2, tuple(float(c) for c in query[0] + torch.tensor(at)))
@@ -399,7 +399,7 @@ def test_what_packets_lose_around_points_in_a_plane_or_on_a_line_by_hand(asked, 
 
 
 @pytest.mark.parametrize(("count", "chosen"), [(28_000, "packets"), (30_000, "auto")])
-def test_packets_are_taken_until_they_lose_more_than_they_gain(count, chosen, monkeypatch):
+def test_packets_are_chosen_until_losses_exceed_gains(count, chosen, monkeypatch):
     monkeypatch.setattr(backend_choice, "_can_search", lambda *_: True)
     query, points = box_of((160.0, 62.5, 100.0), 64_000), box_of((80.0, 160.0, 0.0), count, (5.0, -20.0, 310.0))
     assert backend_choice.choose_shared_backend(query, [points]) == chosen
@@ -416,7 +416,7 @@ def untried():
 LARGE = (random_cloud(17_000, 50), random_cloud(200, 51))
 
 
-def test_without_numba_the_tree_searches_and_the_log_says_how_to_get_it(monkeypatch, caplog, untried):
+def test_without_numba_the_tree_searches_and_logs(monkeypatch, caplog, untried):
     monkeypatch.setitem(BACKENDS, "packets", "no.such.module")
     with caplog.at_level("INFO", logger="torchcover"):
         found = [nearest(*LARGE) for _ in range(2)]
@@ -427,7 +427,7 @@ def test_without_numba_the_tree_searches_and_the_log_says_how_to_get_it(monkeypa
     assert "pip install 'torchcover[fast]'" in line
 
 
-def test_with_a_broken_numba_the_tree_searches_and_says_so_once(monkeypatch, tmp_path, untried):
+def test_broken_numba_warns_once_and_uses_trees(monkeypatch, tmp_path, untried):
     (tmp_path / "broken_backend.py").write_text("raise OSError('libllvm: no such file\\nand a trace')")
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setitem(BACKENDS, "packets", "broken_backend")
@@ -519,7 +519,7 @@ def test_max_radius_saturates(backend, max_radius):
 
 
 @pytest.mark.parametrize("offset", [1e3, 1e5])
-def test_small_distances_survive_where_a_matrix_product_loses_them(offset):
+def test_small_distances_survive_without_matrix_products(offset):
     """pytorch issues 42479 and 57690: ||q||^2 - 2 q.p + ||p||^2 cancels."""
     step = 2.0**-6
     line = torch.zeros(400, 3)
@@ -573,7 +573,7 @@ def test_other_types_are_refused(bad, arrived):
 
 
 @pytest.mark.parametrize("limit", [-1.0, math.nan])
-def test_a_max_distance_that_is_no_distance_is_refused(limit):
+def test_invalid_max_distances_are_rejected(limit):
     with pytest.raises(ValueError, match=f"max_distance .*>= 0 is needed; got {limit}"):
         nearest(random_cloud(2, 34), random_cloud(2, 35), max_distance=limit)
     with pytest.raises(ValueError, match=r"max_radius.* >= 0 is needed"):
@@ -586,7 +586,7 @@ def test_a_memory_budget_that_is_none_is_refused(budget):
         nearest(random_cloud(2, 36), random_cloud(2, 37), memory_mb=budget)
 
 
-def test_an_unknown_backend_is_refused_with_the_known_ones():
+def test_unknown_backends_are_rejected_with_a_list():
     with pytest.raises(ValueError, match="backend: one of auto, cdist, kdtree, packets, warp is needed; got 'faiss'"):
         nearest(random_cloud(2, 38), random_cloud(2, 39), backend="faiss")
 
@@ -624,7 +624,7 @@ def unsaid():
 @pytest.mark.parametrize(
     ("device", "faster"), [("meta", "all pairs"), ("cuda", "all pairs; faster still: .*torchcover.warp.*")]
 )
-def test_many_pairs_on_a_device_are_searched_on_the_cpu_and_it_says_so_once(monkeypatch, unsaid, device, faster):
+def test_many_pairs_move_to_the_cpu_once_logged(monkeypatch, unsaid, device, faster):
     params = backend_choice.BackendParams(max_device_pairs=5)
     monkeypatch.setattr(backend_choice, "_can_search", lambda backend, *_: backend != "warp")
     few, many = ([on_another_device(count, device) for count in counts] for counts in ((1, 5), (2, 3)))
@@ -650,7 +650,7 @@ def test_auto_takes_warp_on_cuda_alone(monkeypatch, device, chosen):
     assert asked == [("warp", torch.device("cuda"))] * (device == "cuda")
 
 
-def test_without_warp_the_log_says_how_to_get_it(monkeypatch, caplog, untried):
+def test_without_warp_the_log_names_the_package(monkeypatch, caplog, untried):
     monkeypatch.setitem(BACKENDS, "warp", "no.such.module")
     with caplog.at_level("INFO", logger="torchcover"):
         works = [backend_choice._can_search("warp", torch.device("cpu"), "others search") for _ in range(2)]
@@ -659,7 +659,7 @@ def test_without_warp_the_log_says_how_to_get_it(monkeypatch, caplog, untried):
     assert line.startswith("nearest: others search; warp is faster: pip install 'torchcover[warp]'")
 
 
-def test_warp_that_cannot_use_the_device_is_not_used_and_that_is_said_once(monkeypatch, untried):
+def test_unusable_warp_is_skipped_and_logged_once(monkeypatch, untried):
     """As on a GPU of another make, which torch calls cuda too. On `meta`, where there are no numbers to search."""
     monkeypatch.setitem(BACKENDS, "warp", "torchcover.neighbors.kdtree")
     with pytest.warns(UserWarning, match="^nearest: others search, as backend 'warp' does not work here: ") as said:
@@ -669,7 +669,7 @@ def test_warp_that_cannot_use_the_device_is_not_used_and_that_is_said_once(monke
 
 
 @pytest.mark.parametrize(("backend", "extra"), [("packets", "fast"), ("warp", "warp")])
-def test_a_broken_backend_that_was_named_is_an_error_of_one_line(monkeypatch, tmp_path, backend, extra):
+def test_broken_requested_backends_raise_one_line(monkeypatch, tmp_path, backend, extra):
     (tmp_path / "broken_backend.py").write_text("raise OSError('libllvm: no such file\\nand a trace')")
     monkeypatch.syspath_prepend(tmp_path)
     monkeypatch.setitem(BACKENDS, backend, "broken_backend")
@@ -708,7 +708,7 @@ class SmallMemory:
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_out_of_memory_the_queries_are_asked_in_parts(monkeypatch, dtype):
+def test_queries_are_split_when_memory_runs_out(monkeypatch, dtype):
     query, points = random_cloud(5001, 62, dtype=dtype), random_cloud(400, 63, dtype=dtype)
     inputs = [cloud.requires_grad_() for cloud in (query, points)]
     expected = nearest(query, points, max_distance=9.0)
@@ -723,7 +723,7 @@ def test_out_of_memory_the_queries_are_asked_in_parts(monkeypatch, dtype):
     torch.testing.assert_close(gradients, expected_gradients, rtol=1e-6, atol=1e-6)
 
 
-def test_out_of_memory_for_a_few_queries_is_an_error_with_the_size(monkeypatch):
+def test_few_queries_out_of_memory_raise_the_size(monkeypatch):
     monkeypatch.setattr("torchcover.neighbors.query.choose_search", lambda *_: SmallMemory(0, kdtree.search))
     said = (
         "^cpu: not enough memory to search 400 points for 3,000 queries, 750 at a time: CUDA out of memory.*7.00 GiB.$"
@@ -760,7 +760,7 @@ def test_transforms_of_torch_give_what_eager_code_gives():
 
 
 @pytest.mark.filterwarnings("ignore:`torch.jit.script` is deprecated:DeprecationWarning")
-def test_compiled_code_gives_what_eager_code_gives_and_leaves_it_alone(untried):
+def test_compiled_code_equals_eager_code(untried):
     compiled = torch.compile(
         lambda query, points: nearest(query, points, max_distance=0.3), backend="eager", fullgraph=True
     )

@@ -121,7 +121,7 @@ def test_the_index_is_the_slow_twins(name, backend):
 
 @if_installed
 @pytest.mark.parametrize("name", ["random", "ties", "every point 8 times", "all equal", "17 points", "one point"])
-def test_the_loops_as_python_runs_them_find_the_same_and_stay_within_arrays(name, installed, as_python, monkeypatch):
+def test_uncompiled_loops_stay_within_their_arrays(name, installed, as_python, monkeypatch):
     """Compiled ones do not look where they write."""
     monkeypatch.setattr(packets, "CROWD", 20)
     query, points = (cloud[:count] for cloud, count in zip(CLOUDS[name], (70, 90), strict=True))
@@ -137,7 +137,7 @@ def boxes_around(count, seed):
 
 
 @if_installed
-def test_gaps_between_boxes_are_those_along_each_axis_in_closed_form(installed):
+def test_gaps_between_boxes_equal_their_closed_form(installed):
     one, other = boxes_around(60, 33), boxes_around(60, 35)
     (low, high), (least, most) = ((boxes[:, :3], boxes[:, 3:]) for boxes in (one, other))
     apart = np.maximum(np.maximum(low - most, least - high), 0)
@@ -149,7 +149,7 @@ def test_gaps_between_boxes_are_those_along_each_axis_in_closed_form(installed):
 
 
 @pytest.mark.parametrize("backend", [name for name in BACKENDS if name == "warp"])
-def test_the_gap_to_a_box_is_that_to_the_nearest_place_in_it(backend):
+def test_gap_to_a_box_ends_at_nearest_point(backend):
     """As Python runs it: a smaller one would be found out by nothing but the time that a search takes."""
     boxes, points = boxes_around(60, 37), uniform(60, 39)
     gap = import_module("torchcover.neighbors.warp")._compute_gap.func
@@ -159,7 +159,7 @@ def test_the_gap_to_a_box_is_that_to_the_nearest_place_in_it(backend):
 
 
 @pytest.mark.parametrize("backend", [name for name in BACKENDS if name == "warp"])
-def test_a_walk_looks_into_at_most_twice_the_boxes_that_any_search_has_to(backend, monkeypatch):
+def test_searches_visit_at_most_twice_the_needed_boxes(backend, monkeypatch):
     """As Python runs it: those beneath a box that is nearer than the nearest point, which nobody knows beforehand."""
     warp = import_module("torchcover.neighbors.warp")
     points = generator(43).normal(0, 9, (600, 3)).astype(np.float32)
@@ -186,7 +186,7 @@ def test_a_walk_looks_into_at_most_twice_the_boxes_that_any_search_has_to(backen
 
 
 @if_installed
-def test_a_packet_looks_into_fewer_leaves_if_it_begins_with_those_around_its_middle(installed, as_python, monkeypatch):
+def test_packets_that_begin_near_visit_fewer_leaves(installed, as_python, monkeypatch):
     """Of the many whose boxes meet its own, as where points are asked for their neighbours."""
     points = generator(41).normal(0, 9, (600, 3)).astype(np.float32)
     query = points + np.float32(0.1)
@@ -217,7 +217,7 @@ def test_in_float64_too(name, backend):
 
 
 @backends
-def test_of_ties_all_around_the_first_is_named_wherever_it_lies(backend):
+def test_ties_return_the_smallest_index(backend):
     """Every leaf holds one place, and all are as far away as the nearest one."""
     places = {each for x in (-3, 3) for y in (-4, 4) for each in permutations((x, y, 0))}
     points = np.repeat(np.array(sorted(places), dtype=np.float32), 32, axis=0)
@@ -227,7 +227,7 @@ def test_of_ties_all_around_the_first_is_named_wherever_it_lies(backend):
 
 @clouds
 @backends
-def test_the_order_of_the_queries_their_parts_and_the_threads_change_nothing(name, backend, threads, monkeypatch):
+def test_order_chunks_and_threads_change_no_bit(name, backend, threads, monkeypatch):
     query, points = CLOUDS[name]
     threads(1)
     expected = search(query, points, backend)
@@ -242,7 +242,7 @@ def test_the_order_of_the_queries_their_parts_and_the_threads_change_nothing(nam
 
 @if_installed
 @pytest.mark.parametrize(("count", "asked"), [(1, 0), (2, 2)])
-def test_the_sort_and_the_search_are_on_several_threads_where_there_are_some(
+def test_sort_and_search_use_several_threads(
     installed, threads, monkeypatch, count, asked
 ):
     threads(count)
@@ -279,7 +279,7 @@ def leaf_sizes(cloud):
 
 
 @if_installed
-def test_a_point_far_away_does_not_coarsen_the_order(installed):
+def test_a_far_point_does_not_coarsen_the_order(installed):
     cloud = uniform(20_000, 31)
     far = np.float32([[1e9, 1e9, 1e9]])
     alone = np.median(leaf_sizes(cloud))
@@ -288,7 +288,7 @@ def test_a_point_far_away_does_not_coarsen_the_order(installed):
 
 
 @if_installed
-def test_keys_are_the_bits_of_the_cells_along_the_axes_in_turn_and_then_the_index(installed):
+def test_keys_interleave_the_bits_of_cells(installed):
     cells = generator(44).integers(0, packets.AXIS_CELLS, (500, 3))
     cells[:2] = [[0] * 3, [packets.AXIS_CELLS - 1] * 3]
     keys = packets._compute_morton_keys(cells.astype(np.float32) - 7)
@@ -299,7 +299,7 @@ def test_keys_are_the_bits_of_the_cells_along_the_axes_in_turn_and_then_the_inde
 
 
 @if_installed
-def test_crowds_are_the_runs_of_more_equal_cells_than_are_left_alone(installed):
+def test_crowds_are_long_runs_of_equal_cells(installed):
     counts = [3, packets.CROWD, packets.CROWD + 1, 1, 5000, packets.CROWD - 1, 2 * packets.CROWD]
     cells, ends = np.repeat(np.arange(len(counts), dtype=np.uint64), counts), np.cumsum(counts)
     keys = (cells << np.uint64(31)) + np.arange(len(cells), dtype=np.uint64)[::-1]
@@ -309,7 +309,7 @@ def test_crowds_are_the_runs_of_more_equal_cells_than_are_left_alone(installed):
 
 @if_installed
 @pytest.mark.parametrize("count", [1, 16, 17, 100, 1000])
-def test_boxes_and_smallest_indices_are_of_all_that_is_beneath(installed, count):
+def test_nodes_bound_all_points_below_them(installed, count):
     points, order = uniform(count, 46), generator(47).permutation(count)
     leaves, indices, boxes, smallest = packets._build_tree(points, order)
     filled = np.concatenate([order, np.repeat(order[-1:], -count % 16)]).reshape(-1, 16)
@@ -327,7 +327,7 @@ def test_boxes_and_smallest_indices_are_of_all_that_is_beneath(installed, count)
 
 @if_installed
 @pytest.mark.parametrize("count", [64, 40])
-def test_a_packet_knows_its_box_and_its_least_distances_and_whether_a_box_may_lessen_them(installed, as_python, count):
+def test_packets_know_which_boxes_may_improve_them(installed, as_python, count):
     query, part = uniform(100, 48), generator(49).permutation(100)[:count]
     points = np.sort(uniform(64, 50), axis=0) + np.float32([60, 0, 0])  # some boxes beside all queries
     leaves, indices, boxes, smallest = packets._build_tree(points, np.arange(64))
@@ -355,7 +355,7 @@ def test_a_packet_knows_its_box_and_its_least_distances_and_whether_a_box_may_le
 
 @if_installed
 @pytest.mark.parametrize("axis", range(3))
-def test_the_order_is_as_fine_along_whichever_axis_a_cloud_is_long(installed, axis):
+def test_order_is_equally_fine_along_each_axis(installed, axis):
     cloud = uniform(20_000, 45) * np.float32([100, 1, 0.01])
     assert np.median(leaf_sizes(np.roll(cloud, axis, axis=1))) < 1.1 * np.median(leaf_sizes(cloud)) < 60
 
@@ -373,7 +373,7 @@ def test_equal_points_keep_their_order(installed):
     assert compute_morton_order(np.ones((5000, 3), np.float32)).tolist() == list(range(5000))
 
 
-def test_without_its_library_a_backend_says_what_to_install(monkeypatch):
+def test_backends_name_the_library_to_install(monkeypatch):
     for name in ("packets", "compiled", "morton", "warp"):
         monkeypatch.delitem(sys.modules, f"torchcover.neighbors.{name}", raising=False)
     for backend, library, extra in (("packets", "numba", "fast"), ("warp", "warp", "warp")):

@@ -380,7 +380,7 @@ def mislabelled_member():
     return stream.getvalue()
 
 
-def test_laz_files_are_read_after_meshes_by_the_same_process(tmp_path):
+def test_laz_files_are_read_after_meshes(tmp_path):
     """Libraries look into all loaded modules, among them the one that stands in for a detector of encodings."""
     mesh = tmp_path / "triangle.obj"
     mesh.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
