@@ -21,11 +21,9 @@ def saved(scenes, measured):
         settings = {"num_frames": 16, "cell_m": 4.0, "thresholds_m": (2.0,), "num_rays": 1024, **changes}
         key = rig, *settings.items()
         if key not in measured:
-            measured[key] = evaluate(scenes / f"{rig}.yaml", scenes / "yard.yaml", **settings).coverage
-        file = scenes / rig / "coverage.npz"
-        file.parent.mkdir()
-        measured[key].save(file)
-        return file
+            measured[key] = evaluate(scenes / f"{rig}.yaml", scenes / "yard.yaml", **settings)
+        measured[key].save(scenes / rig, file_kinds="numbers")
+        return scenes / rig / "coverage.npz"
 
     return run
 

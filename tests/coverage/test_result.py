@@ -297,7 +297,7 @@ def rewrite(path, header=None, **arrays):
         {"header": lambda _: "[1]"},
         {"header": lambda _: "3"},
         {"header": lambda _: "no JSON"},
-        {"header": lambda _: '{"format": 11}'},
+        {"header": lambda _: '{"format": 12}'},
         {"header": lambda old: json.dumps({name: value for name, value in old.items() if name != "counts"})},
         {"header": lambda old: json.dumps({**old, "grid": {**old["grid"], "cell_m": 0.7}})},
     ],
@@ -367,10 +367,10 @@ def test_an_array_file_is_no_coverage_file(saved):
         Coverage.load(saved)
 
 
-@pytest.mark.parametrize(("number", "then"), [(10, "; evaluate the recording or scenario again"), (12, "$")])
+@pytest.mark.parametrize(("number", "then"), [(11, "; evaluate the recording or scenario again"), (13, "$")])
 def test_another_format_is_refused_by_its_number(saved, number, then):
     rewrite(saved, header=lambda old: json.dumps({**old, "format": number, "unheard of": 1}))
-    said = rf"coverage\.npz: coverage format {number}; this torchcover reads format 11{then}"
+    said = rf"coverage\.npz: coverage format {number}; this torchcover reads format 12{then}"
     with pytest.raises(ValueError, match=said):
         Coverage.load(saved)
 

@@ -20,7 +20,8 @@ from tests.recordings.layouts import LAYOUTS
 from tests.simulation.recorded.drives import OTHERS, write_argoverse2, write_commonroad, write_csv, write_nuscenes
 from tests.simulation.sumo.towns import XODR, drive, fcd, street, together, write_net
 from torchcover.cameras import Camera, read_depth
-from torchcover.coverage import BevGrid, Coverage, CoverageMetric
+from torchcover.coverage import BevGrid, Coverage, CoverageMetric, Region, TargetSums
+from torchcover.coverage.target_sums import read_target_sums
 from torchcover.data import read_cloud
 from torchcover.evaluation.checkpoint import read_header, read_state, write_checkpoint
 from torchcover.files import read_json_table
@@ -135,6 +136,15 @@ def coverage(folder):
     path = Path(folder, "seed.npz")
     metric.compute().save(path)
     return path.read_bytes()
+
+
+def target_sums():
+    """Sums of one test target in one region and two blocks."""
+    grid, region = BevGrid(x_m=(0.0, 4.0), y_m=(0.0, 2.0), cell_m=1.0), Region("front", (0.0, 4.0), (0.0, 2.0))
+    counts, sums, maps = torch.tensor([3, 4]), torch.ones(2, 1, 1, 5), torch.ones(1, 2, 4, 2)
+    file = io.BytesIO()
+    np.savez(file, **TargetSums(("pole",), (region,), 5, 0.4, grid, counts, sums.double(), maps.double()).to_arrays())
+    return file.getvalue()
 
 
 ROS = b"""image_width: 640
@@ -355,6 +365,7 @@ def kinds(folder):
         Kind("sensors.json", CARLA, read_carla_sensors),
         Kind("labels.csv", LABELS, frame_files.read_boxes),
         Kind("coverage.npz", coverage(folder), Coverage.load),
+        Kind("targets.npz", target_sums(), read_target_sums),
         *scene_files(),
         *track_files(folder),
         *recording_files(folder),

@@ -80,12 +80,7 @@ def test_files_contain_test_targets_for_comparisons(both, tmp_path):
         {**row, "vehicle": None, "sensor_model": None} for row in select_target_rows(both)
     ]
     loaded = Coverage.load(tmp_path / "coverage" / "roof.npz")
-    scalars = both.coverages["roof"].scalars()
-    assert loaded.scalars() == pytest.approx(scalars, rel=0, abs=0, nan_ok=True)
-    assert (
-        scalars["target_positions_5_points/left_3m/pole_100cm"]
-        == select_target_rows(both, rig="roof")[2]["target_positions_5_points"]
-    )
+    assert loaded.scalars() == pytest.approx(both.coverages["roof"].scalars(), rel=0, abs=0, nan_ok=True)
     rows = list(csv.DictReader((tmp_path / "summary.csv").read_text().splitlines()))
     assert [row["region"] for row in rows if row["band"] == "pole_100cm"] == SIDES * 2
     assert json.loads((tmp_path / "summary.json").read_text())["rows"] == both.summary

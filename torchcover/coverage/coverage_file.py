@@ -24,7 +24,6 @@ from torchcover.coverage.redundancy import Redundancy, list_redundancy_quantitie
 from torchcover.coverage.region_sums import AggregatedNumbers, RegionSums
 from torchcover.coverage.regions import Region
 from torchcover.coverage.sparse_sums import BlockSums, ObservedCells
-from torchcover.coverage.target_sums import TargetColumn, TargetSums
 from torchcover.estimation import Quantity
 from torchcover.files import (
     TooLargeError,
@@ -40,29 +39,29 @@ from torchcover.metrics.blocked_sums import FINE_BLOCKS_PER_BLOCK
 Arrays = dict[str, NDArray[Any]]
 
 # Raised whenever a header key, an array name or the meaning of an array changes.
-FORMAT_VERSION = 11
+FORMAT_VERSION = 12
 # Names of the arrays of each part, in the order of the fields of the class that holds them.
 BLOCK_ARRAYS = ("block_frame_counts", "block_cell", "block_observed_frames", "block_sums")
 AREA_ARRAYS = ("area_frame_counts", "area_cell", "area_m2", "area_sums")
 REGION_ARRAYS = ("region_frame_counts", "region_areas_m2", "region_sums")
-TARGET_ARRAYS = ("target_frame_counts", "target_sums", "target_position_counts")
 AGGREGATED_ARRAYS = ("region_numbers", "region_numbers_jackknife")
 
 
-def write_coverage(attributes: Mapping[str, Any], path: Path) -> None:
+def write_coverage(attributes: Mapping[str, Any], further_arrays: Mapping[str, NDArray[Any]], path: Path) -> None:
     """Write a coverage to one compressed file, with the standard errors of its maps for readers without torchcover.
 
     Args:
         attributes: Attributes of the `Coverage`, with its `sparse_errors`.
+        further_arrays: Arrays by name that are not part of the coverage.
         path: File to be written.
     """
-    arrays: dict[str, Any] = {name: tensor.cpu().numpy() for name, tensor in _collect_tensors(attributes).items()}
+    arrays: Arrays = {name: tensor.cpu().numpy() for name, tensor in _collect_tensors(attributes).items()}
     arrays["cell"] = _shrink_indices(arrays["cell"], attributes["grid"].num_cells)
     if attributes["block_sums"] is not None:
         arrays |= _convert_block_sums(attributes["block_sums"], BLOCK_ARRAYS)
     if attributes["area_sums"] is not None:
         arrays |= _convert_block_sums(attributes["area_sums"], AREA_ARRAYS)
-    write_npz(path, {"header": np.array(json.dumps(_build_header(attributes))), **arrays})
+    write_npz(path, {"header": np.array(json.dumps(_build_header(attributes))), **arrays, **further_arrays})
 
 
 def _build_header(attributes: Mapping[str, Any]) -> dict[str, Any]:
@@ -85,13 +84,12 @@ def _build_header(attributes: Mapping[str, Any]) -> dict[str, Any]:
         "aggregated_quantities": [quantity._asdict() for quantity in aggregated_quantities],
         "sensor_names": None if redundancy is None else redundancy.sensor_names,
         "redundancy_layers": [layer.quantity._asdict() for layer in redundancy_layers],
-        "targets": None if attributes["target_sums"] is None else attributes["target_sums"].to_record(),
     }
 
 
 def _collect_tensors(attributes: Mapping[str, Any]) -> dict[str, Tensor]:
     """Collect the tensors of a coverage by the name of their array, except for sums in blocks."""
-    observed, targets = attributes["observed_cells"], attributes["target_sums"]
+    observed = attributes["observed_cells"]
     tensors = {
         "cell": observed.cell_indices,
         "observed_frames": observed.observed_frames,
@@ -105,9 +103,6 @@ def _collect_tensors(attributes: Mapping[str, Any]) -> dict[str, Tensor]:
         tensors |= {key: layer.values for key, layer in attributes["redundancy"].sparse_layers.items()}
     if attributes["region_sums"] is not None:
         tensors |= dict(zip(REGION_ARRAYS, attributes["region_sums"], strict=True))
-    if targets is not None:
-        target_tensors = (targets.frame_counts, targets.sums, targets.position_counts)
-        tensors |= dict(zip(TARGET_ARRAYS, target_tensors, strict=True))
     return tensors
 
 
@@ -156,11 +151,10 @@ def _parse_arguments(header: dict[str, Any], arrays: Arrays) -> dict[str, Any]:
         "counts": header["counts"],
         "block_sums": _parse_block_sums(BLOCK_ARRAYS, header, grid, arrays) if has_blocks else None,
         "area_sums": _parse_block_sums(AREA_ARRAYS, header, grid, arrays) if header["has_area_weights"] else None,
-        "regions": [_parse_region(record) for record in header["regions"]],
+        "regions": [Region.from_record(record) for record in header["regions"]],
         "region_sums": _parse_region_sums(header, grid, arrays) if header["has_region_sums"] else None,
         "aggregated_numbers": _parse_aggregated(header, grid, arrays) if header["aggregated_quantities"] else None,
         "redundancy": _parse_redundancy(header, observed_cells, arrays) if has_redundancy else None,
-        "target_sums": None if header["targets"] is None else _parse_target_sums(header["targets"], arrays),
     }
 
 
@@ -170,27 +164,6 @@ def _check_memory_of_maps(grid: BevGrid, observed_cells: ObservedCells, arrays: 
     # One map of all cells exists at a time; errors need three arrays over blocks and observed cells.
     float64_count = grid.num_cells + 3 * max(block_counts, default=0) * len(observed_cells.cell_indices)
     check_memory(8 * float64_count + sum(array.nbytes for array in arrays.values()))
-
-
-def _parse_target_sums(record: dict[str, Any], arrays: Arrays) -> TargetSums:
-    """Parse the sums of test targets and check their shapes."""
-    grid = BevGrid(**record.pop("grid"))
-    names = tuple(record.pop("target_names"))
-    regions = tuple(_parse_region(region) for region in record.pop("regions"))
-    frame_counts, sums, position_counts = (torch.from_numpy(arrays[name]) for name in TARGET_ARRAYS)
-    expected_shapes = (len(frame_counts), len(names), len(regions), len(TargetColumn)), (len(names), *grid.shape[1:], 2)
-    shapes = tuple(sums.shape), tuple(position_counts.shape)
-    if shapes != expected_shapes:
-        raise ValueError(f"the sums of {len(names)} test targets have shapes {shapes}, not {expected_shapes}")
-    return TargetSums(
-        target_names=names,
-        regions=regions,
-        grid=grid,
-        frame_counts=frame_counts,
-        sums=sums,
-        position_counts=position_counts,
-        **record,
-    )
 
 
 def _parse_aggregated(header: dict[str, Any], grid: BevGrid, arrays: Arrays) -> AggregatedNumbers:
@@ -235,11 +208,6 @@ def _parse_observed_cells(grid: BevGrid, arrays: Arrays) -> ObservedCells:
 def _parse_layers(records: Sequence[dict[str, Any]], arrays: Arrays) -> list[Layer]:
     quantities = [Quantity(**record) for record in records]
     return [Layer(quantity, _get_cell_array(quantity.key, arrays)) for quantity in quantities]
-
-
-def _parse_region(record: Mapping[str, Any]) -> Region:
-    corners_m = tuple((x_m, y_m) for x_m, y_m in record["corners_m"])
-    return Region(record["name"], tuple(record["x_m"]), tuple(record["y_m"]), corners_m, tuple(record["bands"]))
 
 
 def _parse_block_sums(names: Sequence[str], header: dict[str, Any], grid: BevGrid, arrays: Arrays) -> BlockSums:

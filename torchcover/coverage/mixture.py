@@ -6,7 +6,6 @@ from dataclasses import replace
 from torchcover.coverage.regions import Region, list_region_bands
 from torchcover.coverage.result import Coverage
 from torchcover.coverage.summary import RegionSummary, convert_to_cell_numbers, summarize_redundancy
-from torchcover.coverage.target_sums import TargetMixture
 from torchcover.estimation import Estimate
 
 
@@ -19,7 +18,7 @@ class CoverageMixture:
         scenario_coverages: Weight and result by the name of the scenario; weights are above 0 and sum to 1.
 
     Raises:
-        ValueError: Two results differ in grid, thresholds, average, regions or test targets.
+        ValueError: Two results differ in grid, thresholds, average or regions.
     """
 
     def __init__(self, scenario_coverages: Mapping[str, tuple[float, Coverage]]) -> None:
@@ -32,14 +31,6 @@ class CoverageMixture:
         self.grid, self.thresholds_m, self.max_radius_m = first.grid, first.thresholds_m, first.max_radius_m
         self.average, self.quantities = first.average, first.quantities
         self.aggregated_numbers = first.aggregated_numbers
-        target_sums = [(weight, part.target_sums) for weight, part in self.weighted_coverages if part.target_sums]
-        self.target_sums = None
-        if target_sums:
-            region_targets = target_sums[0][1].region_targets
-            is_equal = all(sums.region_targets == region_targets for _, sums in target_sums)
-            if not is_equal or len(target_sums) < len(self.weighted_coverages):
-                raise ValueError("scenarios cannot be mixed: they differ in their test targets; use the same in all")
-            self.target_sums = TargetMixture(target_sums, region_targets)
 
     def _mix(self, estimate: Callable[[Coverage], Estimate]) -> Estimate:
         """Combine the estimates of all scenarios."""

@@ -8,7 +8,11 @@ import torch
 from torchcover.coverage.mixture import CoverageMixture
 from torchcover.coverage.regions import Region
 from torchcover.coverage.result import Coverage
+from torchcover.coverage.target_sums import TargetMixture, TargetSums
 from torchcover.estimation import Difference, Estimate
+
+# Numbers of one rig that can be compared with those of other rigs.
+MeasuredRig = Coverage | CoverageMixture | TargetSums | TargetMixture
 
 
 def check_paired(coverages: Mapping[str, Coverage]) -> None:
@@ -18,8 +22,8 @@ def check_paired(coverages: Mapping[str, Coverage]) -> None:
         coverages: Results by the name of the rig.
 
     Raises:
-        ValueError: There are fewer than two, or two differ in grid, band frame, thresholds, maximum radius, test
-            targets, frames, or reference points of any cell.
+        ValueError: There are fewer than two, or two differ in grid, band frame, thresholds, maximum radius, frames,
+            or reference points of any cell.
     """
     if len(coverages) < 2:
         raise ValueError(f"a comparison needs at least two rigs; got {', '.join(coverages) or 'none'}")
@@ -29,10 +33,6 @@ def check_paired(coverages: Mapping[str, Coverage]) -> None:
         for attribute in ("band_frame", "grid", "thresholds_m", "max_radius_m"):
             if getattr(coverage, attribute) != getattr(expected, attribute):
                 raise ValueError(f"{subject}: they differ in their {attribute}")
-        targets = coverage.target_sums and coverage.target_sums.region_targets
-        expected_targets = expected.target_sums and expected.target_sums.region_targets
-        if targets != expected_targets:
-            raise ValueError(f"{subject}: they were measured with different test targets")
         if coverage.average != expected.average or coverage.layers.keys() != expected.layers.keys():
             raise ValueError(f"{subject}: they have different layers")
         if not _has_same_points(coverage, expected):
@@ -53,58 +53,51 @@ def _has_same_points(a: Coverage, b: Coverage) -> bool:
     return torch.equal(a.block_sums.frame_counts, b.block_sums.frame_counts)
 
 
-def _list_estimates(
-    coverage: Coverage | CoverageMixture, region: Region, band_or_target: str, is_target: bool
-) -> list[Estimate]:
+def _list_estimates(result: MeasuredRig, region: Region, band: str) -> list[Estimate]:
     """List the estimates of a region in a band, or of a test target in a region."""
-    if is_target:
-        assert coverage.target_sums is not None
-        return [coverage.target_sums.estimate(region, band_or_target)]
-    return [coverage.estimate(region, band_or_target), coverage.estimate_aggregated(region, band_or_target)]
+    if isinstance(result, Coverage | CoverageMixture):
+        return [result.estimate(region, band), result.estimate_aggregated(region, band)]
+    return [result.estimate(region, band)]
 
 
 def compute_differences(
-    coverages: Mapping[str, Coverage | CoverageMixture], region: Region, band_or_target: str, *, is_target: bool = False
+    results: Mapping[str, MeasuredRig], region: Region, band: str
 ) -> dict[str, dict[str, Difference]]:
     """Compute the difference of every rig, including the first, to the first.
 
     Args:
-        coverages: Results by the name of the rig, from the same frames.
+        results: Coverages or sums of test targets by the name of the rig, from the same frames.
         region: Region within the grid.
-        band_or_target: Name of a height band, or of a test target.
-        is_target: The name is that of a test target; the differences are those of target visibility.
+        band: Name of a height band; for sums of test targets, the name of a target.
 
     Returns:
         For each rig, the differences by the key of their quantity.
     """
-    baselines = _list_estimates(next(iter(coverages.values())), region, band_or_target, is_target)
+    baselines = _list_estimates(next(iter(results.values())), region, band)
     differences: dict[str, dict[str, Difference]] = {}
-    for name, coverage in coverages.items():
+    for name, result in results.items():
         differences[name] = {}
-        estimates = _list_estimates(coverage, region, band_or_target, is_target)
+        estimates = _list_estimates(result, region, band)
         for estimate, baseline in zip(estimates, baselines, strict=True):
             differences[name] |= estimate.compute_differences(baseline)
     return differences
 
 
-def find_leaders(
-    coverages: Mapping[str, Coverage | CoverageMixture], region: Region, band_or_target: str, *, is_target: bool = False
-) -> dict[str, str]:
+def find_leaders(results: Mapping[str, MeasuredRig], region: Region, band: str) -> dict[str, str]:
     """Find the best rig of each quantity, where its difference to the second is significant.
 
     Args:
-        coverages: As in `compute_differences`.
+        results: As in `compute_differences`.
         region: As in `compute_differences`.
-        band_or_target: As in `compute_differences`.
-        is_target: As in `compute_differences`.
+        band: As in `compute_differences`.
 
     Returns:
         Name of the rig by the key of the quantity; quantities without a significant leader are missing.
     """
-    estimates = [_list_estimates(coverage, region, band_or_target, is_target) for coverage in coverages.values()]
+    estimates = [_list_estimates(result, region, band) for result in results.values()]
     leaders = {}
     for rig_estimates in zip(*estimates, strict=True):
-        estimate_by_rig = dict(zip(coverages, rig_estimates, strict=True))
+        estimate_by_rig = dict(zip(results, rig_estimates, strict=True))
         for index, quantity in enumerate(rig_estimates[0].quantities):
             scores = {}
             for rig, estimate in estimate_by_rig.items():

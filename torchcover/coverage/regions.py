@@ -1,8 +1,9 @@
 """Regions of interest: named rectangles and polygons in bird's-eye view."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -76,6 +77,16 @@ class Region:
             raise ValueError(f"region {name!r}: three different corners or more are needed; got {len(set(corners))}")
         x, y = zip(*corners, strict=True)
         return cls(name, (min(x), max(x)), (min(y), max(y)), corners)
+
+    @classmethod
+    def from_record(cls, record: Mapping[str, Any]) -> "Region":
+        """Create a region from its fields in JSON, as `dataclasses.asdict` returns them.
+
+        Args:
+            record: Fields.
+        """
+        corners_m = tuple((x_m, y_m) for x_m, y_m in record["corners_m"])
+        return cls(record["name"], tuple(record["x_m"]), tuple(record["y_m"]), corners_m, tuple(record["bands"]))
 
     def _check_polygon(self) -> None:
         """Check that edges do not cross, and that the corners have the bounds of the region."""

@@ -20,7 +20,6 @@ from torchcover.coverage.region_sums import AggregatedNumbers, RegionSums
 from torchcover.coverage.regions import Region, RegionBands, check_regions, get_paper_regions, list_region_bands
 from torchcover.coverage.sparse_sums import BlockSums, LazyMaps, ObservedCells
 from torchcover.coverage.summary import RegionSummary, convert_to_cell_numbers, summarize_redundancy
-from torchcover.coverage.target_sums import TargetSums
 from torchcover.estimation import Estimate, Quantity
 from torchcover.files import write_atomically
 from torchcover.notebooks import build_dataframe, build_result_html, build_xarray_dataset
@@ -30,6 +29,7 @@ if TYPE_CHECKING:
     import xarray
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+    from numpy.typing import NDArray
 
 
 class Coverage:
@@ -51,7 +51,6 @@ class Coverage:
         region_sums: Sums over area in `regions`, by the position of each point; None without area weights.
         aggregated_numbers: Numbers of other aggregations in `regions`; None without them.
         redundancy: Coverage without each sensor; None if the metric does not distinguish sensors.
-        target_sums: Visibility of test targets; None without them.
 
     Attributes:
         sparse_layers: (K,) layers by the key of their quantity.
@@ -82,7 +81,6 @@ class Coverage:
         region_sums: RegionSums | None = None,
         aggregated_numbers: AggregatedNumbers | None = None,
         redundancy: Redundancy | None = None,
-        target_sums: TargetSums | None = None,
     ) -> None:
         self.grid = grid
         self.thresholds_m = tuple(thresholds_m)
@@ -96,7 +94,6 @@ class Coverage:
         self.region_sums = region_sums
         self.aggregated_numbers = aggregated_numbers
         self.redundancy = redundancy
-        self.target_sums = target_sums
         self._paper_means: dict[tuple[Region, str], Estimate] = {}
 
     def __repr__(self) -> str:
@@ -133,7 +130,7 @@ class Coverage:
         return ax.figure  # type: ignore[return-value]  # the figure around a subfigure is not needed
 
     def to_dataframe(self, regions: Sequence[Region] | None = None) -> "pandas.DataFrame":
-        """Convert the numbers of `scalars` to a table with one row per region and height band or test target.
+        """Convert the numbers of `scalars` to a table with one row per region and height band.
 
         Args:
             regions: As in `summary`.
@@ -142,7 +139,7 @@ class Coverage:
             ModuleNotFoundError: pandas is not installed.
         """
         records = []
-        for row in self._list_rows(regions):
+        for row in self.summary(regions):
             values = row.to_dict(include_errors=self.block_sums is not None)
             records.append({"region": row.region, "band": row.band, **values})
         return build_dataframe(records)
@@ -380,22 +377,21 @@ class Coverage:
             `"visible_m2/20m/ground"` with area weights.
         """
         values: dict[str, float] = {}
-        for row in self._list_rows(regions):
+        for row in self.summary(regions):
             values |= row.to_scalars(include_errors=self.block_sums is not None)
         return values
 
-    def _list_rows(self, regions: Sequence[Region] | None) -> list[RegionSummary]:
-        return [*self.summary(regions), *(self.target_sums.summarize() if self.target_sums else ())]
-
-    def save(self, path: str | Path) -> None:
+    def save(self, path: str | Path, further_arrays: "Mapping[str, NDArray[Any]] | None" = None) -> None:
         """Write the result to one `.npz` file, which NumPy can read: lists over observed cells, and the blocks.
 
         `load` restores numbers, errors and differences to the last bit.
 
         Args:
             path: File; it is replaced atomically.
+            further_arrays: Arrays by name that the file also contains; `load` skips them.
         """
-        write_atomically(Path(path), partial(write_coverage, vars(self) | {"sparse_errors": self.sparse_errors}))
+        attributes = vars(self) | {"sparse_errors": self.sparse_errors}
+        write_atomically(Path(path), partial(write_coverage, attributes, further_arrays or {}))
 
     @classmethod
     def load(cls, path: str | Path) -> "Coverage":

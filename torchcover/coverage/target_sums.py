@@ -1,17 +1,27 @@
 """Visibility of test targets around the vehicle: shares of free positions and of surface with detection."""
 
+import json
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from enum import IntEnum
+from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from torchcover.coverage.grid import BevGrid
 from torchcover.coverage.regions import Region
 from torchcover.coverage.summary import RegionSummary
 from torchcover.estimation import Estimate, Quantity
+from torchcover.files import check_dtype_kind, guard_reader, parse_json, read_npz
+
+# Names of the arrays in a coverage file: the header as JSON, then tensors in the order of the fields of `TargetSums`.
+TARGET_ARRAYS = ("target_header", "target_frame_counts", "target_sums", "target_position_counts")
 
 
 class TargetColumn(IntEnum):
@@ -108,18 +118,57 @@ class TargetSums:
             )
         return rows
 
-    def to_record(self) -> dict[str, Any]:
-        """Convert everything except the tensors to a JSON record."""
-        return {
+    def to_arrays(self) -> dict[str, NDArray[Any]]:
+        """Convert to arrays by name, for `Coverage.save`; `read_target_sums` reads them."""
+        header = {
             "target_names": self.target_names,
             "detection_points": self.detection_points,
             "threshold_m": self.threshold_m,
             "regions": [asdict(region) for region in self.regions],
             "grid": {"x_m": self.grid.x_m, "y_m": self.grid.y_m, "cell_m": self.grid.cell_m},
         }
+        tensors = (self.frame_counts, self.sums, self.position_counts)
+        arrays = {name: tensor.numpy() for name, tensor in zip(TARGET_ARRAYS[1:], tensors, strict=True)}
+        return {TARGET_ARRAYS[0]: np.array(json.dumps(header)), **arrays}
 
     def _get_sums(self, region: Region, target_name: str) -> Tensor:
         return self.sums[:, self.target_names.index(target_name), self.regions.index(region)]
+
+
+@guard_reader("saved test targets")
+def read_target_sums(path: Path) -> TargetSums | None:
+    """Read the sums of test targets from a coverage file.
+
+    Args:
+        path: File that `Coverage.save` wrote; it may come from an untrusted source.
+
+    Returns:
+        The sums; None if the file has none.
+
+    Raises:
+        BadFileError: The file is damaged or too large.
+    """
+    arrays = read_npz(path, partial(check_dtype_kind, "fiuU"), set(TARGET_ARRAYS).intersection)
+    if not arrays:
+        return None
+    header: dict[str, Any] = parse_json(str(arrays[TARGET_ARRAYS[0]]))
+    grid = BevGrid(**header.pop("grid"))
+    names = tuple(header.pop("target_names"))
+    regions = tuple(Region.from_record(record) for record in header.pop("regions"))
+    frame_counts, sums, position_counts = (torch.from_numpy(arrays[name]) for name in TARGET_ARRAYS[1:])
+    expected_shapes = (len(frame_counts), len(names), len(regions), len(TargetColumn)), (len(names), *grid.shape[1:], 2)
+    shapes = tuple(sums.shape), tuple(position_counts.shape)
+    if shapes != expected_shapes:
+        raise ValueError(f"the sums of {len(names)} test targets have shapes {shapes}, not {expected_shapes}")
+    return TargetSums(
+        target_names=names,
+        regions=regions,
+        grid=grid,
+        frame_counts=frame_counts,
+        sums=sums,
+        position_counts=position_counts,
+        **header,
+    )
 
 
 class TargetMixture(NamedTuple):
@@ -132,6 +181,28 @@ class TargetMixture(NamedTuple):
 
     parts: Sequence[tuple[float, TargetSums]]
     region_targets: Sequence[tuple[Region, str]]
+
+    @classmethod
+    def from_parts(cls, parts: Sequence[tuple[float, TargetSums | None]]) -> "TargetMixture | None":
+        """Mix the sums of scenarios.
+
+        Args:
+            parts: Weights that sum to 1, and sums of each scenario; None without test targets.
+
+        Returns:
+            The mixture; None if no scenario has test targets.
+
+        Raises:
+            ValueError: Two scenarios differ in regions or test targets.
+        """
+        weighted_sums = [(weight, sums) for weight, sums in parts if sums is not None]
+        if not weighted_sums:
+            return None
+        region_targets = weighted_sums[0][1].region_targets
+        is_equal = all(sums.region_targets == region_targets for _, sums in weighted_sums)
+        if not is_equal or len(weighted_sums) < len(parts):
+            raise ValueError("scenarios cannot be mixed: they differ in their test targets; use the same in all")
+        return cls(weighted_sums, region_targets)
 
     def estimate(self, region: Region, target_name: str) -> Estimate:
         """Estimate the weighted mean of `TargetSums.estimate`.

@@ -4,7 +4,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from torchcover.coverage import Coverage
+from torchcover.coverage import Coverage, TargetSums
+from torchcover.coverage.target_sums import read_target_sums
 from torchcover.evaluation.arguments import accept_fields
 from torchcover.evaluation.config import DESCRIPTIONS
 from torchcover.evaluation.measurement import measure_coverage
@@ -85,12 +86,14 @@ class _MeasuredRig(NamedTuple):
         coverage: Its coverage.
         path: Coverage file, or the name or file of the rig that the user gave.
         source: Source of the frames.
+        target_sums: Visibility of test targets; None without them.
     """
 
     name: str
     coverage: Coverage
     path: str | Path
     source: Mapping[str, Any]
+    target_sums: TargetSums | None
 
 
 def _compare_single(inputs: Sequence[Result | str | Path]) -> Result:
@@ -117,6 +120,7 @@ def _compare_single(inputs: Sequence[Result | str | Path]) -> Result:
         source=source,
         reference_record=None,
         device=None,
+        target_sums={name: rig.target_sums for name, rig in zip(names, rigs, strict=True) if rig.target_sums},
         input_files=[rig.path for rig in rigs if isinstance(rig.path, Path)],
     )
 
@@ -125,7 +129,7 @@ def _list_measured_rigs(item: Result | str | Path) -> list[_MeasuredRig]:
     """List the rigs of a result, or the rig of a coverage file."""
     if isinstance(item, Result):
         return [
-            _MeasuredRig(name, coverage, item.rigs[name] or name, item.source)
+            _MeasuredRig(name, coverage, item.rigs[name] or name, item.source, item.target_sums.get(name))
             for name, coverage in item.coverages.items()
         ]
     if not isinstance(item, str | Path):
@@ -135,4 +139,4 @@ def _list_measured_rigs(item: Result | str | Path) -> list[_MeasuredRig]:
         raise ValueError(f"{item}: not measured; compare takes results and .npz files, and `evaluate` several rigs")
     # `evaluate` names its file `coverage.npz` in any folder, so that the folder is the better name.
     name = file.absolute().parent.name if file.stem == "coverage" else file.stem
-    return [_MeasuredRig(name, Coverage.load(file), file, {})]
+    return [_MeasuredRig(name, Coverage.load(file), file, {}, read_target_sums(file))]

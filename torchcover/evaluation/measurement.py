@@ -103,9 +103,9 @@ def measure_coverage(
         observed = _observe_frames(task, settings, further_observers, stopping_rule)
     coverages = {name: observer.compute() for name, observer in observed.coverage.items()}
     target_observer = observed.further_observers.get(NEAR_FIELD_TARGETS)
+    target_sums = {}
     if isinstance(target_observer, NearFieldObserver):
-        for name, coverage in coverages.items():
-            coverage.target_sums = target_observer.get_target_sums(name)
+        target_sums = {name: target_observer.get_target_sums(name) for name in coverages}
     if len({coverage.counts["num_frames"] for coverage in coverages.values()}) > 1:
         observed.run.raise_failure()  # an observer failed within a frame, so that rigs differ in their frames
     metric_report = None
@@ -121,6 +121,7 @@ def measure_coverage(
         source=task.description,
         reference_record=task.frames.reference_record,
         device=settings.device,
+        target_sums=target_sums,
         target_error=settings.target_error,
         target_regions=task.query_plan.target_regions,
         sensors=task.sensors,

@@ -10,6 +10,7 @@ from typing import Any
 from matplotlib.figure import Figure
 
 from torchcover.coverage import Coverage, CoverageMixture
+from torchcover.coverage.target_sums import TargetMixture
 from torchcover.evaluation.checkpoint import Checkpoint
 from torchcover.evaluation.measurement import measure_coverage
 from torchcover.evaluation.result import Result
@@ -95,6 +96,19 @@ class MixedResult(Result):
             mixtures[rig] = CoverageMixture(parts)
         return mixtures
 
+    def _mix_targets(self) -> dict[str, TargetMixture]:
+        """Mix the visibility of test targets for each rig with test targets."""
+        mixtures = {}
+        for rig in self.mixtures:
+            parts = []
+            for name, weight in self.weights.items():
+                if weight > 0.0:
+                    parts.append((weight, self.scenario_results[name].target_sums.get(rig)))
+            mixture = TargetMixture.from_parts(parts)
+            if mixture is not None:
+                mixtures[rig] = mixture
+        return mixtures
+
     @cached_property
     def table(self) -> CoverageTable:
         """Numbers of the mixture with standard errors, differences and marks."""
@@ -105,7 +119,9 @@ class MixedResult(Result):
             "unknown in the mixture; each map shows one scenario."
         )
         scenario_notes = merge_notes({name: result.notes for name, result in self.scenario_results.items()})
-        return CoverageTable.from_coverages(self.mixtures, self.regions, [note, *scenario_notes], self.source)
+        return CoverageTable.from_coverages(
+            self.mixtures, self.regions, [note, *scenario_notes], self.source, target_sums=self._mix_targets()
+        )
 
     @property
     def record(self) -> dict[str, Any]:

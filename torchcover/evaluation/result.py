@@ -2,7 +2,7 @@
 
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from torchcover import __version__
-from torchcover.coverage import Coverage, Region
+from torchcover.coverage import Coverage, Region, TargetSums
 from torchcover.coverage.quantities import make_area_quantity
 from torchcover.evaluation.omissions import Omission, build_omissions_table
 from torchcover.evaluation.pipeline import Run
@@ -86,6 +86,7 @@ class Result:
         source: Source of the frames, with the keys `scenario`, `vehicle`, `frames`, `seed` and others.
         reference_record: Source of the reference points, see `FrameSource.reference_record`; None if unknown.
         device: Device of the measurement; None if unknown.
+        target_sums: Name of each rig -> visibility of test targets in the near field; empty without them.
         target_error: Requested standard errors.
         target_regions: Regions to which `target_error` applies.
         sensors: Name of each rig -> its sensors, for maps; rigs with unknown sensors are missing.
@@ -104,6 +105,7 @@ class Result:
     source: Mapping[str, object]
     reference_record: Mapping[str, Any] | None
     device: str | None
+    target_sums: Mapping[str, TargetSums] = field(default_factory=dict)
     target_error: TargetError | None = None
     target_regions: Sequence[Region] = ()
     sensors: Mapping[str, Sequence[Sensor]] = field(default_factory=dict)
@@ -139,7 +141,9 @@ class Result:
     @cached_property
     def table(self) -> CoverageTable:
         """Numbers with standard errors, differences and marks; `RENDERERS` format it."""
-        return CoverageTable.from_coverages(self.coverages, self.regions, self.notes, self.source, self.block_ends)
+        return CoverageTable.from_coverages(
+            self.coverages, self.regions, self.notes, self.source, self.block_ends, self.target_sums
+        )
 
     @property
     def notes(self) -> list[str]:
@@ -152,7 +156,7 @@ class Result:
         notes += describe_perfect_depth(self.sensors)
         notes += describe_scan_periods(self.sensors)
         is_recording = bool(self.source.get("frames"))
-        notes += describe_test_targets(self._first_coverage, self.regions, is_recording=is_recording)
+        notes += describe_test_targets(self.target_sums, self.regions, is_recording=is_recording)
         if self.run is not None and self.used_reference is not None:
             notes += describe_reference(self.used_reference, self.run, self._first_coverage)
         return notes
@@ -236,7 +240,7 @@ class Result:
             lead=f"Blind spots and coverage in {location}, measured by torchcover.",
             findings=self.verdict,
             tables=self.tables,
-            maps=list(build_page_maps(self.coverages)) if self.coverages else [],
+            maps=list(build_page_maps(self.coverages, self.target_sums)) if self.coverages else [],
             rigs=rigs,
             ego_outline_m=self.ego_outline_m,
             outlines=[build_region_outline(region) for region in self.regions],
@@ -350,8 +354,9 @@ class Result:
         names = [f"{folder}coverage.npz"]
         if self.is_comparison:
             names = [f"{folder}coverage/{stem}.npz" for stem in build_file_stems(list(self.coverages))]
-        for name, coverage in zip(names, self.coverages.values(), strict=True):
-            output.add(name, coverage.save)
+        for name, (rig, coverage) in zip(names, self.coverages.items(), strict=True):
+            arrays = self.target_sums[rig].to_arrays() if rig in self.target_sums else None
+            output.add(name, partial(coverage.save, further_arrays=arrays))
         output.add_text(f"{folder}summary.csv", RENDERERS["csv"](self.table))
         if self.metrics is not None:
             for name, text in self.metrics.files.items():

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from torchcover.coverage import Coverage, Region
+from torchcover.coverage import Coverage, Region, TargetSums
 from torchcover.estimation import MIN_BLOCKS
 from torchcover.evaluation.pipeline import Run
 from torchcover.simulation import CameraSensor, Sensor
@@ -145,16 +145,18 @@ def _get_scan_period_s(sensor: Sensor) -> float:
     return timing.period_s if timing else 0.0
 
 
-def describe_test_targets(coverage: Coverage, regions: Sequence[Region], *, is_recording: bool) -> list[str]:
+def describe_test_targets(
+    target_sums: Mapping[str, TargetSums], regions: Sequence[Region], *, is_recording: bool
+) -> list[str]:
     """Describe where test targets were placed, or why a recording has none.
 
     Args:
-        coverage: Coverage of a rig.
+        target_sums: Name of each rig -> visibility of test targets; empty without them.
         regions: Regions of the numbers.
         is_recording: Whether the frames are recorded.
     """
-    if coverage.target_sums is not None:
-        num_frames = int(coverage.target_sums.frame_counts.sum())
+    if target_sums:
+        num_frames = int(next(iter(target_sums.values())).frame_counts.sum())
         return [
             f"Test targets: in {num_frames:,} frame{'s' * (num_frames != 1)}, one at a time, at random positions whose "
             "center is in the region; they occlude nothing else."

@@ -15,7 +15,8 @@ from torchcover.coverage import (
     list_region_bands,
 )
 from torchcover.coverage.averages import Average
-from torchcover.coverage.paired import find_leaders
+from torchcover.coverage.paired import MeasuredRig, find_leaders
+from torchcover.coverage.target_sums import TargetMixture, TargetSums
 from torchcover.estimation import MIN_BLOCKS, ROUND_OFF, Difference, Quantity
 
 
@@ -96,6 +97,7 @@ class CoverageTable:
         notes: Sequence[str] = (),
         source: Mapping[str, object] | None = None,
         block_ends: Sequence[int] = (),
+        target_sums: Mapping[str, TargetSums | TargetMixture] | None = None,
     ) -> "CoverageTable":
         """Build the table of one rig, or of several rigs that were measured together.
 
@@ -105,13 +107,15 @@ class CoverageTable:
             notes: Further conditions of the numbers.
             source: Source of the numbers, see `CoverageTable`.
             block_ends: Ends of the blocks, see `CoverageTable`.
+            target_sums: Name of the rig -> its visibility of test targets; by default there are none.
 
         Raises:
-            ValueError: There is no rig, the rigs are not paired (`check_paired`), or `Coverage.summary` rejects a
-                region.
+            ValueError: There is no rig, the rigs are not paired (`check_paired`), have different test targets, or
+                `Coverage.summary` rejects a region.
         """
         if not coverages:
             raise ValueError("coverages: got none; give at least one rig")
+        _check_same_targets(coverages, target_sums or {})
         scenario_coverages = [_split_mixture(coverage) for coverage in coverages.values()]
         for rigs_in_scenario in zip(*scenario_coverages, strict=True):
             if len(coverages) > 1:
@@ -120,12 +124,10 @@ class CoverageTable:
         summaries = {rig: coverage.summary(regions) for rig, coverage in coverages.items()}
         rows = _build_rows(coverages, list_region_bands(regions, first.grid), summaries)
         target_rows: list[dict[str, Row]] = []
-        if first.target_sums:
-            target_summaries: dict[str, Sequence[RegionSummary]] = {}
-            for rig, coverage in coverages.items():
-                if coverage.target_sums:
-                    target_summaries[rig] = coverage.target_sums.summarize()
-            target_rows = _build_rows(coverages, first.target_sums.region_targets, target_summaries, is_target=True)
+        if target_sums:
+            region_targets = next(iter(target_sums.values())).region_targets
+            target_summaries = {rig: sums.summarize() for rig, sums in target_sums.items()}
+            target_rows = _build_rows(target_sums, region_targets, target_summaries)
         return cls(
             quantities=(*first.quantities, *(first.aggregated_numbers.quantities if first.aggregated_numbers else ())),
             grid=first.grid,
@@ -174,6 +176,17 @@ class CoverageTable:
         return ()
 
 
+def _check_same_targets(rigs: Iterable[str], target_sums: Mapping[str, TargetSums | TargetMixture]) -> None:
+    """Raise ValueError unless all rigs were measured with the same test targets, or all without any."""
+    first, *others = rigs
+    for rig in others:
+        targets = [target_sums[name].region_targets if name in target_sums else None for name in (first, rig)]
+        if targets[0] != targets[1]:
+            raise ValueError(
+                f"{first!r} and {rig!r} cannot be compared: they were measured with different test targets"
+            )
+
+
 def _group_by_rig(rows: Sequence[Mapping[str, Row]], rigs: Iterable[str]) -> dict[str, tuple[Row, ...]]:
     """Group the rows of each region by rig."""
     rows_by_rig = {}
@@ -183,21 +196,19 @@ def _group_by_rig(rows: Sequence[Mapping[str, Row]], rigs: Iterable[str]) -> dic
 
 
 def _build_rows(
-    coverages: Mapping[str, Coverage | CoverageMixture],
+    results: Mapping[str, MeasuredRig],
     region_bands: Sequence[tuple[Region, str]],
     summaries: Mapping[str, Sequence[RegionSummary]],
-    *,
-    is_target: bool = False,
 ) -> list[dict[str, Row]]:
     """Build the rows of each region and band (or test target), by rig."""
     rows = []
     for (region, band), rig_summaries in zip(region_bands, zip(*summaries.values(), strict=True), strict=True):
         differences: dict[str, dict[str, Difference]] = {}
-        if len(coverages) > 1:
-            differences = compute_differences(coverages, region, band, is_target=is_target)
-        leaders = find_leaders(coverages, region, band, is_target=is_target)
+        if len(results) > 1:
+            differences = compute_differences(results, region, band)
+        leaders = find_leaders(results, region, band)
         row = {}
-        for rig, summary in zip(coverages, rig_summaries, strict=True):
+        for rig, summary in zip(results, rig_summaries, strict=True):
             leading_keys = frozenset(key for key in leaders if leaders[key] == rig)
             row[rig] = Row(rig, region, summary, leading_keys, differences.get(rig, {}))
         rows.append(row)

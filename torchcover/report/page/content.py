@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from torchcover.coverage import Coverage, Layer
+from torchcover.coverage import Coverage, Layer, TargetSums
 from torchcover.estimation import Number
 from torchcover.report.colors import UNOBSERVED, ColorScale, build_color_scale, build_difference_scale, to_array
 from torchcover.report.map_layers import (
@@ -189,18 +189,18 @@ class Page:
     more_tables: Sequence[PageTable] = ()
 
 
-def build_page_maps(coverages: Mapping[str, Coverage]) -> Iterator[PageMap]:
+def build_page_maps(
+    coverages: Mapping[str, Coverage], target_sums: Mapping[str, TargetSums] | None = None
+) -> Iterator[PageMap]:
     """Yield a map for each quantity, height band and rig; maps of test targets come first.
 
     Args:
         coverages: Name of the rig -> its coverage; several must be paired.
+        target_sums: Name of the rig -> its visibility of test targets; by default there are none.
     """
     coverages = {name: downsample_coverage(coverage) for name, coverage in coverages.items()}
     first = next(iter(coverages.values()))
-    for rig, coverage in coverages.items():
-        targets = coverage.target_sums
-        if targets is None:
-            continue
+    for rig, targets in (target_sums or {}).items():
         quantity = targets.quantities[0]
         for target, counts in zip(targets.target_names, targets.position_counts, strict=True):
             share = counts[..., 1] / counts[..., 0]
