@@ -1,14 +1,14 @@
-"""Frames that several tests use."""
+"""Fixtures of the tests of placement."""
 
 import pytest
 
-from tests.placement.worlds import held
+from tests.placement.worlds import create_frames
 from torchcover.placement import validation
 
 
 @pytest.fixture(autouse=True, scope="session")
 def no_targets():
-    """Targets around the winner of every small search would take most of the time."""
+    """Validate without test targets, which would take most of the time of a small search."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(validation, "TARGETS", ())
         yield
@@ -16,4 +16,4 @@ def no_targets():
 
 @pytest.fixture(scope="session")
 def frames():
-    return held()
+    return create_frames()

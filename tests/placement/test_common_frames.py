@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.placement.worlds import BAY, FLOOR, LOT, OBJECTIVES, WALL, held, lidar, rig, yard
+from tests.placement.worlds import BAY, FLOOR, LOT, OBJECTIVES, WALL, create_frames, lidar, rig, yard
 from torchcover.evaluation import evaluate
 from torchcover.placement import Objective
 from torchcover.placement.common_frames import CachedFrames
@@ -47,7 +47,7 @@ def test_other_rigs_score_as_in_own_frames(scenario):
 
 def test_ideal_sensors_have_a_point_for_every_hit():
     short = rig(lidar(range_at_10_percent_m=5.0))
-    ideal, real = held(num_scenes=1, sensor_model="ideal"), held(num_scenes=1)
+    ideal, real = create_frames(num_scenes=1, sensor_model="ideal"), create_frames(num_scenes=1)
     points = [[len(frame.sensor) for frame in of.iterate_frames(short)] for of in (ideal, real)]
     assert points[0] == [len(frame.sensor) for frame in real.iterate_frames(rig(name=short.name))]
     assert points[1][0] < points[0][0]
@@ -56,16 +56,18 @@ def test_ideal_sensors_have_a_point_for_every_hit():
 
 def test_omitted_rays_change_no_objective(monkeypatch):
     near = {"near": Objective(threshold_m=0.2, band="ground", region={"ahead": {"x_m": (3, 8), "y_m": (-2, 2)}})}
-    some = held(objectives=near, num_scenes=1, num_rays=200)
+    some = create_frames(objectives=near, num_scenes=1, num_rays=200)
     monkeypatch.setattr(Queries, "search_radius_m", None)
-    every = held(objectives=near, num_scenes=1, num_rays=200)
+    every = create_frames(objectives=near, num_scenes=1, num_rays=200)
     same(every.score(TWO), some.score(TWO))
     assert len(next(some.iterate_frames(TWO)).sensor) < 0.7 * len(next(every.iterate_frames(TWO)).sensor)
 
 
 def test_numbers_equal_evaluate_to_the_last_bit():
     """By area and over known cells, in regions of several objectives, from frames that nobody has cut."""
-    held_by = {measure: held(num_scenes=4, frames_per_scene=2, average=measure) for measure in ("area", "cells")}
+    held_by = {
+        measure: create_frames(num_scenes=4, frames_per_scene=2, average=measure) for measure in ("area", "cells")
+    }
     found = held_by["area"]
     frames = SimulatedFrames(
         found._host_scenarios[0],
@@ -102,7 +104,7 @@ def test_numbers_equal_evaluate_to_the_last_bit():
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_it_makes_no_difference_who_holds_the_worlds(frames, workers):
-    with held(num_workers=workers) as elsewhere:
+    with create_frames(num_workers=workers) as elsewhere:
         same(elsewhere.score(TWO), frames.score(TWO))
         assert all(
             seen.frame is None for seen in elsewhere._compute(TWO, [0, 3], is_measured=True)
@@ -123,7 +125,7 @@ def test_scene_stays_with_the_process_that_built_it(monkeypatch, tmp_path):
         return built(self, index, number)
 
     monkeypatch.setattr(CachedFrames, "_build_reference", noted)
-    with held(num_workers=2, num_scenes=4) as elsewhere:
+    with create_frames(num_workers=2, num_scenes=4) as elsewhere:
         for _ in range(2):
             elsewhere.score(rig())
         elsewhere.score(TWO)
@@ -147,17 +149,17 @@ def test_the_order_of_rigs_makes_no_difference(frames):
 def test_unobserved_scenes_do_not_contribute():
     obstacles = {"ahead": Objective(region="20m", band="obstacle"), "ground": Objective(region="20m", band="ground")}
     scenarios = [yard(WALL), yard(name="empty"), LOT]
-    found = held(scenarios, obstacles, num_scenes=1, frames_per_scene=1)
+    found = create_frames(scenarios, obstacles, num_scenes=1, frames_per_scene=1)
     assert [index.scene_id for index in found.indices] == [0, 1, 2]
     estimate = found.score(rig()).estimate
     assert torch.isfinite(estimate.jackknife_values).all()
     assert estimate.jackknife_values[1, 0] == estimate.value[0]  # the empty one has no obstacle
-    nothing = held([yard()], obstacles).score(rig()).estimate.value
+    nothing = create_frames([yard()], obstacles).score(rig()).estimate.value
     assert torch.isnan(nothing).tolist() == [True, False]
 
 
 def test_a_world_without_traffic_shows_each_instant_once():
-    found = held([yard(WALL)], frames_per_scene=4)
+    found = create_frames([yard(WALL)], frames_per_scene=4)
     assert [index.scene_id for index in found.indices] == [0] * 4
     assert (
         len({float(frame.reference_weights.sum()) for frame in found.iterate_frames()}) == 4
@@ -188,7 +190,7 @@ def test_a_world_without_traffic_shows_each_instant_once():
 )  # fmt: skip
 def test_invalid_settings_are_refused(change, message):
     with pytest.raises(ValueError, match=message):
-        held(**change)
+        create_frames(**change)
 
 
 def test_rigs_that_cannot_be(frames):
@@ -201,12 +203,12 @@ def test_rig_of_another_vehicle_needs_explicit_vehicle():
     near = {"near": Objective(region="20m", band="ground")}
     roof = rig(vehicle="renault_zoe")
     with pytest.raises(ValueError, match="its vehicle is renault_zoe, and that of these frames suv; set vehicle="):
-        held([open_lot], near).score(roof)
-    assert len(held([open_lot], near, vehicle="renault_zoe").score(roof).estimate.value) == 1
+        create_frames([open_lot], near).score(roof)
+    assert len(create_frames([open_lot], near, vehicle="renault_zoe").score(roof).estimate.value) == 1
 
 
 def test_killed_worker_is_reported_and_ends_the_search():
-    frames = held(num_workers=9, num_scenes=2, frames_per_scene=1)
+    frames = create_frames(num_workers=9, num_scenes=2, frames_per_scene=1)
     killed, other = frames._loader._iterator._workers
 
     def ask():
@@ -233,7 +235,7 @@ def test_threads_make_no_difference(frames):
 
 
 def test_recording_is_one_scene_without_held_out_scenes():
-    with held(
+    with create_frames(
         ["tracks_table"], {"near": Objective(region="20m", band="ground")}, num_scenes=3, frame_interval_s=0.5
     ) as recorded:
         assert [index.scene_id for index in recorded.indices] == [0, 0]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.placement.worlds import held, lidar, rig
+from tests.placement.worlds import create_frames, lidar, rig
 from torchcover.coverage import CoverageMetric, Maximum, Quantiles
 from torchcover.coverage.number import estimate_number
 from torchcover.estimation import Estimate
@@ -59,7 +59,7 @@ NUMBERS = {
 
 @pytest.fixture(scope="module")
 def several():
-    return held(objectives=NUMBERS)
+    return create_frames(objectives=NUMBERS)
 
 
 def test_objective_is_any_number_with_its_direction(several):
@@ -100,7 +100,7 @@ def test_objective_is_any_number_with_its_direction(several):
 
 
 def test_failure_numbers_use_the_same_cells_as_evaluate(several):
-    both = several, held(objectives=NUMBERS, average="cells")
+    both = several, create_frames(objectives=NUMBERS, average="cells")
     by_area, by_cells = (dict(zip(NUMBERS, of.score(TWO).estimate.value.tolist(), strict=True)) for of in both)
     region = several.queries.regions["20m"]
     metric = CoverageMetric(
@@ -125,7 +125,9 @@ def test_a_number_without_any_sensor_says_so(several):
 def test_numbers_without_average_are_equal_for_both_averages():
     alone = {"cells": Objective(number="cells_radius_m", region="20m")}
     for asked in (NUMBERS, alone):
-        by_area, by_cells = (held(objectives=asked, average=one).score(TWO).estimate.value for one in ("area", "cells"))
+        by_area, by_cells = (
+            create_frames(objectives=asked, average=one).score(TWO).estimate.value for one in ("area", "cells")
+        )
         for objective, area, cells in zip(asked.values(), by_area, by_cells, strict=True):
             assert (area == cells) == (objective.fixed_average != ""), objective.key
     assert alone["cells"].fixed_average == "cells"

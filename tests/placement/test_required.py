@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from tests.placement.worlds import EGO, LOT, held, lidar, rig
+from tests.placement.worlds import EGO, LOT, create_frames, lidar, rig
 from torchcover.evaluation.requirements import Requirements
 from torchcover.evaluation.requirements_check import check
 from torchcover.evaluation.target_visibility import build_flat_ground
@@ -39,7 +39,7 @@ def lot(tmp_path_factory):
     return str(path)
 
 
-def searched(lot, out=None, *, objectives=None, resume=False, num_evaluations=8, **changes):
+def run_small_search(lot, out=None, *, objectives=None, resume=False, num_evaluations=8, **changes):
     content = {
         "name": "nose", "start": LEVEL, "scenario": lot,
         "free": {"top": {"pitch_deg": (0.0, 30.0)}}, "objectives": objectives or {"child": child()}, **changes,
@@ -56,8 +56,8 @@ def searched(lot, out=None, *, objectives=None, resume=False, num_evaluations=8,
 
 
 def test_objective_is_the_share_of_detected_positions():
-    some = held(objectives={"near": Objective(region="20m"), "child": child(), "far": Objective(region="80m")})
-    without = held(objectives={"near": Objective(region="20m"), "far": Objective(region="80m")})
+    some = create_frames(objectives={"near": Objective(region="20m"), "child": child(), "far": Objective(region="80m")})
+    without = create_frames(objectives={"near": Objective(region="20m"), "far": Objective(region="80m")})
     empty, shares = build_flat_ground().model_copy(update={"ego": some._host_scenarios[0].ego}), []
     for each in (LEVEL, DOWN):
         estimate = some.score(each).estimate
@@ -75,7 +75,7 @@ def test_objective_is_the_share_of_detected_positions():
 
 def test_encounters_count_if_met_at_all_offsets():
     asked = {"requirement": {"encounters": ENCOUNTERS, "braking": {}}}
-    some = held(
+    some = create_frames(
         [LOT.model_copy(update={"ego": None})],
         objectives={"crossings": Objective.model_validate(asked)},
         vehicle="van",
@@ -89,8 +89,8 @@ def test_encounters_count_if_met_at_all_offsets():
 
 
 def test_resumed_search_finds_the_same_rig(lot, tmp_path):
-    searched(lot, tmp_path, num_evaluations=2)
-    resumed, found = (searched(lot, out, resume=out is not None) for out in (tmp_path, None))
+    run_small_search(lot, tmp_path, num_evaluations=2)
+    resumed, found = (run_small_search(lot, out, resume=out is not None) for out in (tmp_path, None))
     values = [[one.values for one in of.search.evaluations] for of in (resumed, found)]
     assert values[0] == values[1]
     start, best = (one.estimate.value[0] for one in (found.search.evaluations[0], found.best.evaluation))
@@ -113,7 +113,9 @@ def test_requirement_objectives_change_without_standard_error(lot):
     """Of the ground ahead more is seen with the nose down, and of an adult far ahead with the nose up."""
     level = {"requirement": {"target": "adult", "positions": {"points_m": [[20.0, 0.0]]}, "points": 1}}
     objectives = {"near": {"region": ("front_3m", "20m"), "band": "ground"}}
-    free, kept = (searched(lot, objectives=objectives, num_evaluations=16, not_worse=worse) for worse in ((), (level,)))
+    free, kept = (
+        run_small_search(lot, objectives=objectives, num_evaluations=16, not_worse=worse) for worse in ((), (level,))
+    )
     (name,) = kept.search.space.scored_objectives.keys() - {"near"}
     assert kept.search.evaluations[0].estimate.value.tolist()[1] == 1.0
     assert free.best.evaluation.values["top.pitch_deg"] > 8 > kept.best.evaluation.values["top.pitch_deg"]
@@ -123,11 +125,11 @@ def test_requirement_objectives_change_without_standard_error(lot):
 
 def test_where_nothing_is_ever_seen_nothing_is_unknown(lot, tmp_path):
     never = child(points=10**6)
-    found = searched(lot, objectives={"near": {"region": "20m"}, "never": never}, num_evaluations=6)
+    found = run_small_search(lot, objectives={"near": {"region": "20m"}, "never": never}, num_evaluations=6)
     assert not np.isnan(found.improvements).any()
     assert (found.improvements[:, 1] == 0).all()
     assert "never: no significant improvement: 0 points in any scene" in found.summary
-    alone = searched(lot, objectives={"never": never}, num_evaluations=6)
+    alone = run_small_search(lot, objectives={"never": never}, num_evaluations=6)
     assert alone.best.is_start
     alone.save(tmp_path)
 
@@ -156,4 +158,4 @@ def test_what_cannot_be_an_objective_is_refused(given, message):
 def test_occupied_positions_are_refused_with_the_start(lot):
     inside = child(positions={"x_m": [-0.5, 0.5], "y_m": [-0.3, 0.3]})
     with pytest.raises(ValueError, match=r"objectives.child: .* no position is free for the target"):
-        searched(lot, objectives={"child": inside})
+        run_small_search(lot, objectives={"child": inside})

@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 
-from tests.placement.surfaces import Surface, near_far, plan, space
+from tests.placement.surfaces import Surface, compute_near_far, plan, space
 from torchcover.evaluation.check_result import CheckResult
 from torchcover.evaluation.verdicts import Verdict
 from torchcover.files import BadFileError
@@ -17,12 +17,12 @@ from torchcover.simulation import Rig
 RANDOM_ONLY = OptimizerParams(num_startup_candidates=0, random_interval=1)
 
 
-def searched(out=None, *, of=None, resume=False, **settings):
+def run_small_search(out=None, *, of=None, resume=False, **settings):
     search = PlacementSearch(space() if of is None else of, plan(**settings))
     return run_search(search, out, resume=resume)
 
 
-def contents(search):
+def dump_evaluations(search):
     """All evaluations without their times, for comparison."""
     return [json.dumps({**each.to_record(), "duration_s": 0}) for each in search.evaluations]
 
@@ -31,7 +31,7 @@ class Ended(Exception):  # noqa: N818
     """Ends a process at any moment."""
 
 
-def ending_after(count):
+def make_ending_frames(count):
     class EndsAfter(Surface):
         def score(self, rig):
             if len(self.scored) > count:
@@ -44,7 +44,7 @@ def ending_after(count):
 
 
 def test_start_is_first_and_random_candidates_are_control():
-    result = searched(num_evaluations=24)
+    result = run_small_search(num_evaluations=24)
     evaluations = result.search.evaluations
     assert [each.number for each in evaluations] == list(range(25))
     strategies = [each.strategy for each in evaluations]
@@ -57,7 +57,7 @@ def test_start_is_first_and_random_candidates_are_control():
 def test_startup_covers_all_options_and_range_ends():
     models = ("hesai_pandar64", "ouster_os1_64", "ouster_os1_128", "velodyne_vlp16", "velodyne_hdl32e")
     of = space(free={"roof": {"model": models, "x_m": (-0.6, 0.8)}})
-    startup = searched(of=of, num_evaluations=5).search.evaluations[1:]
+    startup = run_small_search(of=of, num_evaluations=5).search.evaluations[1:]
     assert {each.values["roof.model"] for each in startup} == set(models)
     assert sorted((each.values["roof.x_m"] + 0.6) // 0.28 for each in startup) == [0, 1, 2, 3, 4]
 
@@ -65,8 +65,8 @@ def test_startup_covers_all_options_and_range_ends():
 @pytest.mark.parametrize("seed", range(3))
 def test_optimizer_beats_random_on_held_out_scenes(seed):
     result, random = (
-        searched(num_evaluations=20, seed=seed),
-        searched(num_evaluations=20, seed=seed, optimizer_params=RANDOM_ONLY),
+        run_small_search(num_evaluations=20, seed=seed),
+        run_small_search(num_evaluations=20, seed=seed, optimizer_params=RANDOM_ONLY),
     )
     best, control = result.finalists
     assert abs(best.evaluation.values["roof.pitch_deg"] - 4) < 1.5
@@ -86,7 +86,7 @@ def test_optimizer_beats_random_on_held_out_scenes(seed):
 def test_what_must_not_be_worse_is_kept():
     """Near likes the nose down, far likes it up: what is best near loses far."""
     free, kept = (
-        searched(of=space(not_worse=not_worse), num_evaluations=24) for not_worse in ((), ({"region": "80m"},))
+        run_small_search(of=space(not_worse=not_worse), num_evaluations=24) for not_worse in ((), ({"region": "80m"},))
     )
     assert free.best.evaluation.values["roof.pitch_deg"] > 2
     assert kept.best.evaluation.values["roof.pitch_deg"] < 0.8
@@ -111,7 +111,7 @@ def required(*bounds, **target):
 
 def test_unmet_bounds_end_with_the_smallest_shortfall():
     """The second number of a surface likes the nose up, and is 0.4 at most."""
-    result = searched(of=space(requirements=required({"min_value": 0.5})), num_evaluations=24)
+    result = run_small_search(of=space(requirements=required({"min_value": 0.5})), num_evaluations=24)
     search = result.search
     missing = [sum(search.find_shortfalls(each).values()) for each in search.evaluations]
     best = missing[result.best.evaluation.number]
@@ -123,7 +123,7 @@ def test_unmet_bounds_end_with_the_smallest_shortfall():
     assert f"{best:.2%} of {name}" in [row[-1] for row in result.report.csv_tables["evaluations.csv"]]
 
 
-def needing(pitch_deg):
+def require_pitch(pitch_deg):
     """A check of a child that is seen only with the nose so far down."""
 
     def check(rig, required, world, **settings):
@@ -141,8 +141,8 @@ def needing(pitch_deg):
 @pytest.mark.parametrize(("needed_deg", "lowest", "highest"), [(5.0, 5.0, 9.0), (50.0, 12.0, 15.0)])
 def test_target_requirements_are_met_or_nearly_met(monkeypatch, needed_deg, lowest, highest):
     """The best near is 4 degrees; a child needs 5, or more than the range has."""
-    monkeypatch.setattr("torchcover.placement.objective.check", needing(needed_deg))
-    result = searched(of=space(requirements=required(points=5)), num_evaluations=24)
+    monkeypatch.setattr("torchcover.placement.objective.check", require_pitch(needed_deg))
+    result = run_small_search(of=space(requirements=required(points=5)), num_evaluations=24)
     assert list(result.search.evaluations[0].shortfalls) == ["child_110cm, points_m [[5.0, 0.0]], points >= 5"]
     assert lowest <= result.best.evaluation.values["roof.pitch_deg"] <= highest
     assert bool(result.best.evaluation.shortfalls) == (needed_deg > 15)
@@ -173,7 +173,7 @@ def test_numbers_that_ended_on_their_bounds_are_named():
         mount = rig.sensors[0].mount
         return np.full(2, 0.5 + 0.1 * mount.x_m - 1e-3 * (mount.pitch_deg - 3) ** 2)
 
-    result = searched(num_evaluations=20, worth=only_x)
+    result = run_small_search(num_evaluations=20, compute_values=only_x)
     assert "Variables at the end of their range: roof.x_m (0.8);" in result.summary
     assert "roof.pitch_deg (" not in result.summary
 
@@ -181,42 +181,46 @@ def test_numbers_that_ended_on_their_bounds_are_named():
 @pytest.mark.parametrize("objectives", [("near",), ("near", "far")])
 def test_resumed_search_proposes_the_same_candidates(tmp_path, objectives):
     of = space(objectives=objectives)
-    whole = searched(tmp_path / "whole", of=of, num_evaluations=14)
+    whole = run_small_search(tmp_path / "whole", of=of, num_evaluations=14)
     out = tmp_path / "ended"
     for most in (0, 4, 9):
         with pytest.raises(Ended):
-            searched(out, of=of, resume=True, num_evaluations=14, make_frames=ending_after(most))
+            run_small_search(out, of=of, resume=True, num_evaluations=14, make_frames=make_ending_frames(most))
     if (out / JOURNAL).exists():
         with (out / JOURNAL).open("ab") as file:
             file.write(b'{"op_code":4,"wor')  # torn by the end of the process
-    resumed = searched(out, of=of, resume=True, num_evaluations=14)
-    assert contents(resumed.search) == contents(whole.search)
+    resumed = run_small_search(out, of=of, resume=True, num_evaluations=14)
+    assert dump_evaluations(resumed.search) == dump_evaluations(whole.search)
     assert [each.role for each in resumed.finalists] == [each.role for each in whole.finalists]
-    assert contents(searched(out, of=of, resume=True, num_evaluations=14).search) == contents(whole.search)
-    longer = searched(out, of=of, resume=True, num_evaluations=16)
-    assert contents(longer.search) == contents(searched(of=of, num_evaluations=16).search)
+    assert dump_evaluations(run_small_search(out, of=of, resume=True, num_evaluations=14).search) == dump_evaluations(
+        whole.search
+    )
+    longer = run_small_search(out, of=of, resume=True, num_evaluations=16)
+    assert dump_evaluations(longer.search) == dump_evaluations(run_small_search(of=of, num_evaluations=16).search)
 
 
 def test_too_small_budget_deletes_nothing(tmp_path):
-    searched(tmp_path, num_evaluations=3)
+    run_small_search(tmp_path, num_evaluations=3)
     before = (tmp_path / JOURNAL).read_bytes()
     with pytest.raises(ValueError, match="too short for two evaluations"):
-        searched(tmp_path, budget_s=1e-6)
+        run_small_search(tmp_path, budget_s=1e-6)
     assert (tmp_path / JOURNAL).read_bytes() == before
 
 
 def test_the_journal_of_another_search_is_refused(tmp_path):
-    searched(tmp_path, num_evaluations=2)
+    run_small_search(tmp_path, num_evaluations=2)
     before = (tmp_path / JOURNAL).read_bytes()
     with pytest.raises(
         ValueError,
         match=r"the journal belongs to another search: num_scenes \(6 there, 4 here\), seed \(0 there, 3 here",
     ):
-        searched(tmp_path, num_evaluations=2, seed=3, num_scenes=4, resume=True)
+        run_small_search(tmp_path, num_evaluations=2, seed=3, num_scenes=4, resume=True)
     with pytest.raises(BadFileError, match="the start has a different score now"):
-        searched(tmp_path, num_evaluations=2, worth=lambda rig: near_far(rig) + 1e-9, resume=True)
+        run_small_search(
+            tmp_path, num_evaluations=2, compute_values=lambda rig: compute_near_far(rig) + 1e-9, resume=True
+        )
     with pytest.raises(ValueError, match="journal belongs to another search: "):
-        searched(tmp_path, of=space(objectives=("near", "far")), num_evaluations=2, resume=True)
+        run_small_search(tmp_path, of=space(objectives=("near", "far")), num_evaluations=2, resume=True)
     assert (tmp_path / JOURNAL).read_bytes() == before
 
 
@@ -235,12 +239,12 @@ def damaged(text):
 
 
 def test_a_damaged_journal_is_one_line(tmp_path):
-    searched(tmp_path, num_evaluations=2)
+    run_small_search(tmp_path, num_evaluations=2)
     path = tmp_path / JOURNAL
     for text in damaged(path.read_text()):
         path.write_text(text)
         with pytest.raises(BadFileError, match=JOURNAL) as error:
-            searched(tmp_path, num_evaluations=2, resume=True)
+            run_small_search(tmp_path, num_evaluations=2, resume=True)
         assert "\n" not in str(error.value)
 
 
@@ -248,17 +252,17 @@ def test_journal_ignores_stale_locks_and_refuses_links(tmp_path):
     out = tmp_path / "out"
     (tmp_path / "out").mkdir()
     (out / f"{JOURNAL}.lock").symlink_to("nothing")  # a killed process leaves one; Optuna would wait for its end
-    searched(out, num_evaluations=2)
+    run_small_search(out, num_evaluations=2)
     (out / JOURNAL).rename(tmp_path / "mine")
     with (tmp_path / "mine").open("a") as file:
         file.write("a line that was not finished")
     before = (tmp_path / "mine").read_bytes()
     (out / JOURNAL).symlink_to(tmp_path / "mine")
     with pytest.raises(ValueError, match=rf"{JOURNAL}: a symbolic link; nothing is written through links"):
-        searched(out, num_evaluations=3, resume=True)
+        run_small_search(out, num_evaluations=3, resume=True)
     (out / JOURNAL).unlink()
     (out / JOURNAL).hardlink_to(tmp_path / "mine")
-    assert len(searched(out, num_evaluations=3, resume=True).search.evaluations) == 4
+    assert len(run_small_search(out, num_evaluations=3, resume=True).search.evaluations) == 4
     assert (tmp_path / "mine").read_bytes() == before
 
 
@@ -292,7 +296,7 @@ class Clock:
         return Slow(seed, worlds, plan.frames_per_scene, objectives={**space.scored_objectives, **dict(more)})
 
 
-def timed(budget_s, monkeypatch):
+def run_timed_search(budget_s, monkeypatch):
     clock = Clock()
     monkeypatch.setattr("torchcover.placement.search.time.perf_counter", clock)
     monkeypatch.setattr("torchcover.placement.search.time.monotonic", clock)
@@ -302,19 +306,19 @@ def timed(budget_s, monkeypatch):
 
 def test_time_budget_proposes_the_same_candidates(monkeypatch):
     # 10 s for 18 frames, 1.8 s a candidate; 48 held-out frames, and three rigs there and here: 46.5 s.
-    result, clock = timed(80.0, monkeypatch)
+    result, clock = run_timed_search(80.0, monkeypatch)
     assert 65 < clock.now < 80
     count = len(result.search.evaluations) - 1
     assert count > 10
-    assert contents(result.search) == contents(searched(num_evaluations=count).search)
+    assert dump_evaluations(result.search) == dump_evaluations(run_small_search(num_evaluations=count).search)
 
 
 def test_too_short_time_budget_names_the_costs(monkeypatch):
     with pytest.raises(
         ValueError, match=r"30 s is too short for two .* 11\.8 s, .* 1\.8 s, .* 46\.5 s; give at least 62"
     ):
-        timed(30.0, monkeypatch)
-    timed(62.0, monkeypatch)
+        run_timed_search(30.0, monkeypatch)
+    run_timed_search(62.0, monkeypatch)
 
 
 @pytest.mark.parametrize(
@@ -340,7 +344,7 @@ def only_the_start(rig):
 
 
 def test_start_remains_if_all_candidates_are_infeasible():
-    result = searched(num_evaluations=8, worth=only_the_start)
+    result = run_small_search(num_evaluations=8, compute_values=only_the_start)
     assert [each.infeasible_reason for each in result.search.evaluations] == ["", *["inside the wall"] * 8]
     assert result.best.is_start
     assert result.rig == result.search.space.start
@@ -350,12 +354,12 @@ def test_start_remains_if_all_candidates_are_infeasible():
 def test_impossible_rigs_are_avoided_after_some_of_them():
     """A rig is impossible behind x = 0, where it would be best."""
 
-    def worth(rig):
+    def compute_values(rig):
         if rig.sensors[0].mount.x_m < 0.0:
             raise ValueError("behind")
-        return near_far(rig) - 0.1 * rig.sensors[0].mount.x_m
+        return compute_near_far(rig) - 0.1 * rig.sensors[0].mount.x_m
 
-    search = searched(num_evaluations=24, worth=worth).search
+    search = run_small_search(num_evaluations=24, compute_values=compute_values).search
     modeled = [each for each in search.evaluations if each.strategy == "optimizer"]
     assert np.mean([not each.infeasible_reason for each in modeled[-6:]]) > 0.5
     assert 0 <= search.evaluations[search.find_best()[0]].values["roof.x_m"] < 0.15
@@ -372,7 +376,7 @@ def tilted():
 def test_infeasible_start_does_not_win():
     with pytest.warns(UserWarning, match="'tilted' is outside the space"):
         of = space(constraints={"max_self_hit_share": 0.2}, start=tilted())
-    result = searched(of=of, num_evaluations=12)
+    result = run_small_search(of=of, num_evaluations=12)
     start = result.search.evaluations[0]
     assert start.infeasible_reason == "30.0% of its rays hit the vehicle; max_self_hit_share is 20.0%"
     assert not result.best.is_start
@@ -380,7 +384,7 @@ def test_infeasible_start_does_not_win():
 
 
 def test_too_many_rays_on_the_vehicle_are_infeasible():
-    search = searched(of=space(constraints={"max_self_hit_share": 0.05}), num_evaluations=12).search
+    search = run_small_search(of=space(constraints={"max_self_hit_share": 0.05}), num_evaluations=12).search
     refused = [each for each in search.evaluations if each.infeasible_reason]
     assert {each.number for each in refused} == {
         each.number for each in search.evaluations if each.values["roof.pitch_deg"] > 5
@@ -392,19 +396,21 @@ def test_an_objective_that_is_unknown_is_refused():
     with pytest.raises(
         ValueError, match=r"objectives\.near: unknown in all 18 frames: a region and band is never visible"
     ):
-        searched(num_evaluations=10, blind=True)
+        run_small_search(num_evaluations=10, blind=True)
 
 
 def test_noise_is_not_reported_as_improvement():
-    result = searched(num_evaluations=12, worth=lambda rig: np.array([0.5, 0.5]), seed=4)
+    result = run_small_search(num_evaluations=12, compute_values=lambda rig: np.array([0.5, 0.5]), seed=4)
     assert "gained" not in result.summary
     assert result.best.improvements[0].difference.is_significant is False
     assert result.best.improvements[0].optimism > 0
-    assert "no significant improvement" in searched(num_evaluations=6, num_scenes=1, num_held_out_scenes=1).summary
+    assert (
+        "no significant improvement" in run_small_search(num_evaluations=6, num_scenes=1, num_held_out_scenes=1).summary
+    )
 
 
 def test_pareto_ends_and_compromise_are_validated():
-    result = searched(of=space(objectives=("near", "far")), num_evaluations=24)
+    result = run_small_search(of=space(objectives=("near", "far")), num_evaluations=24)
     assert [each.role for each in result.finalists] == ["compromise", "near", "far"]
     gains = {each.role: result.improvements[each.evaluation.number] for each in result.finalists}
     assert gains["near"][0] == result.improvements[:, 0].max()
@@ -416,11 +422,11 @@ def test_pareto_ends_and_compromise_are_validated():
 
 
 def test_asking_and_telling_is_what_a_run_does():
-    run = searched(num_evaluations=9).search
+    run = run_small_search(num_evaluations=9).search
     search = PlacementSearch(space(), plan(num_evaluations=9))
     while (candidate := search.ask()) is not None:
         search.tell(candidate, search.frames.score(candidate.rig))
-    assert contents(search) == contents(run)
+    assert dump_evaluations(search) == dump_evaluations(run)
     search = PlacementSearch(space(), plan(num_evaluations=2))
     start = search.ask()
     with pytest.raises(ValueError, match="the start, front_roof_32, cannot be scored: no"):
@@ -432,7 +438,7 @@ def test_asking_and_telling_is_what_a_run_does():
 
 def test_search_ends_after_all_choices():
     of = space(free={"roof": {"model": ("hesai_pandar64", "ouster_os1_64", "ouster_os1_128")}})
-    evaluations = searched(of=of, num_evaluations=50).search.evaluations
+    evaluations = run_small_search(of=of, num_evaluations=50).search.evaluations
     tried = [each.values["roof.model"] for each in evaluations[1:]]
     assert sorted(tried) == ["hesai_pandar64", "ouster_os1_128", "ouster_os1_64"]
 
@@ -453,6 +459,6 @@ def test_search_is_independent_of_workers(tmp_path):
     )
     small = {"num_scenes": 3, "num_held_out_scenes": 3, "frames_per_scene": 2, "frame_interval_s": 0.4, "num_rays": 512}
     results = [run_search(PlacementSearch(of, num_evaluations=3, num_workers=workers, **small)) for workers in (0, 1)]
-    assert contents(results[0].search) == contents(results[1].search)
+    assert dump_evaluations(results[0].search) == dump_evaluations(results[1].search)
     assert results[0].summary == results[1].summary
     assert 0 < results[0].search.evaluations[0].estimate.value[0] < 1

@@ -104,7 +104,7 @@ def test_infeasible_search_still_writes_files(tmp_path):
             raise ValueError("inside the wall")
         return np.array([0.5, 0.5])
 
-    result = run_search(PlacementSearch(space(), plan(num_evaluations=3, worth=nowhere)))
+    result = run_search(PlacementSearch(space(), plan(num_evaluations=3, compute_values=nowhere)))
     result.save(tmp_path)
     assert Rig.load(tmp_path / "best.yaml") == Rig.load("front_roof_32")
     assert [row["reason"] for row in rows(tmp_path / "evaluations.csv")[1:]] == ["inside the wall"] * 3

@@ -1,4 +1,4 @@
-"""A choice of candidates: what bits are worth is what rigs score, and what cannot be chosen is refused."""
+"""A choice of candidates: points reproduce the scores of rigs, and invalid candidates are refused."""
 
 import csv
 import json
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import yaml
 
-from tests.placement.worlds import BAY, EGO, FLOOR, LOT, WALL, held, lidar, rig
+from tests.placement.worlds import BAY, EGO, FLOOR, LOT, WALL, create_frames, lidar, rig
 from torchcover import Rig
 from torchcover.placement import Objective, SelectionSpace, run_selection
 from torchcover.placement.selection import compute_point_weights, observe_points
@@ -38,7 +38,7 @@ def folder(tmp_path_factory):
     return path
 
 
-def loaded(folder, **changes):
+def load_space(folder, **changes):
     path = folder / "space.yaml"
     path.write_text(yaml.safe_dump({**SPACE, **changes}))
     return SelectionSpace.load(path)
@@ -56,13 +56,13 @@ def test_point_weights_reproduce_evaluate(objective, measure):
         lidar("b", mount={"y_m": 1.2, "z_m": 0.9, "yaw_deg": 70}, channels=24, horizontal_fov_deg=200),
         lidar("c"),
     ]
-    with held(objectives={"a": objective}, average=measure) as instants:
-        worth = compute_point_weights(instants)
-        assert worth.sum() == pytest.approx(1.0, rel=1e-12)
+    with create_frames(objectives={"a": objective}, average=measure) as instants:
+        weights = compute_point_weights(instants)
+        assert weights.sum() == pytest.approx(1.0, rel=1e-12)
         seen = [observe_points(rig(sensor), instants)[0] for sensor in sensors]
         for each in ([0], [1, 2], [0, 1, 2]):
             expected = float(instants.score(rig(*(sensors[one] for one in each))).estimate.value[0])
-            assert worth[0] @ np.any([seen[one] for one in each], axis=0) == pytest.approx(expected, rel=1e-12)
+            assert weights[0] @ np.any([seen[one] for one in each], axis=0) == pytest.approx(expected, rel=1e-12)
 
 
 @pytest.mark.parametrize("measure", ["area", "cells"])
@@ -71,19 +71,19 @@ def test_scenes_without_a_region_do_not_count(measure):
     walled = {"name": "walled", "ego": EGO, "bodies": [FLOOR, WALL]}
     scenarios = [type(LOT).model_validate(one) for one in (yard, walled)]
     asked = {"a": Objective(region="20m", band="obstacle")}
-    with held(scenarios, asked, frames_per_scene=1, frame_interval_s=0.1, average=measure) as two:
+    with create_frames(scenarios, asked, frames_per_scene=1, frame_interval_s=0.1, average=measure) as two:
         value = float(two.score(rig()).estimate.value[0])
         assert compute_point_weights(two)[0] @ observe_points(rig(), two)[0] == pytest.approx(value, rel=1e-12)
     with (
-        held(scenarios[:1], asked, frames_per_scene=1, frame_interval_s=0.1) as one,
+        create_frames(scenarios[:1], asked, frames_per_scene=1, frame_interval_s=0.1) as one,
         pytest.raises(ValueError, match="no frame contains a visible surface of obstacle in 20m"),
     ):
         compute_point_weights(one)
 
 
 def test_selection_is_the_best_scored_rig(folder):
-    space = loaded(folder, baseline=["wide_left"])
-    with held(space.scenarios, space.scored_objectives, num_scenes=2) as instants:
+    space = load_space(folder, baseline=["wide_left"])
+    with create_frames(space.scenarios, space.scored_objectives, num_scenes=2) as instants:
         found = run_selection(space, instants, test_seed=5, num_held_out_scenes=3)
         pairs = [("front", "rear"), ("front", "left"), ("rear", "left")]
         named = {sensor.name: sensor for sensor in space.sensors}
@@ -121,11 +121,11 @@ def test_selection_is_the_best_scored_rig(folder):
 
 def test_best_selection_meets_not_worse_bounds(folder):
     objectives = {side: {"band": "ground", "region": f"{side}_3m", "threshold_m": 0.3} for side in ("front", "rear")}
-    space = loaded(folder, objectives=objectives, baseline=["wide_left"], not_worse=["left_3m"])
-    with held(space.scenarios, space.scored_objectives, num_scenes=2) as instants:
+    space = load_space(folder, objectives=objectives, baseline=["wide_left"], not_worse=["left_3m"])
+    with create_frames(space.scenarios, space.scored_objectives, num_scenes=2) as instants:
         found = run_selection(space, instants, test_seed=5, num_held_out_scenes=3)
         kept = found.coverage.compute_values(found.baseline)[2]
-        # The thresholds differ: what a point is worth is a matter of both.
+        # The thresholds differ: the weight of a point depends on both.
         values = instants.score(found.rig).estimate.value.tolist()
     assert found.best.values == pytest.approx(values, rel=1e-12)
     assert list(space.scored_objectives) == ["front", "rear", "not worse: left_3m"]
@@ -141,10 +141,10 @@ def test_best_selection_meets_not_worse_bounds(folder):
 
 
 def test_infeasible_bounds_report_the_smallest_shortfall(folder):
-    space = loaded(
+    space = load_space(
         folder, constraints={"max_sensors": 1}, baseline=["wide_front", "wide_rear"], not_worse=["front_3m", "rear_3m"]
     )
-    with held(space.scenarios, space.scored_objectives, num_scenes=1) as instants:
+    with create_frames(space.scenarios, space.scored_objectives, num_scenes=1) as instants:
         found = run_selection(space, instants, test_seed=5, num_held_out_scenes=1)
         each = {at: found.coverage.compute_values([at])[1:] for at in range(len(found.sensors))}
         kept = found.coverage.compute_values(found.baseline)[1:]
@@ -161,8 +161,8 @@ def test_infeasible_bounds_report_the_smallest_shortfall(folder):
 def test_candidates_with_many_self_hits_are_refused(folder):
     low = {"front": PLACES["front"], "flat": {"z_m": 1.51}}
     candidates, limits = {"wide": {"sensor": SENSOR, "mounts": low}}, {"max_sensors": 1, "max_self_hit_share": 0.4}
-    space = loaded(folder, candidates=candidates, constraints=limits)
-    with held(space.scenarios, space.scored_objectives, num_scenes=1) as instants:
+    space = load_space(folder, candidates=candidates, constraints=limits)
+    with create_frames(space.scenarios, space.scored_objectives, num_scenes=1) as instants:
         found = run_selection(space, instants, test_seed=5, num_held_out_scenes=1)
     assert "of its rays hit the vehicle; max_self_hit_share is 40.0%" in found.excluded["wide_flat"]
 
@@ -170,7 +170,7 @@ def test_candidates_with_many_self_hits_are_refused(folder):
 def test_mount_grid_lies_on_the_region(tmp_path):
     grid = {"region": ["roof", "hood"], "spacing_m": 0.6, "height_m": 0.2, "yaw_deg": [0, 90]}
     candidates = {"wide": {"sensor": SENSOR, "grid": grid}}
-    space = loaded(tmp_path, scenario="courtyard", vehicle="suv", candidates=candidates)
+    space = load_space(tmp_path, scenario="courtyard", vehicle="suv", candidates=candidates)
     names = [sensor.name for sensor in space.sensors]
     assert len(set(names)) == len(names) > 10
     assert all(name.startswith(("wide_roof_", "wide_hood_")) for name in names)
@@ -215,14 +215,14 @@ def test_mount_grid_lies_on_the_region(tmp_path):
 )
 def test_invalid_selection_is_refused_in_one_line(folder, changes, message):
     with pytest.raises(ValueError, match=message) as error:
-        loaded(folder, **changes)
+        load_space(folder, **changes)
     assert "space.yaml" in str(error.value)
 
 
 def test_candidates_that_are_all_inside_are_refused(folder):
-    space = loaded(folder, candidates={"wide": {"sensor": SENSOR, "mounts": {"a": {"z_m": 0.7}}}})
+    space = load_space(folder, candidates={"wide": {"sensor": SENSOR, "mounts": {"a": {"z_m": 0.7}}}})
     with (
-        held(space.scenarios, space.scored_objectives, num_scenes=1) as instants,
+        create_frames(space.scenarios, space.scored_objectives, num_scenes=1) as instants,
         pytest.raises(ValueError, match=r"none of 1 can be mounted; wide_a: .* inside the ego"),
     ):
         run_selection(space, instants, test_seed=5, num_held_out_scenes=1)
@@ -230,17 +230,17 @@ def test_candidates_that_are_all_inside_are_refused(folder):
 
 def test_candidates_that_see_nothing_that_counts_are_refused(folder):
     up = {**SENSOR, "vertical_fov_deg": [60, 80]}
-    space = loaded(folder, candidates={"wide": {"sensor": up, "mounts": PLACES}})
+    space = load_space(folder, candidates={"wide": {"sensor": up, "mounts": PLACES}})
     with (
-        held(space.scenarios, space.scored_objectives, num_scenes=1) as instants,
+        create_frames(space.scenarios, space.scored_objectives, num_scenes=1) as instants,
         pytest.raises(ValueError, match="none of the 3 that can be mounted improves"),
     ):
         run_selection(space, instants, test_seed=5, num_held_out_scenes=1)
 
 
 def test_few_held_out_scenes_show_no_improvement(folder):
-    space = loaded(folder, baseline=["wide_left"])
-    with held(space.scenarios, space.scored_objectives, num_scenes=1) as instants:
+    space = load_space(folder, baseline=["wide_left"])
+    with create_frames(space.scenarios, space.scored_objectives, num_scenes=1) as instants:
         found = run_selection(space, instants, test_seed=5, num_held_out_scenes=1)
     assert "no significant improvement" in found.summary
     assert "nan" not in found.summary

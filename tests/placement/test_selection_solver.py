@@ -20,15 +20,15 @@ POINTS, COUNT = 37, 8
 def some(seed, count=COUNT, numbers=3):
     """Candidates that see points at random, the last of them the same as the first, and all of it ungrouped."""
     generator = np.random.default_rng(seed)
-    worth = generator.gamma(0.5, size=(numbers, POINTS)) * (generator.random((numbers, POINTS)) < 0.7)
-    worth /= worth.sum(axis=1, keepdims=True)
+    weights = generator.gamma(0.5, size=(numbers, POINTS)) * (generator.random((numbers, POINTS)) < 0.7)
+    weights /= weights.sum(axis=1, keepdims=True)
     seen = generator.random((count + 1, POINTS)) < generator.uniform(0.05, 0.5, (count + 1, 1))
     seen[-2] = seen[0]
-    return CandidateCoverage.from_points(worth, list(seen[:-1]), seen[-1]), seen, worth
+    return CandidateCoverage.from_points(weights, list(seen[:-1]), seen[-1]), seen, weights
 
 
-def slow_values(seen, worth, chosen):
-    return (worth * seen[[-1, *chosen]].any(axis=0)).sum(axis=1)
+def slow_values(seen, weights, chosen):
+    return (weights * seen[[-1, *chosen]].any(axis=0)).sum(axis=1)
 
 
 def all_allowed(limits, count=COUNT):
@@ -60,10 +60,10 @@ def _apart(generator):
 
 
 def test_grouping_points_preserves_values():
-    candidates, seen, worth = some(0)
+    candidates, seen, weights = some(0)
     assert len(np.unique(candidates.observes, axis=0)) == len(candidates.observes) < POINTS
     for chosen in ((), (3,), (0, 4, 7), tuple(range(COUNT))):
-        np.testing.assert_allclose(candidates.compute_values(chosen), slow_values(seen, worth, chosen), rtol=1e-12)
+        np.testing.assert_allclose(candidates.compute_values(chosen), slow_values(seen, weights, chosen), rtol=1e-12)
     lost = candidates.compute_failure_effects((1, 2, 6))
     np.testing.assert_allclose(
         lost[1], candidates.compute_values((1, 2, 6)) - candidates.compute_values((1, 6)), rtol=1e-12
@@ -73,28 +73,28 @@ def test_grouping_points_preserves_values():
 @pytest.mark.parametrize("kind", LIMITS)
 @pytest.mark.parametrize("seed", range(4))
 def test_selection_is_best_and_cheapest(kind, seed):
-    candidates, seen, worth = some(seed)
+    candidates, seen, weights = some(seed)
     limits = LIMITS[kind](np.random.default_rng(seed))
-    each = {chosen: slow_values(seen, worth, chosen)[0] for chosen in all_allowed(limits)}
+    each = {chosen: slow_values(seen, weights, chosen)[0] for chosen in all_allowed(limits)}
     most = max(each.values())
     cheapest = min((limits.compute_price_eur(one), len(one)) for one, value in each.items() if value > most - 1e-9)
     found = select_sensors(candidates, limits)
     assert found.is_proven
     assert found.shortfall == 0
     assert found.values[0] == pytest.approx(most, abs=2e-6)
-    np.testing.assert_allclose(found.values, slow_values(seen, worth, found.selected), rtol=1e-12)
+    np.testing.assert_allclose(found.values, slow_values(seen, weights, found.selected), rtol=1e-12)
     assert (limits.compute_price_eur(found.selected), len(found.selected)) == cheapest
 
 
 @pytest.mark.parametrize("seed", range(6))
 def test_lower_bounds_are_met_or_nearly_met(seed):
-    candidates, seen, worth = some(seed)
+    candidates, seen, weights = some(seed)
     generator = np.random.default_rng(seed)
     least = np.append(-np.inf, generator.uniform(0.3, 0.9, 2))
     limits = SelectionLimits(3, list(prices(generator)), 500.0, min_values=least)
     value = {}
     for chosen in all_allowed(limits):
-        values = slow_values(seen, worth, chosen)
+        values = slow_values(seen, weights, chosen)
         value[chosen] = (least - values).clip(0).sum(), values[0]
     fewest = min(short for short, _ in value.values())
     found = select_sensors(candidates, limits)
@@ -106,10 +106,10 @@ def test_lower_bounds_are_met_or_nearly_met(seed):
 
 @pytest.mark.parametrize("seed", range(4))
 def test_compromise_minimizes_the_largest_distance(seed):
-    candidates, seen, worth = some(seed)
+    candidates, seen, weights = some(seed)
     limits = SelectionLimits(2)
     between, *ends = select_for_objectives(candidates, limits, 2)
-    each = np.array([slow_values(seen, worth, chosen)[:2] for chosen in all_allowed(limits)])
+    each = np.array([slow_values(seen, weights, chosen)[:2] for chosen in all_allowed(limits)])
     np.testing.assert_allclose([ends[k].values[k] for k in range(2)], each.max(axis=0), atol=2e-5)
     low, extent = (op([end.values[:2] for end in ends], axis=0) for op in (np.min, np.ptp))
     if (extent > 1e-6).all():
@@ -131,12 +131,12 @@ def test_solver_without_time_reports_its_gap():
 
 
 def test_random_selections_meet_limits_and_are_maximal():
-    candidates, seen, worth = some(6)
+    candidates, seen, weights = some(6)
     limits = LIMITS["two for money"](np.random.default_rng(6))
     drawn = sample_selections(candidates, limits, 50, seed=1)
     assert drawn == sample_selections(candidates, limits, 50, seed=1)
     assert len({one.selected for one in drawn}) > 10
     for one in drawn:
-        assert one.values == pytest.approx(slow_values(seen, worth, one.selected).tolist())
+        assert one.values == pytest.approx(slow_values(seen, weights, one.selected).tolist())
         assert limits.compute_price_eur(one.selected) <= 400
         assert not any(limits.can_add(one.selected, other) for other in range(COUNT))

@@ -1,4 +1,4 @@
-"""Small worlds and rigs, and scores that are made up."""
+"""Small scenarios and rigs, and estimates of given scores."""
 
 import numpy as np
 import torch
@@ -11,7 +11,7 @@ EGO = {"shape": {"type": "box", "size_m": [4, 2, 1.5]}}
 FLOOR = {"name": "floor", "shape": {"type": "plane", "size_m": [400, 400]}}
 WALL = {"name": "wall", "shape": {"type": "box", "size_m": [0.5, 6, 1.8]}, "poses": [{"x_m": 9.0, "y_m": 1.0}]}
 
-# Three instants a run that are 0.4 s apart.
+# Three frames per run, 0.4 s apart.
 LOT = Scenario.model_validate(
     {
         "name": "lot",
@@ -46,7 +46,7 @@ def rig(*sensors, name="small", **keys):
     return Rig.model_validate({"name": name, "sensors": list(sensors) or [lidar()], **keys})
 
 
-def held(scenarios=(LOT,), objectives=OBJECTIVES, **keys):
+def create_frames(scenarios=(LOT,), objectives=OBJECTIVES, **keys):
     return CommonFrames(
         scenarios,
         objectives,
@@ -54,12 +54,12 @@ def held(scenarios=(LOT,), objectives=OBJECTIVES, **keys):
     )
 
 
-def estimate_of(values, world, lower_is_better=()):
-    """Of (n, O) values at instants of some worlds: the means, and what they are without each world."""
-    values = torch.as_tensor(np.asarray(values, dtype=np.float64).reshape(len(world), -1))
-    each, world = torch.unique(torch.as_tensor(world), return_inverse=True)
-    sums = torch.zeros(len(each), values.shape[1], dtype=torch.float64).index_add_(0, world, values)
-    steps = torch.bincount(world)
+def estimate_values(values, scene_ids, lower_is_better=()):
+    """Estimate the means of (n, O) values in frames of some scenes, also without each scene."""
+    values = torch.as_tensor(np.asarray(values, dtype=np.float64).reshape(len(scene_ids), -1))
+    unique_ids, scene_indices = torch.unique(torch.as_tensor(scene_ids), return_inverse=True)
+    sums = torch.zeros(len(unique_ids), values.shape[1], dtype=torch.float64).index_add_(0, scene_indices, values)
+    frame_counts = torch.bincount(scene_indices)
     names = [f"o{k}" for k in range(values.shape[1])]
     quantities = [Quantity(name, name, "share", name in lower_is_better) for name in names]
-    return Estimate.from_ratios(quantities, steps.double(), sums, steps)
+    return Estimate.from_ratios(quantities, frame_counts.double(), sums, frame_counts)

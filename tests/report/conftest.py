@@ -1,4 +1,4 @@
-"""Coverages that the tests of tables and figures share."""
+"""Coverages for the tests of tables and figures."""
 
 import pytest
 import torch
@@ -6,93 +6,101 @@ import torch
 from torchcover.coverage import BevGrid, Coverage, CoverageMetric, Region
 
 GRID = BevGrid(x_m=(-8.0, 12.0), y_m=(-5.0, 5.0), cell_m=1.0)
-# Nothing was ever probed behind x = -5 m.
+# No reference point lies behind x = -5 m.
 REGIONS = (Region("near", (0.0, 5.0), (-5.0, 5.0)), Region("behind", (-8.0, -6.0), (-5.0, 5.0)))
 
 
-def cloud(count: int, seed: int) -> torch.Tensor:
-    """Points in front of x = -5 m, in both bands."""
+def sample_cloud(count: int, seed: int) -> torch.Tensor:
+    """Sample points in front of x = -5 m, in both bands."""
     unit = torch.rand(count, 3, generator=torch.Generator().manual_seed(seed))
     return unit * torch.tensor([17.0, 10.0, 2.4]) + torch.tensor([-5.0, -5.0, -0.45])
 
 
-def measured(sensor: torch.Tensor, *, grid: BevGrid = GRID, seed: int = 0, **options) -> Coverage:
-    """One step of a rig with these points."""
+def measure_frame(sensor: torch.Tensor, *, grid: BevGrid = GRID, seed: int = 0, **options) -> Coverage:
+    """Measure one frame of a rig with these points."""
     metric = CoverageMetric(grid, **options)
-    metric.update(sensor, cloud(300, seed))
+    metric.update(sensor, sample_cloud(300, seed))
     return metric.compute()
 
 
-def over_steps(size: int, seed: int, steps: int, **options) -> Coverage:
-    """One cloud of the rig a step, against reference points of that step."""
+def measure_frames(size: int, seed: int, num_frames: int, **options) -> Coverage:
+    """Measure frames with another cloud and other reference points in each."""
     metric = CoverageMetric(GRID, num_blocks=16, **options)
-    for index in range(steps):
-        metric.update(cloud(size, seed * 100 + index), cloud(100, 1000 + index), block_index=index)
+    for index in range(num_frames):
+        metric.update(sample_cloud(size, seed * 100 + index), sample_cloud(100, 1000 + index), block_index=index)
     return metric.compute()
 
 
-def over_surface(size: int, seed: int, steps: int) -> Coverage:
-    """As `over_steps`, but every reference point stands for 0.1 to 0.9 square metres."""
+def measure_surface(size: int, seed: int, num_frames: int) -> Coverage:
+    """Measure the same frames, with reference points that represent 0.1 to 0.9 square meters each."""
     metric = CoverageMetric(GRID, num_blocks=16, has_area_weights=True)
-    for index in range(steps):
-        m2 = 0.1 + 0.8 * torch.rand(100, generator=torch.Generator().manual_seed(index))
-        metric.update(cloud(size, seed * 100 + index), cloud(100, 1000 + index), weights=m2, block_index=index)
+    for index in range(num_frames):
+        weights_m2 = 0.1 + 0.8 * torch.rand(100, generator=torch.Generator().manual_seed(index))
+        metric.update(
+            sample_cloud(size, seed * 100 + index),
+            sample_cloud(100, 1000 + index),
+            weights=weights_m2,
+            block_index=index,
+        )
     return metric.compute()
 
 
 @pytest.fixture(scope="session")
 def regions():
-    """One that is known in part, one that is not."""
+    """A partly observed region, and an unobserved one."""
     return REGIONS
 
 
 @pytest.fixture(scope="session")
 def measure():
-    """(points of a rig, options of the metric) -> its coverage after one step."""
-    return measured
+    """Function from the points of a rig and options of the metric to its coverage after one frame."""
+    return measure_frame
 
 
 @pytest.fixture(scope="session")
 def points():
-    """(count, seed) -> points of a rig."""
-    return cloud
+    """Function from count and seed to the points of a rig."""
+    return sample_cloud
 
 
 @pytest.fixture(scope="session")
 def pair():
-    """Few points, and the same with many more; one step, no errors."""
-    few, more = cloud(20, 1), cloud(200, 2)
-    return {"few": measured(few), "many": measured(torch.cat([few, more]))}
+    """A rig with few points, and one with the same points and many more; one frame, no errors."""
+    few, more = sample_cloud(20, 1), sample_cloud(200, 2)
+    return {"few": measure_frame(few), "many": measure_frame(torch.cat([few, more]))}
 
 
 @pytest.fixture(scope="session")
 def blind():
-    """A rig without a point, one that sees, and another without a point; infinite radii."""
-    seeing, nothing = measured(cloud(50, 1)), measured(torch.zeros(0, 3))
-    return {"blind": nothing, "seeing": seeing, "[blind]": measured(torch.zeros(0, 3))}
+    """Two rigs without points, whose radii are infinite, and one with points between them."""
+    no_points = torch.zeros(0, 3)
+    seeing = measure_frame(sample_cloud(50, 1))
+    return {"blind": measure_frame(no_points), "seeing": seeing, "[blind]": measure_frame(no_points)}
 
 
 @pytest.fixture(scope="session")
 def trios():
-    """Steps -> few points, as many other points, and many more, in every step; with errors."""
-    kept = {}
+    """Function from the number of frames to rigs with few, as many other, and many points, with errors."""
+    cache = {}
 
-    def trio(steps: int) -> dict[str, Coverage]:
-        if steps not in kept:
+    def measure_trio(num_frames: int) -> dict[str, Coverage]:
+        if num_frames not in cache:
             sizes = {"few": (20, 1), "other": (20, 2), "many": (300, 3)}
-            kept[steps] = {name: over_steps(size, seed, steps) for name, (size, seed) in sizes.items()}
-        return kept[steps]
+            cache[num_frames] = {}
+            for name, (size, seed) in sizes.items():
+                cache[num_frames][name] = measure_frames(size, seed, num_frames)
+        return cache[num_frames]
 
-    return trio
+    return measure_trio
 
 
 @pytest.fixture(scope="session")
 def surface_pair():
-    """Few points and many, against the same surface points; 24 steps, with errors."""
-    return {"few": over_surface(20, 1, 24), "many": over_surface(300, 3, 24)}
+    """Rigs with few and many points against the same surface points; 24 frames, with errors."""
+    return {"few": measure_surface(20, 1, 24), "many": measure_surface(300, 3, 24)}
 
 
 @pytest.fixture(scope="session")
 def trio(trios):
-    """The three of 24 steps."""
+    """Rigs of `trios` after 24 frames."""
     return trios(24)
