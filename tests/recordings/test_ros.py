@@ -16,6 +16,7 @@ from torchcover.files import BadFileError
 from torchcover.geometry import build_transform, convert_euler_to_rotation, invert, transform_points
 from torchcover.recordings.formats.bag import Bag
 from torchcover.recordings.formats.ros import RosBag
+from torchcover.recordings.formats.ros_poses import FrameTree
 from torchcover.recordings.vehicle_cloud import transform_to_vehicle
 
 CORNERS_M = np.array([[5.0, 1.0, 0.5], [8.0, -2.0, 0.25], [-4.0, 0.5, 1.0], [6.0, 6.0, 2.0]])
@@ -682,3 +683,11 @@ def test_wrong_index_is_detected(tmp_path):
     path.write_bytes(data[:count] + (3).to_bytes(8, "little") + data[count + 8 :])
     with pytest.raises(BadFileError, match="the index of its messages is missing or incomplete"):
         RosBag(path)
+
+
+def test_long_chains_of_transforms_are_refused():
+    step = build_transform(np.eye(3), [1.0, 0.0, 0.0])
+    chain = [link(f"f{k}", f"f{k + 1}", step) for k in range(5001)]
+    assert FrameTree(chain[:5000]).lookup_transform("f0", "f5000")[0, 3] == 5000.0
+    with pytest.raises(ValueError, match="5,001 transforms between different frames; at most 5,000 are read"):
+        FrameTree(chain)

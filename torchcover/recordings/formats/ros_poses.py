@@ -1,7 +1,7 @@
 """Poses in a bag: static transforms between frames, and interpolated poses of the vehicle from odometry or tf."""
 
 import warnings
-from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence, Sized
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -58,13 +58,23 @@ class FrameTree:
 
     def __init__(self, transforms: Iterable[Any]) -> None:
         self._mounts: dict[Edge, Matrix] = {}
+        self._edges_by_frame: dict[str, dict[Edge, None]] = {}
         self._replaced: dict[Edge, Matrix] = {}
         for transform in transforms:
             edge, parent_T_child = parse_edge(transform)
             earlier = self._mounts.pop(edge, parent_T_child)
             if np.abs(earlier - parent_T_child).max() > MOUNT_TOLERANCE:
                 self._replaced[edge] = earlier
-            self._mounts[edge] = parent_T_child
+            self._insert(edge, parent_T_child)
+        check_transform_count(self._mounts)
+
+    def _insert(self, edge: Edge, parent_T_child: Matrix) -> None:
+        """Insert a transform as the latest one."""
+        self._mounts[edge] = parent_T_child
+        for frame in edge:
+            edges = self._edges_by_frame.setdefault(frame, {})
+            edges.pop(edge, None)
+            edges[edge] = None
 
     def add(self, parent: str, child: str, parent_T_child: Matrix) -> None:
         """Add a transform unless both frames are already connected.
@@ -75,7 +85,7 @@ class FrameTree:
             parent_T_child: (4, 4) transform.
         """
         if self.lookup_transform(parent, child) is None:
-            self._mounts[parent, child] = parent_T_child
+            self._insert((parent, child), parent_T_child)
 
     def remove_edges(self, edges: Container[Edge]) -> "FrameTree":
         """Return a tree without some of the transforms.
@@ -84,7 +94,9 @@ class FrameTree:
             edges: Edges to remove.
         """
         tree = FrameTree(())
-        tree._mounts = {edge: mount for edge, mount in self._mounts.items() if edge not in edges}
+        for edge, mount in self._mounts.items():
+            if edge not in edges:
+                tree._insert(edge, mount)
         return tree
 
     def find_mounted_frames(self, frame: str) -> set[str]:
@@ -109,10 +121,11 @@ class FrameTree:
         Yields:
             Neighbor and `frame_T_neighbor`.
         """
-        for (parent, child), parent_T_child in reversed(self._mounts.items()):
+        for parent, child in reversed(self._edges_by_frame.get(frame, {})):
+            parent_T_child = self._mounts[parent, child]
             if parent == frame:
                 yield child, parent_T_child
-            elif child == frame:
+            else:
                 yield parent, invert(parent_T_child)
 
     def lookup_transform(self, destination: str, source: str) -> Matrix | None:
@@ -142,6 +155,8 @@ class FrameTree:
             clashes.append(f"{parent} -> {child} is sent with two values, {difference} apart: the later one is used")
         transforms = self._find_transforms(frame)
         for (parent, child), mount in self._mounts.items():
+            if len(clashes) >= 3:
+                break
             if parent not in transforms or child not in transforms:
                 continue
             used = invert(transforms[parent]) @ transforms[child]
@@ -163,6 +178,20 @@ class FrameTree:
                     transforms[neighbor] = transforms[current] @ current_T_neighbor
                     queue.append(neighbor)
         return transforms
+
+
+def check_transform_count(edges: Sized) -> None:
+    """Check the number of transforms, because the search of paths takes quadratic time and memory.
+
+    Args:
+        edges: Different pairs of parent and child.
+
+    Raises:
+        ValueError: There are too many.
+    """
+    max_transforms = 5000  # robots have tens to hundreds of frames
+    if len(edges) > max_transforms:
+        raise ValueError(f"{len(edges):,} transforms between different frames; at most {max_transforms:,} are read")
 
 
 def normalize_frame_id(frame_id: str) -> str:
@@ -459,6 +488,7 @@ def _sample_transforms(bag: Bag, topic: str) -> dict[Edge, list[Any]]:
             for transform in message.transforms:
                 edge = normalize_frame_id(transform.header.frame_id), normalize_frame_id(transform.child_frame_id)
                 sampled.setdefault(edge, []).append(transform)
+    check_transform_count(sampled)
     return sampled
 
 
@@ -532,7 +562,8 @@ def _list_unused_edges(
     edges_by_path = [{link for link in path if isinstance(link, tuple)} for path in paths]
     passed_frames = set[str]()
     for _, child in edges_by_path[0] if edges_by_path else ():
-        passed_frames |= tree.find_mounted_frames(child)
+        if child not in passed_frames:
+            passed_frames |= tree.find_mounted_frames(child)
     used = set[Edge]().union(*edges_by_path)
     unused = [edge for edge in moving if edge[1] in passed_frames and edge not in used]
     return sorted(f"{parent} -> {child}" for parent, child in unused)
@@ -548,10 +579,14 @@ def _find_world_paths(
     """
     paths: dict[str, list[Edge | Matrix]] = {vehicle_frame: []}
     ranks: dict[str, tuple[bool, int]] = {}
+    mounted_by_frame: dict[str, set[str]] = {}
     queue = [vehicle_frame]
     for frame in queue:
         path = paths[frame]
-        mounted = tree.find_mounted_frames(frame)
+        if frame not in mounted_by_frame:
+            mounted_frames = tree.find_mounted_frames(frame)
+            mounted_by_frame.update(dict.fromkeys(mounted_frames, mounted_frames))
+        mounted = mounted_by_frame[frame]
         is_odom = frame == "odom"  # this frame never jumps (REP-105)
         is_world = is_odom or not any(child in mounted for _, child in moving)
         if path and isinstance(path[0], tuple) and is_world:
