@@ -150,7 +150,7 @@ def measured(sweeps, cases, many, longest_s):
     """The true numbers of each rig; of each case those of its rigs, the processor time a frame, and `found_movers`."""
     surface = sweeps.replace_reference_sensor(
         create_reference_sensor(
-            num_rays=TRUTH_RAYS, query_plan=RegionsOfInterest().build_query_plan(sweeps.ego_outline_m)
+            num_rays=TRUTH_RAYS, query_plan=RegionsOfInterest().build_query_plan(sweeps.metadata.ego_outline_m)
         )
     )
     truths = {rig: metric() for rig in MOUNTS}

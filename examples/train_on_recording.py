@@ -58,7 +58,7 @@ def write_small_recording(folder):
 
 def prepare_frames(frames):
     """Prepare training frames, and validation frames with reference; `network RIG` is the input of the detector."""
-    rig, training_count, prepared = frames.rigs[0], int(TRAINING_SHARE * len(frames)), []
+    rig, training_count, prepared = frames.metadata.rigs[0], int(TRAINING_SHARE * len(frames)), []
     for frame in track(frames, description="accumulating the reference", total=len(frames)):
         if frame.boxes is None:
             raise SystemExit(f"{frames.recording.path}: labeled boxes are needed for recall, and there are none")
@@ -109,7 +109,7 @@ def main():
         console.print(f"simulating a small recording: {recording}")
         write_small_recording(recording)
     frames = RecordedFrames(recording, reference=AccumulatedReference(options.window), use_ground_model=False)
-    console.print(*frames.reference_record["notes"], sep="\n")
+    console.print(*frames.describe_reference()["notes"], sep="\n")
     rig, training_frames, validation_frames = prepare_frames(frames)
     metric = build_coverage_metric(has_area_weights=False)
     module, coverage = train(rig, training_frames, validation_frames, metric, options, console)

@@ -26,13 +26,15 @@ def run(options):
     histogram = PointHistogram()
     # 16 blocks give standard errors.
     coverages = measurement.run(range(options.num_frames), num_blocks=16, observers=[histogram])
-    views = build_sensor_views(measurement.frames.sensors[RIG])
+    views = build_sensor_views(measurement.frames.metadata.sensors[RIG])
     texts = []
     for (_, average), coverage in coverages.items():
         table = CoverageTable.from_coverages({RIG: coverage}, REGIONS)
         print_table(table, Console())
         texts.append(RENDERERS["markdown"](table))
-        figures = plot_maps({RIG: coverage}, ego_outline_m=measurement.frames.ego_outline_m, sensors={RIG: views})
+        figures = plot_maps(
+            {RIG: coverage}, ego_outline_m=measurement.frames.metadata.ego_outline_m, sensors={RIG: views}
+        )
         write_figures(figures, out / "maps" / average)
         coverage.save(out / f"{RIG}_{average}.npz")
     (out / "table.md").write_text("\n".join(texts), encoding="utf-8")
@@ -43,7 +45,7 @@ def run(options):
         FIGURE_GRID,
         num_frames=options.num_frames,
         title=f"Four views of {RIG}",
-        ego_outline_m=measurement.frames.ego_outline_m,
+        ego_outline_m=measurement.frames.metadata.ego_outline_m,
         sensors=views,
     )
     figure.savefig(out / "figure_2.png", dpi=figure.dpi)

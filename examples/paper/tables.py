@@ -53,8 +53,8 @@ def run(options):
     (options.out / "tables.json").write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
     for rig_set in rig_sets.values():
         coverages = {rig_set[lidar]: load_merged(pieces, rig_set[lidar], "cells") for lidar in MAPPED_LIDARS}
-        sensors = {rig: build_sensor_views(measurement.frames.sensors[rig]) for rig in coverages}
-        figures = plot_maps(coverages, ego_outline_m=measurement.frames.ego_outline_m, sensors=sensors)
+        sensors = {rig: build_sensor_views(measurement.frames.metadata.sensors[rig]) for rig in coverages}
+        figures = plot_maps(coverages, ego_outline_m=measurement.frames.metadata.ego_outline_m, sensors=sensors)
         write_figures(figures, options.out / "maps" / "_".join(coverages).replace("/", "-"))
 
 

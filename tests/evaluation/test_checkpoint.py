@@ -16,7 +16,7 @@ import torch
 
 import torchcover
 from torchcover.coverage import FrameQuantiles, Maximum
-from torchcover.data import BadFrameError, FrameDataset
+from torchcover.data import BadFrameError, FrameDataset, FrameMetadata
 from torchcover.evaluation import Checkpoint, checkpoint
 from torchcover.evaluation.checkpoint import read_header, read_state, write_checkpoint
 from torchcover.evaluation.config import DESCRIPTIONS
@@ -30,16 +30,13 @@ SETTINGS = {"cell_m": 8.0, "aggregations": (Maximum(), FrameQuantiles((0.5,)))}
 class SyntheticFrames(FrameDataset):
     """Source of frames, some of which may be bad; a delay allows a test to kill it during a frame."""
 
-    rigs = ("a",)
-    sensors = {}  # noqa: RUF012
-    ego_outline_m = None
-    description = {"scenario": None, "frames": "drive", "seed": None}  # noqa: RUF012
-    has_area_weights = False
-    reference_record = None
-    get_scene_id = staticmethod(int)
+    metadata = FrameMetadata(("a",), {"scenario": None, "frames": "drive", "seed": None})
 
     def __init__(self, frame_of, bad=(), content="drive", delay_s=0.0):
-        self.frame_of, self.bad, self.content, self.delay_s = frame_of, bad, {"frames": content}, delay_s
+        self.frame_of, self.bad, self.content, self.delay_s = frame_of, bad, content, delay_s
+
+    def collect_content(self):
+        return {"frames": self.content}
 
     def __len__(self):
         return NUM_FRAMES

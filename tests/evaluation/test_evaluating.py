@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 import torchcover
 from torchcover import Coverage, RegionsOfInterest, Rig, Scenario
 from torchcover.coverage import Maximum, Quantiles
-from torchcover.data import DEFAULT_REFERENCE, BadFrameError, Frame, FrameDataset
+from torchcover.data import DEFAULT_REFERENCE, BadFrameError, Frame, FrameDataset, FrameMetadata
 from torchcover.evaluation import Settings, TargetError, task
 from torchcover.evaluation.omissions import SLOW_PACKAGES
 from torchcover.evaluation.target_error import MIN_FRAMES, StoppingParams
@@ -46,14 +46,7 @@ class PointCount:
 class Source(FrameDataset):
     """Source of frames that is neither a simulation nor a recording."""
 
-    rigs = ("low", "high")
-    sensors = {}  # noqa: RUF012
-    ego_outline_m = None
-    description = {"scenario": None, "frames": "made up", "seed": None}  # noqa: RUF012
-    has_area_weights = False
-    reference_record = None
-    content = {"frames": "made up"}  # noqa: RUF012
-    get_scene_id = staticmethod(int)
+    metadata = FrameMetadata(("low", "high"), {"scenario": None, "frames": "made up", "seed": None})
 
     def __len__(self):
         return 3
@@ -156,7 +149,7 @@ def test_evaluate_takes_a_target_error_object():
 class Single(Source):
     """Source of many frames with one rig."""
 
-    rigs = ("high",)
+    metadata = dataclasses.replace(Source.metadata, rigs=("high",))
 
     def __len__(self):
         return 100
@@ -269,7 +262,7 @@ def test_settings_are_converted_to_one_form():
         ({"only_detection": True, "redundancy": True}, ValueError, "only_detection: excludes radii"),
         ({"only_detection": True, "target_error": "0.02m"}, ValueError, "only_detection: excludes radii"),
         ({"only_detection": True, "thresholds_m": ()}, ValueError, "needs a threshold"),
-        ({"frames": [1, 2]}, TypeError, "FrameSource is needed; got list, which has no rigs, "),
+        ({"frames": [1, 2]}, TypeError, "FrameDataset is needed; got list; for "),
     ],
 )
 def test_invalid_settings_are_rejected_before_the_run(settings, error, message):
@@ -431,12 +424,9 @@ def test_temporary_files_of_killed_processes_are_deleted(tmp_path):
     assert not [name for name in read_files(tmp_path) if name.startswith(".")]
 
 
-def test_missing_attributes_of_a_source_are_named():
-    class Unfinished(Single):
-        has_area_weights = property()  # raises AttributeError, like a missing attribute
-
-    with pytest.raises(TypeError, match="got Unfinished, which has no has_area_weights; for a list"):
-        torchcover.evaluate(frames=Unfinished(), cell_m=8.0)
+def test_checkpoints_need_the_content_of_a_source(tmp_path):
+    with pytest.raises(NotImplementedError, match=r"^frames: Single does not define collect_content\(\), by which"):
+        torchcover.evaluate(frames=Single(), cell_m=8.0, checkpoint=tmp_path / "checkpoint.npz")
 
 
 def test_hills_do_not_change_detection_of_far_obstacles():

@@ -9,21 +9,14 @@ import torch
 import torchcover
 from tests.killing import run_in_fork
 from torchcover import Coverage
-from torchcover.data import Frame, FrameDataset
+from torchcover.data import Frame, FrameDataset, FrameMetadata
 from torchcover.files import BadFileError
 
 
 class Drive(FrameDataset):
     """Two reference points, one of which a sensor detects."""
 
-    rigs = ("low",)
-    sensors = {}  # noqa: RUF012
-    ego_outline_m = None
-    description = {"scenario": None, "frames": "made up", "seed": None}  # noqa: RUF012
-    has_area_weights = False
-    reference_record = None
-    content = {"frames": "made up"}  # noqa: RUF012
-    get_scene_id = staticmethod(int)
+    metadata = FrameMetadata(("low",), {"scenario": None, "frames": "made up", "seed": None})
 
     def __len__(self):
         return 3

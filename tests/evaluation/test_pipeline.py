@@ -205,7 +205,7 @@ def test_each_scene_is_built_by_one_worker(monkeypatch, tmp_path):
         return build(self, seed, run, *args)
 
     monkeypatch.setattr(Scenario, "build_scene", build_scene)
-    evaluate(frames=Forwarding(frames), cell_m=8.0, num_workers=2)
+    evaluate(frames=frames, cell_m=8.0, num_workers=2)
     assert sorted((tmp_path / "built").read_text().split()) == ["0", "1"]
 
 

@@ -15,7 +15,7 @@ import torch
 from torch.distributed import FileStore, HashStore, TCPStore
 
 import torchcover
-from torchcover.data import BadFrameError, FrameDataset, SimulatedFrames
+from torchcover.data import BadFrameError, FrameDataset, FrameMetadata, SimulatedFrames
 from torchcover.evaluation import Ranks, join_ranks
 from torchcover.evaluation.ranks import RanksParams, serialize
 
@@ -25,17 +25,14 @@ TIMEOUT_S = 30.0
 class Drive(FrameDataset):
     """Source of frames; the frames with the indices `bad` raise an error."""
 
-    rigs = ("a", "b")
-    sensors = {}  # noqa: RUF012
-    ego_outline_m = None
-    description = {"scenario": None, "frames": "drive", "seed": None}  # noqa: RUF012
-    has_area_weights = False
-    reference_record = None
-    get_scene_id = staticmethod(int)
+    metadata = FrameMetadata(("a", "b"), {"scenario": None, "frames": "drive", "seed": None})
 
     def __init__(self, frame_of, length=7, bad=(), content="drive", delay_s=0.0):
-        self.frame_of, self.length, self.bad, self.content = frame_of, length, bad, {"frames": content}
+        self.frame_of, self.length, self.bad, self.content = frame_of, length, bad, content
         self.delay_s = delay_s
+
+    def collect_content(self):
+        return {"frames": self.content}
 
     def __len__(self):
         return self.length

@@ -32,7 +32,7 @@ def written(folder):
 
 def content(folder, **settings):
     settings = {"num_frames": 2, "frame_interval_s": 0.1, **settings}
-    return json.dumps(SimulatedFrames(folder / "road.yaml", folder / "low.yaml", **settings).content)
+    return json.dumps(SimulatedFrames(folder / "road.yaml", folder / "low.yaml", **settings).collect_content())
 
 
 def test_content_of_simulations_is_that_of_files(tmp_path):
@@ -66,9 +66,9 @@ def test_content_ignores_paths_and_descriptions(tmp_path):
 
 def test_traffic_has_its_vehicles_in_it(monkeypatch):
     frames = SimulatedFrames("urban", "front_roof_32", num_frames=1)
-    before = frames.content
+    before = frames.collect_content()
     monkeypatch.setattr("torchcover.simulation.traffic.kind.hash_builtin_documents", lambda _: {"van": "larger"})
-    assert frames.content["scenario"]["traffic"].pop("vehicles") == {"van": "larger"}
+    assert frames.collect_content()["scenario"]["traffic"].pop("vehicles") == {"van": "larger"}
     assert len(before["scenario"]["traffic"].pop("vehicles")) > 5
     assert before["scenario"]["traffic"]["type"] == "urban"
 
@@ -79,13 +79,13 @@ def test_content_of_recordings_is_names_times_poses(tmp_path, change):
     for place in ("rigs/a", "rigs/b", "reference"):
         (folder / place).mkdir(parents=True)
         np.save(folder / place / "f1.npy", np.zeros((4, 3), dtype=np.float32))
-    before = RigSubset(RecordedFrames(folder), {"A": "a"}).content
+    before = RigSubset(RecordedFrames(folder), {"A": "a"}).collect_content()
     shutil.move(folder, tmp_path / "elsewhere")
     folder = tmp_path / "elsewhere"
     (folder / "out").mkdir()
     (folder / "out" / "checkpoint.npz").touch()  # results are no part of it
-    assert RigSubset(RecordedFrames(folder), {"A": "a"}).content == before
-    assert RigSubset(RecordedFrames(folder), {"A": "b"}).content != before
+    assert RigSubset(RecordedFrames(folder), {"A": "a"}).collect_content() == before
+    assert RigSubset(RecordedFrames(folder), {"A": "b"}).collect_content() != before
     cloud = folder / "rigs" / "a" / "f1.npy"
     if change == "size":
         stamp = cloud.stat()
@@ -99,4 +99,4 @@ def test_content_of_recordings_is_names_times_poses(tmp_path, change):
     else:
         rows = "[[1, 0, 0, 1], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]"
         (folder / "frames.yaml").write_text(f"reference: {{vehicle_T_sensor: {rows}}}\n")
-    assert RigSubset(RecordedFrames(folder), {"A": "a"}).content != before
+    assert RigSubset(RecordedFrames(folder), {"A": "a"}).collect_content() != before

@@ -10,7 +10,7 @@ from torchcover import Scenario
 from torchcover.data import (
     FORMATS,
     Frame,
-    FrameSource,
+    FrameDataset,
     RecordedFrames,
     RecordingSettings,
     RigSubset,
@@ -56,13 +56,15 @@ def by_area(_):
 @pytest.mark.parametrize("make", [simulated, by_area, recorded, recorded_rigs, chosen])
 def test_sources_are_map_style_datasets_of_rigs(tmp_path, make):
     source = make(tmp_path)
-    assert isinstance(source, FrameSource)
+    metadata = source.metadata
+    assert isinstance(source, FrameDataset)
     assert len(source) == 2
     for index in range(2):
         frame = source[index]
         assert (frame.index, frame.block_index) == (index, source.get_block_index(index))
-        assert list(frame.clouds) == list(source.rigs)
-        assert (frame.reference_weights is not None) == source.has_area_weights
+        assert list(frame.clouds) == list(metadata.rigs)
+        assert (frame.reference_weights is not None) == metadata.has_area_weights
+        assert (frame.boxes is not None) == metadata.has_boxes
         heights_m = frame.reference_heights_m
         assert (heights_m is not None and bool(heights_m.isfinite().any())) == source.has_heights()
         assert all(cloud.dtype == torch.float32 for cloud in (*frame.clouds.values(), frame.reference))
@@ -73,12 +75,13 @@ def test_sources_are_map_style_datasets_of_rigs(tmp_path, make):
     assert [source[number].index for number in (-1, torch.tensor(1), np.int64(1))] == [1, 1, 1]
     assert [frame.index for frame in source[:1]] == [0]
     assert len(source[1:5]) == 1
-    assert set(source.sensors) <= set(source.rigs)
-    assert set(source.description) >= {"scenario", "vehicle", "frames", "seed"}
-    simulated = source.description["scenario"] is not None
-    assert {"sensor", "notes"} | ({"frame_interval_s"} if simulated else set()) == set(source.reference_record)
-    if source.ego_outline_m is not None:
-        assert source.ego_outline_m.shape[1] == 2
+    assert set(metadata.sensors) <= set(metadata.rigs)
+    assert set(metadata.sensor_names) == set(metadata.rigs)
+    assert set(metadata.description) >= {"scenario", "vehicle", "frames", "seed"}
+    simulated = metadata.description["scenario"] is not None
+    assert {"sensor", "notes"} | ({"frame_interval_s"} if simulated else set()) == set(source.describe_reference())
+    if metadata.ego_outline_m is not None:
+        assert metadata.ego_outline_m.shape[1] == 2
     torch.testing.assert_close(pickle.loads(pickle.dumps(source))[1].reference, source[1].reference)
 
 
@@ -86,7 +89,7 @@ def test_sources_are_map_style_datasets_of_rigs(tmp_path, make):
 def test_ego_outline_needs_no_scene(monkeypatch, scenario):
     expected = Scenario.load(scenario).build_scene().ego.mesh.vertices_m[:, :2]
     monkeypatch.setattr(Scenario, "build_scene", lambda *_: pytest.fail("a world was built"))
-    outline_m = SimulatedFrames(scenario, "front_roof_32", num_frames=1).ego_outline_m
+    outline_m = SimulatedFrames(scenario, "front_roof_32", num_frames=1).metadata.ego_outline_m
     np.testing.assert_allclose(outline_m.max(axis=0), expected.max(axis=0))
     np.testing.assert_allclose(outline_m.min(axis=0), expected.min(axis=0))
 
@@ -126,8 +129,8 @@ def test_rigs_are_selected_in_any_order_and_name():
     reference_sensor = PaperReference(16, 16)
     both = SimulatedFrames("parking", rigs=rigs, num_frames=1, boxes=True, reference_sensor=reference_sensor)
     turned = RigSubset(both, {"second": "b", "a": "a"})
-    assert list(turned.rigs) == list(turned.sensors) == list(turned[0].clouds) == ["second", "a"]
-    assert turned.sensors["second"] == both.sensors["b"]
+    assert list(turned.metadata.rigs) == list(turned.metadata.sensors) == list(turned[0].clouds) == ["second", "a"]
+    assert turned.metadata.sensors["second"] == both.metadata.sensors["b"]
     assert torch.equal(turned[0].get_cloud("second"), both[0].get_cloud("b"))
     assert torch.equal(turned[0].reference, both[0].reference)
     assert torch.equal(turned[0].boxes.points_in_box["second"], both[0].boxes.points_in_box["b"])

@@ -127,10 +127,10 @@ def test_evaluated_sensors_are_excluded_at_the_frame():
     alone = RecordedFrames(drive, rigs={"left": ("left",)}, reference=AccumulatedReference(0.0, voxel_m=0.05))
     both = len(transform_wall(drive, 1)) + len(transform_car(drive, 1))
     assert len(alone[1].reference) == both  # of the right one
-    assert alone.reference_record["evaluated_sensors"] == []
+    assert alone.describe_reference()["evaluated_sensors"] == []
     later = RecordedFrames(drive, rigs={"left": ("left",)}, reference=AccumulatedReference(1.0))
-    assert later.reference_record["evaluated_sensors"] == ["left"]
-    assert "also built the reference" in later.reference_record["notes"][-1]
+    assert later.describe_reference()["evaluated_sensors"] == ["left"]
+    assert "also built the reference" in later.describe_reference()["notes"][-1]
     with pytest.raises(ValueError, match=r"window 0 s\) needs a sensor that is not evaluated; all are \(left, right\)"):
         RecordedFrames(drive, reference=AccumulatedReference(0.0))
 

@@ -62,7 +62,7 @@ def recorded(folder, *, reference=True, ids=("roof",)):
 def test_clouds_and_reference_match_the_scene(tmp_path):
     frames = RecordedFrames(recorded(tmp_path))
     assert isinstance(frames.recording, Carla)
-    assert (frames.frame_names, frames.rigs) == (("8", "10"), ("carla",))
+    assert (frames.frame_names, frames.metadata.rigs) == (("8", "10"), ("carla",))
     for frame in frames:
         np.testing.assert_allclose(frame.sensor, WORLD, atol=1e-5)
         assert distances_m(frame.reference, WORLD).max() < 1e-5

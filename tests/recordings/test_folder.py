@@ -59,7 +59,7 @@ def test_weights_follow_their_reference_points(tmp_path):
         "{reference: {area_weights: true}, vehicle: {lower_m: [-1, -1, 0], upper_m: [1, 1, 1]}}"
     )
     frames = RecordedFrames(tmp_path)
-    assert frames.has_area_weights
+    assert frames.metadata.has_area_weights
     assert frames[1].reference[:, 0].tolist() == [9.0, 7.0]
     assert frames[1].reference_weights.tolist() == [2.0, 5.0]
     assert frames[1].reference_weights.dtype == torch.float32
@@ -162,7 +162,7 @@ def test_bad_boxes_are_a_bad_frame(tmp_path, row, message):
 
 def test_sensors_are_chosen_by_folder_name(tmp_path):
     clouds(tmp_path, sensors__roof=CLOUD, sensors__left=CLOUD + 10.0, reference=CLOUD)
-    assert RecordedFrames(tmp_path).rigs == ("recording",)
+    assert RecordedFrames(tmp_path).metadata.rigs == ("recording",)
     assert len(RecordedFrames(tmp_path)[0].sensor) == 4
     assert RecordedFrames(tmp_path, rigs={"one": ["left"]})[0].sensor.tolist() == (CLOUD + 10.0).tolist()
     (tmp_path / "sensors" / "left").rename(tmp_path / "sensors" / "reference")

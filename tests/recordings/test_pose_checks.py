@@ -171,8 +171,8 @@ def test_wrong_units_are_reported_and_corrected(unit):
     assert f"(--set recording.units={unit})" in message
     corrected = RecordedFrames(correct_recording(frames.recording, RecordingSettings(units=unit)))
     assert corrected.check() == []
-    assert f"Corrections of the recording: --set recording.units={unit}." in corrected.reference_record["notes"]
-    assert corrected.content != frames.content
+    assert f"Corrections of the recording: --set recording.units={unit}." in corrected.describe_reference()["notes"]
+    assert corrected.collect_content() != frames.collect_content()
 
 
 def test_clouds_in_feet_are_converted():

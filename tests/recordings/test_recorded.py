@@ -248,7 +248,7 @@ def test_callers_skip_bad_frames_with_workers(tmp_path, workers):
 def test_rigs_share_a_reference_with_own_poses(tmp_path):
     nowhere = np.array([[np.nan, 0, 0], [1.0, 2.0, 3.0]])
     frames = RecordedFrames(record_rigs(tmp_path, rig10=CLOUD, rig2=nowhere))
-    assert frames.rigs == ("rig2", "rig10")
+    assert frames.metadata.rigs == ("rig2", "rig10")
     assert frames.frame_names == ("f2", "f10")
     assert frames[0].clouds["rig10"].tolist() == CLOUD.tolist()
     assert {name: count for name, count in frames[1].counts.items() if count} == {"sensor_nonfinite": 1}

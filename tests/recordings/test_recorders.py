@@ -49,7 +49,7 @@ def test_plain_folder_preserves_written_frames(both, tmp_path):
     write_recording(both, tmp_path)
     again = RecordedFrames(tmp_path)
     assert again.recording.sensors == ("a rear", "z front")
-    assert again.has_area_weights
+    assert again.metadata.has_area_weights
     assert len(again) == 3
     for written, read in zip(both, again, strict=True):
         assert len(read.sensor) == len(written.sensor) > 100
@@ -106,7 +106,7 @@ def test_kitti_layout_is_read_as_kitti(tmp_path):
     frames = simulated(FRONT, steps=1)
     write_recording(frames, tmp_path / "training", "kitti")
     again = RecordedFrames(tmp_path)
-    assert (again.rigs, again.frame_names) == (("kitti",), ("000000",))
+    assert (again.metadata.rigs, again.frame_names) == (("kitti",), ("000000",))
     written, read = frames[0], again[0]
     # The reader excludes points inside KITTI's vehicle.
     points = written.get_measured_points().numpy().astype(np.float64)
@@ -273,9 +273,9 @@ def test_recordings_are_checked_against_their_manifest(tmp_path):
 
 def test_kill_at_any_file_operation_costs_one_frame(tmp_path, monkeypatch):
     frames = simulated(FRONT, scenario="courtyard", steps=2, frame_interval_s=0.1, boxes=False)
-    made, content = [writing.build_frame_record(frames, index) for index in range(2)], frames.content
+    made, content = [writing.build_frame_record(frames, index) for index in range(2)], frames.collect_content()
     monkeypatch.setattr(writing, "build_frame_record", lambda _, index: made[index])
-    monkeypatch.setattr(SimulatedFrames, "content", content)
+    monkeypatch.setattr(SimulatedFrames, "collect_content", lambda _: content)
     whole, copies = tmp_path / "whole", tmp_path / "copies"
     count, code = run_in_fork(lambda: write_recording(frames, whole), copied=(whole, copies))
     assert (count > 40, code) == (True, 0)

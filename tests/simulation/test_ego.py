@@ -93,9 +93,9 @@ def test_unknown_vehicles_are_reported_with_their_rig():
 def test_frames_depend_on_the_vehicle_and_name_it():
     scenario = create_scenario()
     frames = [SimulatedFrames(scenario, rig(), num_frames=1, reference_sensor=SMALL, vehicle=v) for v in (None, "van")]
-    assert [item.description["vehicle"] for item in frames] == ["suv", "van"]
-    assert frames[0].content["scenario"] != frames[1].content["scenario"]
-    np.testing.assert_allclose(np.ptp(frames[1].ego_outline_m, axis=0), [5.93, 2.02])
+    assert [item.metadata.description["vehicle"] for item in frames] == ["suv", "van"]
+    assert frames[0].collect_content()["scenario"] != frames[1].collect_content()["scenario"]
+    np.testing.assert_allclose(np.ptp(frames[1].metadata.ego_outline_m, axis=0), [5.93, 2.02])
     # The vehicle that a rig names does not matter if another one is chosen, not even for checkpoints.
     named = SimulatedFrames(scenario, rig("sedan"), num_frames=1, reference_sensor=SMALL, vehicle="van")
-    assert named.content == frames[1].content
+    assert named.collect_content() == frames[1].collect_content()

@@ -240,7 +240,7 @@ def test_rig_bodies_occlude_like_vehicle_parts(tmp_path):
     np.testing.assert_array_equal(frames[0].clouds["loaded"], vehicle_frame.sensor)
     assert len(frames[0].clouds["plain"]) - len(vehicle_frame.sensor) > 500
     assert frames[0].counts["sensor_self_hits"] > 2 * 3380  # the warning of the vehicle, twice
-    assert [note.split(":")[0] for note in frames.reference_record["notes"]] == ["plain", "loaded"]
+    assert [note.split(":")[0] for note in frames.describe_reference()["notes"]] == ["plain", "loaded"]
 
 
 def test_floating_actors_are_lowered_with_a_warning(tmp_path):

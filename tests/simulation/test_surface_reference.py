@@ -256,7 +256,7 @@ def test_surface_hidden_from_roadside_rigs_is_undetected():
     behind = (x_m > 11) & (x_m < 25) & (y_m.abs() < 20)
     assert behind.sum() > 100
     assert nearest(frames[0].reference[behind], frames[0].sensor).distance.min() > 0.4
-    assert frames.reference_record["notes"][-1].startswith("Reference positions: anywhere in the regions")
+    assert frames.describe_reference()["notes"][-1].startswith("Reference positions: anywhere in the regions")
     with pytest.raises(ValueError, match="close to the mast of this roadside rig"):
         SimulatedFrames(road, rig, num_frames=1, reference_sensor=PaperReference())
     on_car = SimulatedFrames("courtyard", "front_roof_32", num_frames=1).reference_sensor

@@ -8,10 +8,10 @@ from torchmetrics.wrappers import MetricTracker
 
 from torchcover import BevGrid, Coverage, CoverageMetric, Region, compare, evaluate
 from torchcover.coverage import CoverageNumberMetric
-from torchcover.data import Frame, RecordedFrames, RigSubset, SimulatedFrames
+from torchcover.data import Frame, FrameDataset, FrameMetadata, RecordedFrames, SimulatedFrames
 
 
-def measured(frames: SimulatedFrames | RecordedFrames | RigSubset) -> Coverage:
+def measured(frames: FrameDataset) -> Coverage:
     """A loop over any source of frames."""
     metric = CoverageMetric(BevGrid(x_m=(0.0, 20.0), y_m=(-5.0, 5.0)), max_radius_m=25.0)
     for frame in frames:
@@ -30,6 +30,18 @@ def compared(rigs: list[Path], frames: SimulatedFrames) -> list[float]:
     evaluate("front_roof_128", stepz=64)  # type: ignore[call-arg]  # an argument that there is not
     evaluate("front_roof_128", num_frames="64")  # type: ignore[arg-type]
     return [float(coverage.radius.nanmean()) for coverage in compare([one, several, "saved.npz"]).coverages.values()]
+
+
+class ConstantFrames(FrameDataset):
+    """A source of frames that a user writes."""
+
+    metadata = FrameMetadata(rigs=("roof",), description={"frames": "constant"})
+
+    def __len__(self) -> int:
+        return 2
+
+    def make_frame(self, index: int) -> Frame:
+        return Frame({"roof": torch.zeros(1, 3)}, torch.ones(1, 3), index, f"frame {index}")
 
 
 def names(frames: RecordedFrames) -> list[str]:

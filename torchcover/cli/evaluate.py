@@ -17,8 +17,7 @@ if TYPE_CHECKING:
 
     from torchcover.evaluation import Checkpoint, Ranks, Result
     from torchcover.evaluation.rerun_log import RerunLog
-    from torchcover.frames import FrameSource
-    from torchcover.recordings import RecordingSettings
+    from torchcover.recordings import RecordedFrames, RecordingSettings
 
 
 def _run_evaluation(
@@ -52,7 +51,7 @@ def _run_evaluation(
     loaded = load_config(config, assignments or (), options.find_changed_settings(option_values))
     settings = {**loaded.config.get_changed_settings(), "config_record": loaded.record}
     recording = open_frames(frames, settings, loaded.config.recording, sensors)
-    rig_names = list(rigs or (() if recording is None else recording.rigs))
+    rig_names = list(rigs or (() if recording is None else recording.sensors_by_rig))
     weather = settings.get("weather") or ()
     # `compare` of one rig in one weather compares the weather with clear air.
     if len(rig_names) == 1 and min_rigs > 1 and len(weather) == 1:
@@ -148,7 +147,7 @@ def compare(
 
 def open_frames(
     frames: Path | None, settings: dict[str, Any], recording_settings: "RecordingSettings", sensors: list[str] | None
-) -> "FrameSource | None":
+) -> "RecordedFrames | None":
     """Open the recording of `--frames`.
 
     Args:

@@ -14,7 +14,7 @@ from torchcover.contrib.s_mig import SMig
 from torchcover.coverage import BevGrid, Coverage, Region, forward_regions
 from torchcover.evaluation.settings import Settings
 from torchcover.evaluation.task import Task
-from torchcover.frames import FrameSource
+from torchcover.frames import FrameDataset, FrameMetadata
 from torchcover.simulation import Sensor
 from torchcover.simulation.shapes import Mesh
 
@@ -189,7 +189,7 @@ class RunMetrics(NamedTuple):
         return RunMetrics(by_rig, self.omissions)
 
 
-def build_metrics(task: Task[FrameSource], settings: Settings) -> RunMetrics:
+def build_metrics(task: Task[FrameDataset], settings: Settings) -> RunMetrics:
     """Build the requested metrics for all rigs; those whose needs are not met are omitted.
 
     Args:
@@ -204,20 +204,20 @@ def build_metrics(task: Task[FrameSource], settings: Settings) -> RunMetrics:
     """
     query_cache = FrameQueryCache()
     threshold_m = settings.thresholds_m[0] if settings.thresholds_m else 0.4
-    missing, ego_mesh = _find_missing_needs(task), task.frames.get_ego_mesh()
+    missing, ego_mesh = _find_missing_needs(task.metadata), task.metadata.ego_mesh
     unmet = {name: PUBLISHED[name].needs & missing for name in settings.metrics}
     omissions = {name: REASONS[min(needs)] for name, needs in unmet.items() if needs}
     if len(omissions) == len(settings.metrics):
         raise ValueError("; ".join(f"metric {name}: {reason}" for name, reason in omissions.items()))
     by_rig: dict[str, dict[str, FrameMetric]] = {name: {} for name in settings.metrics if name not in omissions}
-    for rig in task.rigs:
+    for rig in task.metadata.rigs:
         setup = MetricSetup(
             rig_name=rig,
-            sensors=tuple(task.sensors.get(rig, ())),
+            sensors=tuple(task.metadata.sensors.get(rig, ())),
             ego_mesh=ego_mesh,
             grid=task.query_plan.grid,
             regions=task.query_plan.regions,
-            has_area_weights=task.frames.has_area_weights,
+            has_area_weights=task.metadata.has_area_weights,
             threshold_m=threshold_m,
             query_cache=query_cache,
         )
@@ -226,12 +226,12 @@ def build_metrics(task: Task[FrameSource], settings: Settings) -> RunMetrics:
     return RunMetrics(by_rig, omissions)
 
 
-def _find_missing_needs(task: Task[FrameSource]) -> frozenset[Need]:
-    """Find the data that a run does not provide for all of its rigs."""
+def _find_missing_needs(metadata: FrameMetadata) -> frozenset[Need]:
+    """Find the data that a source of frames does not provide for all of its rigs."""
     available: dict[Need, bool] = {
-        "sensors": all(task.sensors.get(rig) for rig in task.rigs),
-        "boxes": task.frames.has_boxes(),
-        "sensor_point_counts": all(rig in task.frames.sensor_names for rig in task.rigs),
+        "sensors": all(metadata.sensors.get(rig) for rig in metadata.rigs),
+        "boxes": metadata.has_boxes,
+        "sensor_point_counts": metadata.sensor_names.keys() >= set(metadata.rigs),
     }
     return frozenset(need for need, is_available in available.items() if not is_available)
 

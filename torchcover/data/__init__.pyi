@@ -3,7 +3,7 @@ from torchcover.frames import BadFrameError as BadFrameError
 from torchcover.frames import Frame as Frame
 from torchcover.frames import FrameBatch as FrameBatch
 from torchcover.frames import FrameDataset as FrameDataset
-from torchcover.frames import FrameSource as FrameSource
+from torchcover.frames import FrameMetadata as FrameMetadata
 from torchcover.frames import Measurement as Measurement
 from torchcover.frames import RigSubset as RigSubset
 from torchcover.frames import VisibleBoxes as VisibleBoxes

@@ -27,7 +27,7 @@ from torchcover.evaluation.settings import Settings, load_contrib
 from torchcover.evaluation.target_error import TargetErrorRule
 from torchcover.evaluation.task import CALLER, Task, build_run_identity, find_ray_device, get_device
 from torchcover.files import lock_folder
-from torchcover.frames import BadFrameError, FrameSource
+from torchcover.frames import BadFrameError, FrameDataset
 from torchcover.simulation import QueryPlan, SimulatedFrames
 from torchcover.simulation.memory import check_memory_fits
 from torchcover.targets import NearFieldObserver, Target
@@ -72,7 +72,7 @@ class _ObservedRun:
 
 
 def measure_coverage(
-    task: Task[FrameSource],
+    task: Task[FrameDataset],
     settings: Settings,
     stopping_rule: StoppingRule | None = None,
     params: MeasurementParams = MeasurementParams(),
@@ -91,8 +91,8 @@ def measure_coverage(
     Raises:
         ValueError: As in `evaluate`.
     """
-    ranks = settings.ranks
-    sensors = list(chain.from_iterable(task.sensors.values()))
+    ranks, metadata = settings.ranks, task.metadata
+    sensors = list(chain.from_iterable(metadata.sensors.values()))
     check_drawable(sensors)  # before the run, which may take hours
     settings = replace(settings, num_workers=_choose_num_workers(task, settings, params))
     metrics = load_contrib().build_metrics(task, settings) if settings.metrics else None
@@ -118,14 +118,14 @@ def measure_coverage(
         regions=task.query_plan.regions,
         run=observed.run,
         rigs=task.rig_sources,
-        source=task.description,
-        reference_record=task.frames.reference_record,
+        source=metadata.description,
+        reference_record=task.frames.describe_reference(),
         device=settings.device,
         target_sums=target_sums,
         target_error=settings.target_error,
         target_regions=task.query_plan.target_regions,
-        sensors=task.sensors,
-        ego_outline_m=task.frames.ego_outline_m,
+        sensors=metadata.sensors,
+        ego_outline_m=metadata.ego_outline_m,
         observer_results={name: observed.further_observers[name].compute() for name in settings.observers},
         metrics=metric_report,
         omissions=list_omissions(
@@ -143,7 +143,7 @@ def measure_coverage(
     return result
 
 
-def find_block_ends(frames: FrameSource, max_blocks: int = 80, max_frames: int = 10_000) -> list[int]:
+def find_block_ends(frames: FrameDataset, max_blocks: int = 80, max_frames: int = 10_000) -> list[int]:
     """Find the frames of a source after which the blocks of time are complete.
 
     Args:
@@ -165,7 +165,7 @@ def find_block_ends(frames: FrameSource, max_blocks: int = 80, max_frames: int =
     return ends if len(ends) == max_blocks else [*ends, index]
 
 
-def _choose_num_workers(task: Task[FrameSource], settings: Settings, params: MeasurementParams) -> int:
+def _choose_num_workers(task: Task[FrameDataset], settings: Settings, params: MeasurementParams) -> int:
     """Choose the number of worker processes; recordings may share open files, and ranks share the cores."""
     if settings.num_workers is not None:
         return settings.num_workers
@@ -179,7 +179,7 @@ def _choose_num_workers(task: Task[FrameSource], settings: Settings, params: Mea
 
 
 def _build_target_observers(
-    task: Task[FrameSource], settings: Settings, params: MeasurementParams
+    task: Task[FrameDataset], settings: Settings, params: MeasurementParams
 ) -> dict[str, NearFieldObserver]:
     """Build the observer of test targets in the near field; a recording has no scene in which to place them."""
     has_own_regions = bool(settings.regions and settings.regions.regions)
@@ -196,7 +196,7 @@ def _build_target_observers(
 
 
 def _observe_frames(
-    task: Task[FrameSource], settings: Settings, further_observers: Observers, stopping_rule: StoppingRule | None
+    task: Task[FrameDataset], settings: Settings, further_observers: Observers, stopping_rule: StoppingRule | None
 ) -> _ObservedRun:
     """Pass all frames to the coverage metrics and the other observers, from and to a checkpoint, over all ranks."""
     ranks, checkpoint = settings.ranks, settings.checkpoint
@@ -246,14 +246,15 @@ def _observe_frames(
     )
 
 
-def _build_coverage_observers(task: Task[FrameSource], settings: Settings) -> dict[str, CoverageObserver]:
+def _build_coverage_observers(task: Task[FrameDataset], settings: Settings) -> dict[str, CoverageObserver]:
     """Build the coverage observer of each rig."""
-    sensor_names = task.get_sensor_names() if settings.redundancy else {}
+    metadata = task.metadata
+    sensor_names = metadata.sensor_names if settings.redundancy else dict.fromkeys(metadata.rigs, ())
+    if unknown := [rig for rig in metadata.rigs if rig not in sensor_names]:
+        raise ValueError(f"redundancy: unknown which points of {', '.join(unknown)} are of which sensor")
     observers = {}
-    for name in task.rigs:
-        metric = build_metric(
-            settings, task.query_plan, sensor_names.get(name, ()), has_area_weights=task.frames.has_area_weights
-        )
+    for name in metadata.rigs:
+        metric = build_metric(settings, task.query_plan, sensor_names[name], has_area_weights=metadata.has_area_weights)
         observers[name] = CoverageObserver(metric, name)
     return observers
 

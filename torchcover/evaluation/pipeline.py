@@ -24,9 +24,9 @@ from torchcover.evaluation.observers import AnyObserver, CoverageObserver
 from torchcover.evaluation.progress import END_SIGNALS, Progress, defer_signals
 from torchcover.evaluation.ranks import Ranks
 from torchcover.files import end_with_parent
-from torchcover.frames import BadFrameError, Frame, FrameSource, build_scene_lookup
+from torchcover.frames import BadFrameError, Frame, build_scene_lookup
 
-Frames = FrameSource | Dataset[Frame] | Sequence[Frame]
+Frames = Dataset[Frame] | Sequence[Frame]
 
 
 @dataclass

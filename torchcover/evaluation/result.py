@@ -84,7 +84,7 @@ class Result:
         run: Outcome of the run; None for saved results, where it is unknown.
         rigs: Name of each rig -> name or file that the user gave; None for a rig of a recording.
         source: Source of the frames, with the keys `scenario`, `vehicle`, `frames`, `seed` and others.
-        reference_record: Source of the reference points, see `FrameSource.reference_record`; None if unknown.
+        reference_record: Source of the reference points, see `FrameDataset.describe_reference`; None if unknown.
         device: Device of the measurement; None if unknown.
         target_sums: Name of each rig -> visibility of test targets in the near field; empty without them.
         target_error: Requested standard errors.

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from torchcover.evaluation.observers import AnyObserver
     from torchcover.evaluation.ranks import Ranks
     from torchcover.evaluation.target_error import TargetError
-    from torchcover.frames import FrameSource
+    from torchcover.frames import FrameDataset
     from torchcover.simulation import RegionsOfInterest, Rig, Scenario, Weather
 
     AnyRig: TypeAlias = Rig | str | Path
@@ -230,7 +230,7 @@ class Settings:
     scenario: "AnyScenario | Sequence[AnyScenario] | Mapping[str, float] | None" = None
     _: KW_ONLY
     frames: Annotated[
-        "FrameSource | str | Path | None", "Recording, or another source of frames, instead of a scenario."
+        "FrameDataset | str | Path | None", "Recording, or another source of frames, instead of a scenario."
     ] = None
     num_frames: int | None = None
     seed: int = DEFAULTS.seed

@@ -5,7 +5,7 @@ import json
 import math
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Generic, Literal, NamedTuple, TypeVar
@@ -20,14 +20,13 @@ from torchcover.evaluation.observers import AnyObserver
 from torchcover.evaluation.progress import show_wait
 from torchcover.evaluation.rig_names import AnyRig, format_rig_source, is_rig_document, load_rig, make_rig_names
 from torchcover.evaluation.settings import DEFAULT_NUM_FRAMES, MAX_NUM_FRAMES, Settings
-from torchcover.frames import FrameSource, RigSubset
+from torchcover.frames import FrameDataset, FrameMetadata, RigSubset
 from torchcover.recordings import RecordedFrames, open_recording
 from torchcover.simulation import (
     QueryPlan,
     RegionsOfInterest,
     Rig,
     Scenario,
-    Sensor,
     SimulatedFrames,
     Weather,
     create_reference_sensor,
@@ -39,7 +38,7 @@ from torchcover.simulation.scenario import ROOM_M
 from torchcover.simulation.simulated_frames import DEFAULT_REFERENCE
 
 AnyScenario = Scenario | str | Path
-SourceT = TypeVar("SourceT", bound=FrameSource, covariant=True)
+SourceT = TypeVar("SourceT", bound=FrameDataset, covariant=True)
 
 # Stack level of warnings that point to the call of `evaluate`.
 CALLER = 4
@@ -73,37 +72,19 @@ class Task(NamedTuple, Generic[SourceT]):
     Args:
         frames: Source of the frames.
         rig_sources: Name of each rig in tables and files -> name or path that the user gave; None if not named.
-        sensors: Name of each rig -> its sensors, where they are known.
-        description: Source of the frames for `summary.json`.
+        metadata: Metadata of the frames, with the sensors and the origin that the user gave.
         query_plan: Grid, height bands and regions.
         num_frames: Maximum number of frames; None for all.
     """
 
     frames: SourceT
     rig_sources: Mapping[str, str | None]
-    sensors: Mapping[str, Sequence[Sensor]]
-    description: Mapping[str, object]
+    metadata: FrameMetadata
     query_plan: QueryPlan
     num_frames: int | None = None
 
-    @property
-    def rigs(self) -> tuple[str, ...]:
-        """Names of the rigs in tables and files."""
-        return tuple(self.rig_sources)
 
-    def get_sensor_names(self) -> Mapping[str, Sequence[str]]:
-        """Return the names of the sensors of each rig.
-
-        Raises:
-            ValueError: The frames do not tell which points belong to which sensor of a rig.
-        """
-        sensor_names = self.frames.sensor_names
-        if unknown := [rig for rig in self.rigs if rig not in sensor_names]:
-            raise ValueError(f"redundancy: unknown which points of {', '.join(unknown)} are of which sensor")
-        return sensor_names
-
-
-def build_task(settings: Settings) -> Task[FrameSource]:
+def build_task(settings: Settings) -> Task[FrameDataset]:
     """Prepare the simulation of a scenario, or a recording.
 
     Args:
@@ -112,10 +93,10 @@ def build_task(settings: Settings) -> Task[FrameSource]:
     Raises:
         ValueError: No rig, both a scenario and a recording, settings of the other kind, an unknown rig of a recording.
         FileNotFoundError: Unknown name or file.
-        TypeError: The frames are not a `FrameSource`.
+        TypeError: The frames are not a `FrameDataset`.
 
     Warns:
-        UserWarning: Problems that `FrameSource.check` finds.
+        UserWarning: Problems that `RecordedFrames.check` finds.
     """
     for rig in settings.rigs:
         if not isinstance(rig, Rig) and Path(rig).suffix == ".npz":
@@ -129,21 +110,20 @@ def build_task(settings: Settings) -> Task[FrameSource]:
         raise ValueError("scenario and frames exclude each other: simulate a scenario or read a recording")
     settings.check_recording()
     source = _open_frames(settings.frames, settings)
-    members = [name for name in vars(FrameSource) if not name.startswith("_")]
-    if missing := [name for name in members if not hasattr(source, name)]:
+    if not isinstance(source, FrameDataset):
         raise TypeError(
-            f"frames: a recording's path or a torchcover.data.FrameSource is needed; got {type(source).__name__}, "
-            f"which has no {', '.join(missing)}; for a list of frames, or a dataset, feed observers: "
-            "torchcover.evaluation.observe(frames, observers)"
+            f"frames: a recording's path or a torchcover.data.FrameDataset is needed; got {type(source).__name__}; for "
+            "a list of frames, or a dataset, feed observers: torchcover.evaluation.observe(frames, observers)"
         )
-    if settings.skip_bad_frames and isinstance(source, RecordedFrames):
-        source.skip_unreadable_sweeps()
-    for problem in source.check(settings.num_frames):
-        warnings.warn(problem, stacklevel=CALLER)
+    if isinstance(source, RecordedFrames):
+        if settings.skip_bad_frames:
+            source.skip_unreadable_sweeps()
+        for problem in source.check(settings.num_frames):
+            warnings.warn(problem, stacklevel=CALLER)
     return _build_recording_task(source, settings)
 
 
-def _open_frames(frames: FrameSource | str | Path, settings: Settings) -> FrameSource:
+def _open_frames(frames: FrameDataset | str | Path, settings: Settings) -> FrameDataset:
     """Open a recording, or return the frames of the user."""
     if not isinstance(frames, str | Path):
         return frames
@@ -204,10 +184,12 @@ def build_simulation_task(
     # A path identifies a scenario better than the name in its file.
     given_scenario = settings.single_scenario
     name = scenario.name if isinstance(given_scenario, Scenario) else str(given_scenario)
-    description: dict[str, object] = {**frames.description, "scenario": name}
+    metadata = frames.metadata
+    description: dict[str, object] = {**metadata.description, "scenario": name}
     if settings.config_record:
         description["config"] = settings.config_record
-    return Task(frames, rig_sources, frames.sensors, description, query_plan, _limit_frames(frames, settings))
+    metadata = replace(metadata, description=description)
+    return Task(frames, rig_sources, metadata, query_plan, _limit_frames(frames, settings))
 
 
 def _load_rigs(
@@ -278,27 +260,29 @@ def _limit_frames(frames: SimulatedFrames, settings: Settings) -> int | None:
     return max(DEFAULT_NUM_FRAMES, num_distinct_frames)
 
 
-def _build_recording_task(frames: FrameSource, settings: Settings) -> Task[FrameSource]:
+def _build_recording_task(frames: FrameDataset, settings: Settings) -> Task[FrameDataset]:
     """Build the task of a recording or of another source of frames."""
-    names = make_rig_names(settings.rigs or list(frames.rigs))
-    is_single = len(names) == len(frames.rigs) == 1  # the only rig of a recording may have any name
-    recorded_names = frames.rigs if is_single else names
+    metadata = frames.metadata
+    names = make_rig_names(settings.rigs or metadata.rigs)
+    is_single = len(names) == len(metadata.rigs) == 1  # the only rig of a recording may have any name
+    recorded_names = metadata.rigs if is_single else names
     subset = RigSubset(frames, dict(zip(names, recorded_names, strict=True)))
     given_rigs: dict[str, AnyRig] = dict(zip(names, settings.rigs, strict=True)) if settings.rigs else {}
     rig_sources: dict[str, str | None] = dict.fromkeys(names)
-    sensors = dict(subset.sensors)
+    sensors = dict(subset.metadata.sensors)
     for name, rig in given_rigs.items():
         rig_sources[name] = format_rig_source(rig)
         # A name of the recording need not be a rig; any other name must be.
-        if is_rig_document(rig) or name not in frames.rigs:
+        if is_rig_document(rig) or name not in metadata.rigs:
             sensors[name] = load_rig(rig).sensors
     band_frame = settings.band_frame or ("ground" if frames.has_heights() else "vehicle")
     regions = settings.regions or RegionsOfInterest()
-    query_plan = regions.build_query_plan(frames.ego_outline_m, settings.cell_m, band_frame)
-    description = dict(frames.description)
+    query_plan = regions.build_query_plan(metadata.ego_outline_m, settings.cell_m, band_frame)
+    description = dict(metadata.description)
     if settings.config_record:
         description["config"] = settings.config_record
-    return Task(subset, rig_sources, sensors, description, query_plan, settings.num_frames)
+    metadata = replace(subset.metadata, sensors=sensors, description=description)
+    return Task(subset, rig_sources, metadata, query_plan, settings.num_frames)
 
 
 def _find_limits(scenario: Scenario, rigs: Mapping[str, Rig]) -> Region | None:
@@ -345,7 +329,7 @@ def compute_frame_interval_s(
 
 
 def build_run_identity(
-    task: Task[FrameSource], settings: Settings, observers: Mapping[str, AnyObserver], num_ranks: int = 1
+    task: Task[FrameDataset], settings: Settings, observers: Mapping[str, AnyObserver], num_ranks: int = 1
 ) -> dict[str, str]:
     """Describe everything that the sums of a run depend on; checkpoints of another identity are refused.
 
@@ -364,8 +348,8 @@ def build_run_identity(
     grid = task.query_plan.grid
     identity = {
         "torchcover": __version__,
-        **task.frames.content,
-        "rigs": task.rigs,
+        **task.frames.collect_content(),
+        "rigs": task.metadata.rigs,
         "cell_m": grid.cell_m,
         "grid": [grid.x_m, grid.y_m],
         "heights": list(grid.heights.items()),

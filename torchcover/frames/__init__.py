@@ -1,4 +1,4 @@
-"""Frames, batches of frames, augmentation, and the interface of sources of frames."""
+"""Frames, batches of frames, augmentation, and the base class of sources of frames."""
 
 import lazy_loader
 

@@ -4,7 +4,7 @@ from .frame import Frame as Frame
 from .frame import Measurement as Measurement
 from .source import BadFrameError as BadFrameError
 from .source import FrameDataset as FrameDataset
-from .source import FrameSource as FrameSource
+from .source import FrameMetadata as FrameMetadata
 from .source import RigSubset as RigSubset
 from .source import build_scene_lookup as build_scene_lookup
 from .transforms import Augmentation as Augmentation

@@ -1,11 +1,11 @@
-"""Interface of sources of frames: simulations, recordings and other formats."""
+"""Base class of sources of frames: simulations, recordings and other formats."""
 
 import operator
 import re
 from abc import abstractmethod
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import replace
-from typing import TYPE_CHECKING, Protocol, SupportsIndex, TypeVar, overload, runtime_checkable
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING, SupportsIndex, TypeVar, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,106 +42,34 @@ class BadFrameError(ValueError):
         self.index = int(parts["index"]) if parts else -1
 
 
-@runtime_checkable
-class FrameSource(Protocol):
-    """Map-style torch dataset of frames with a description of its rigs and of its origin.
+@dataclass(frozen=True, eq=False)
+class FrameMetadata:
+    """Rigs and origin of the frames of a source, and the data that all of its frames have.
 
-    A format of recordings is such a class that is constructed from a path; see `FORMATS`.
+    Args:
+        rigs: Names of the rigs, the keys of `Frame.clouds`.
+        description: Origin of the frames, for `summary.json`: `scenario`, `vehicle`, `seed` or `frames`; other keys are
+            None.
+        has_area_weights: True if all frames have `Frame.reference_weights`; False if none has.
+        has_boxes: True if frames have `Frame.boxes`.
+        sensors: Name of each rig with known sensors -> its sensors, for plots.
+        sensor_names: Name of each rig for which `Frame.sensor_point_counts` is known -> names of its sensors.
+        ego_outline_m: (K, 2) corners x, y of the ego vehicle in the vehicle frame in meters; None if unknown.
+        ego_mesh: Mesh of the ego vehicle in the vehicle frame; None if unknown.
     """
 
-    @property
-    def rigs(self) -> Collection[str]:
-        """Names of the rigs, the keys of `Frame.clouds`."""
-
-    @property
-    def sensors(self) -> Mapping[str, "Sequence[Sensor]"]:
-        """Sensors of the rigs with known sensors, for plots; may be empty."""
-
-    @property
-    def sensor_names(self) -> Mapping[str, Sequence[str]]:
-        """Sensor names of the rigs for which `Frame.sensor_point_counts` is known."""
-
-    @property
-    def ego_outline_m(self) -> NDArray[np.float64] | None:
-        """(K, 2) corners x, y of the ego vehicle in the vehicle frame in meters; None if unknown."""
-
-    @property
-    def description(self) -> Mapping[str, object]:
-        """Origin of the frames, for `summary.json`: `scenario`, `vehicle`, `seed` or `frames`; other keys are None."""
-
-    @property
-    def has_area_weights(self) -> bool:
-        """True if all frames have `Frame.reference_weights`; False if none has."""
-
-    @property
-    def reference_record(self) -> Mapping[str, object] | None:
-        """Origin of the reference points, for `summary.json`: `sensor` and its settings; None if unknown.
-
-        It contains `notes`, sentences that the reader of the numbers needs, and for simulated frames
-        `frame_interval_s`.
-        """
-
-    @property
-    def content(self) -> Mapping[str, object]:
-        """Inputs that determine the frames, as JSON values; the keys appear in messages.
-
-        A checkpoint belongs to one content: it changes if, and only if, a frame may change. Large inputs may be hashed.
-        """
-
-    def get_scene_id(self, index: int, /) -> int:
-        """Return the number of the scene of a frame.
-
-        One process makes all frames of a scene, so that the scene is built once. Sources that build no scenes return
-        the index, so that any process may make any frame.
-
-        Args:
-            index: Index of the frame.
-
-        Returns:
-            Any number that is equal for frames of one scene.
-        """
-
-    def get_block_index(self, index: int, /) -> int:
-        """Return `Frame.block_index` of a frame without making the frame.
-
-        Args:
-            index: Index of the frame; a simulation accepts indices beyond its last frame.
-
-        Returns:
-            Block index.
-
-        Raises:
-            IndexError: The frame does not exist.
-        """
-
-    def has_boxes(self) -> bool:
-        """Return whether frames have `Frame.boxes`."""
-
-    def has_heights(self) -> bool:
-        """Return whether frames have `Frame.reference_heights_m`, the condition for height bands above ground."""
-
-    def get_ego_mesh(self) -> "Mesh | None":
-        """Return the mesh of the ego vehicle in the vehicle frame; None if unknown."""
-
-    def check(self, num_frames: int | None, /) -> Sequence[str]:
-        """Return warnings about the frames, one sentence each, before they are evaluated.
-
-        Args:
-            num_frames: Number of frames to check, from the first; None for all.
-
-        Returns:
-            Warnings; empty if no problem is found.
-        """
-
-    def __len__(self) -> int:
-        """Return the number of frames."""
-
-    def __getitem__(self, index: int, /) -> Frame:
-        """Return one frame, or raise `BadFrameError` if it cannot be used."""
+    rigs: Sequence[str]
+    description: Mapping[str, object]
+    has_area_weights: bool = False
+    has_boxes: bool = False
+    sensors: Mapping[str, "Sequence[Sensor]"] = field(default_factory=dict)
+    sensor_names: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    ego_outline_m: NDArray[np.float64] | None = None
+    ego_mesh: "Mesh | None" = None
 
 
 def build_scene_lookup(frames: object) -> Callable[[int], int]:
-    """Return the function `FrameSource.get_scene_id` for any map-style dataset or list of frames.
+    """Return the function `FrameDataset.get_scene_id` for any map-style dataset or list of frames.
 
     Args:
         frames: Dataset with `get_scene_id`, a torch `Subset` of one, or a sequence of frames.
@@ -170,40 +98,90 @@ def build_scene_lookup(frames: object) -> Callable[[int], int]:
         return get_subset_scene_id
     raise TypeError(
         f"frames: {type(frames).__name__} does not name the scene of a frame, so every process would build every "
-        "scene; define get_scene_id(index), see FrameSource, or use a single process"
+        "scene; define get_scene_id(index), see FrameDataset, or use a single process"
     )
 
 
 class FrameDataset(Dataset[Frame]):
-    """Base class of map-style torch datasets of frames that a `for` loop iterates in order.
+    """Base class of sources of frames: a map-style torch dataset that a `for` loop iterates in order.
 
-    A `FrameSource` that derives from this class overrides only the methods for which it has information.
+    A source defines `metadata`, `__len__` and `make_frame`, and the other methods only where it has information.
+
+    Example:
+        >>> import torch
+        >>> class ConstantFrames(FrameDataset):
+        ...     metadata = FrameMetadata(rigs=("roof",), description={"frames": "constant"})
+        ...
+        ...     def __len__(self):
+        ...         return 2
+        ...
+        ...     def make_frame(self, index):
+        ...         return Frame({"roof": torch.zeros(1, 3)}, torch.ones(1, 3), index, f"frame {index}")
+        >>> [frame.name for frame in ConstantFrames()]
+        ['frame 0', 'frame 1']
     """
 
     @property
-    def sensor_names(self) -> Mapping[str, Sequence[str]]:
-        """Empty: the sensor of each point is unknown."""
-        return {}
+    @abstractmethod
+    def metadata(self) -> FrameMetadata:
+        """Rigs and origin of the frames; a class attribute if they are always the same."""
+        raise NotImplementedError
+
+    def get_scene_id(self, index: int) -> int:
+        """Return the number of the scene of a frame.
+
+        One process makes all frames of a scene, so that the scene is built once. Sources that build no scenes return
+        the index, the default, so that any process may make any frame.
+
+        Args:
+            index: Index of the frame.
+
+        Returns:
+            Any number that is equal for frames of one scene.
+        """
+        return index
 
     def get_block_index(self, index: int) -> int:
-        """Return the index: each frame is independent; see `FrameSource.get_block_index`."""
+        """Return `Frame.block_index` of a frame without making the frame; the default is that of independent frames.
+
+        Args:
+            index: Index of the frame; a simulation accepts indices beyond its last frame.
+
+        Returns:
+            Block index.
+
+        Raises:
+            IndexError: The frame does not exist.
+        """
         return range(len(self))[index]
 
-    def has_boxes(self) -> bool:
-        """Return False: frames have no boxes."""
-        return False
-
     def has_heights(self) -> bool:
-        """Return False: heights above ground are unknown."""
+        """Return whether frames have `Frame.reference_heights_m`, the condition for height bands above ground."""
         return False
 
-    def get_ego_mesh(self) -> "Mesh | None":
-        """Return None: the ego vehicle is unknown."""
+    def describe_reference(self) -> Mapping[str, object] | None:
+        """Describe the origin of the reference points, for `summary.json`.
+
+        Returns:
+            `sensor`, its settings and `notes`, sentences that the reader of the numbers needs; for simulated frames
+            also `frame_interval_s`. None if unknown, the default.
+        """
         return None
 
-    def check(self, num_frames: int | None) -> Sequence[str]:
-        """Return no warnings; see `FrameSource.check`."""
-        return ()
+    def collect_content(self) -> Mapping[str, object]:
+        """Collect the inputs that determine the frames; runs with a checkpoint or several ranks need them.
+
+        Returns:
+            JSON values that change if, and only if, a frame may change; large inputs may be hashed. The keys appear in
+            messages.
+
+        Raises:
+            NotImplementedError: The source does not define them.
+        """
+        raise NotImplementedError(
+            f"frames: {type(self).__name__} does not define collect_content(), by which checkpoints and ranks "
+            "recognize equal frames; define it, or run in one process without a checkpoint"
+        )
 
     @abstractmethod
     def __len__(self) -> int:
@@ -225,10 +203,18 @@ class FrameDataset(Dataset[Frame]):
         position = operator.index(index)
         if not -len(self) <= position < len(self):
             raise IndexError(f"frame {position} of {len(self)}")
-        return self._frame_at(position % len(self))
+        return self.make_frame(position % len(self))
 
-    def _frame_at(self, position: int) -> Frame:
-        """Make the frame at a position from 0 to `len(self) - 1`."""
+    @abstractmethod
+    def make_frame(self, index: int) -> Frame:
+        """Make one frame.
+
+        Args:
+            index: Index from 0 to `len(self) - 1`.
+
+        Raises:
+            BadFrameError: The frame cannot be used; other frames can.
+        """
         raise NotImplementedError
 
     def __iter__(self) -> Iterator[Frame]:
@@ -239,8 +225,6 @@ class FrameDataset(Dataset[Frame]):
 class RigSubset(FrameDataset):
     """Frames of another source with the clouds of selected rigs under new names.
 
-    Members without a description return the value of the source.
-
     Args:
         frames: Source of the frames.
         source_rigs: New name of each rig -> its name in the source, in the desired order.
@@ -249,82 +233,50 @@ class RigSubset(FrameDataset):
         ValueError: The source has no such rig.
     """
 
-    def __init__(self, frames: FrameSource, source_rigs: Mapping[str, str]) -> None:
-        unknown = [name for name in source_rigs.values() if name not in frames.rigs]
-        if unknown:
-            raise ValueError(f"no clouds of the rig {', '.join(unknown)}; the frames have {', '.join(frames.rigs)}")
+    def __init__(self, frames: FrameDataset, source_rigs: Mapping[str, str]) -> None:
+        metadata = frames.metadata
+        if unknown := [name for name in source_rigs.values() if name not in metadata.rigs]:
+            raise ValueError(f"no clouds of the rig {', '.join(unknown)}; the frames have {', '.join(metadata.rigs)}")
         self.frames = frames
         self.source_rigs = dict(source_rigs)
+        self._metadata = replace(
+            metadata,
+            rigs=tuple(source_rigs),
+            sensors=self._rename_rigs(metadata.sensors),
+            sensor_names=self._rename_rigs(metadata.sensor_names),
+        )
 
     @property
-    def rigs(self) -> tuple[str, ...]:
-        """New names of the rigs."""
-        return tuple(self.source_rigs)
-
-    @property
-    def sensors(self) -> Mapping[str, "Sequence[Sensor]"]:
-        """Known sensors of the selected rigs."""
-        return self._rename_rigs(self.frames.sensors)
-
-    @property
-    def sensor_names(self) -> Mapping[str, Sequence[str]]:
-        """Known sensor names of the selected rigs."""
-        return self._rename_rigs(self.frames.sensor_names)
-
-    @property
-    def ego_outline_m(self) -> NDArray[np.float64] | None:
-        """Outline from the source."""
-        return self.frames.ego_outline_m
+    def metadata(self) -> FrameMetadata:
+        """Metadata of the source with the selected rigs only."""
+        return self._metadata
 
     def get_scene_id(self, index: int) -> int:
-        """Return the scene number from the source; see `FrameSource.get_scene_id`."""
+        """Return the scene number from the source; see `FrameDataset.get_scene_id`."""
         return self.frames.get_scene_id(index)
 
     def get_block_index(self, index: int) -> int:
-        """Return the block index from the source; see `FrameSource.get_block_index`."""
+        """Return the block index from the source; see `FrameDataset.get_block_index`."""
         return self.frames.get_block_index(index)
-
-    def has_boxes(self) -> bool:
-        """Return whether frames of the source have boxes."""
-        return self.frames.has_boxes()
 
     def has_heights(self) -> bool:
         """Return whether frames of the source have heights above ground."""
         return self.frames.has_heights()
 
-    def get_ego_mesh(self) -> "Mesh | None":
-        """Return the ego vehicle of the source."""
-        return self.frames.get_ego_mesh()
+    def describe_reference(self) -> Mapping[str, object] | None:
+        """Describe the reference of the source."""
+        return self.frames.describe_reference()
 
-    def check(self, num_frames: int | None) -> Sequence[str]:
-        """Return the warnings of the source; see `FrameSource.check`."""
-        return self.frames.check(num_frames)
-
-    @property
-    def description(self) -> Mapping[str, object]:
-        """Description from the source."""
-        return self.frames.description
-
-    @property
-    def has_area_weights(self) -> bool:
-        """True if reference points of the source have area weights."""
-        return self.frames.has_area_weights
-
-    @property
-    def reference_record(self) -> Mapping[str, object] | None:
-        """Record of the reference from the source."""
-        return self.frames.reference_record
-
-    @property
-    def content(self) -> Mapping[str, object]:
-        """Content of the source and the selected rigs."""
-        return {**self.frames.content, "rigs of the recording": self.source_rigs}
+    def collect_content(self) -> Mapping[str, object]:
+        """Collect the content of the source and the selected rigs."""
+        return {**self.frames.collect_content(), "rigs of the recording": self.source_rigs}
 
     def __len__(self) -> int:
         return len(self.frames)
 
-    def _frame_at(self, position: int) -> Frame:
-        frame = self.frames[position]
+    def make_frame(self, index: int) -> Frame:
+        """Make a frame of the source and select its rigs."""
+        frame = self.frames[index]
         boxes, point_counts = frame.boxes, frame.sensor_point_counts
         if boxes is not None:
             boxes = replace(boxes, points_in_box=self._rename_rigs(boxes.points_in_box))

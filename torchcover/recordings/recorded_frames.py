@@ -16,7 +16,7 @@ from torchcover.detection import Boxes
 from torchcover.detection.inside import add_point_counts
 from torchcover.files import allow_links, find_link_roots
 from torchcover.frames.frame import Frame
-from torchcover.frames.source import BadFrameError, FrameDataset
+from torchcover.frames.source import BadFrameError, FrameDataset, FrameMetadata
 from torchcover.geometry import transform_points
 from torchcover.recordings.accumulated_reference import AccumulatedReference
 from torchcover.recordings.recording import Recording
@@ -100,27 +100,17 @@ class RecordedFrames(FrameDataset):
         return tuple(self.recording.frame_names[frame] for frame in self.recording.key_frames)
 
     @property
-    def rigs(self) -> tuple[str, ...]:
-        """Names of the rigs."""
-        return tuple(self.sensors_by_rig)
-
-    @property
-    def sensors(self) -> Mapping[str, tuple[()]]:
-        """Empty, because a recording does not describe the scan patterns of its sensors."""
-        return {}
-
-    @property
-    def sensor_names(self) -> Mapping[str, tuple[str, ...]]:
-        """Names of the sensors of each rig."""
-        return self.sensors_by_rig
-
-    def get_scene_id(self, index: int) -> int:
-        """Return the index, since no scene has to be built.
-
-        Args:
-            index: Index of the frame.
-        """
-        return index
+    def metadata(self) -> FrameMetadata:
+        """Rigs, vehicle and path; a recording does not describe the scan patterns of its sensors."""
+        ego_box = self.recording.ego_box
+        return FrameMetadata(
+            rigs=tuple(self.sensors_by_rig),
+            description={"scenario": None, "vehicle": None, "frames": str(self.recording.path), "seed": None},
+            has_area_weights=self.reference.has_area_weights(self.recording),
+            has_boxes=self._has_boxes(),
+            sensor_names=self.sensors_by_rig,
+            ego_outline_m=None if ego_box is None else ego_box.outline_m,
+        )
 
     def get_block_index(self, index: int) -> int:
         """Get the block of a frame; frames of one window share most of their reference points and so their block.
@@ -130,7 +120,7 @@ class RecordedFrames(FrameDataset):
         """
         return self._block_indices[index]
 
-    def has_boxes(self) -> bool:
+    def _has_boxes(self) -> bool:
         """Return whether the first frame with readable labels has boxes, or none but is labeled."""
         for frame in self.recording.key_frames:
             try:
@@ -167,25 +157,8 @@ class RecordedFrames(FrameDataset):
         num_checked_frames = len(self) if num_frames is None else min(num_frames, len(self))
         return check_recording(self.recording, self.reference, self.sensors_by_rig, num_checked_frames)
 
-    @property
-    def ego_outline_m(self) -> NDArray[np.float64] | None:
-        """Outline of the vehicle in bird's-eye view; None if the recording does not know its size."""
-        ego_box = self.recording.ego_box
-        return None if ego_box is None else ego_box.outline_m
-
-    @property
-    def description(self) -> Mapping[str, object]:
-        """Source of the frames for `summary.json`."""
-        return {"scenario": None, "vehicle": None, "frames": str(self.recording.path), "seed": None}
-
-    @property
-    def has_area_weights(self) -> bool:
-        """Whether reference points have areas in square meters as weights."""
-        return self.reference.has_area_weights(self.recording)
-
-    @property
-    def reference_record(self) -> Mapping[str, object]:
-        """Description of the reference, of corrections, and of the ground if height bands depend on it."""
+    def describe_reference(self) -> Mapping[str, object]:
+        """Describe the reference, corrections, and the ground if height bands depend on it."""
         record = self.reference.describe(self.recording, self._evaluated_sensors)
         notes: list[str] = [*record["notes"]]  # type: ignore[misc]  # sentences, see `Reference.describe`
         if self.corrections:
@@ -198,9 +171,8 @@ class RecordedFrames(FrameDataset):
             )
         return {**record, "notes": notes}
 
-    @property
-    def content(self) -> Mapping[str, object]:
-        """Names, sizes and modification times of the files, which are not read, and all settings of the frames.
+    def collect_content(self) -> Mapping[str, object]:
+        """Collect names, sizes and modification times of the files, which are not read, and all settings.
 
         Raises:
             OSError: A file is gone.
@@ -222,7 +194,8 @@ class RecordedFrames(FrameDataset):
     def __len__(self) -> int:
         return len(self.recording.key_frames)
 
-    def _frame_at(self, index: int) -> Frame:
+    def make_frame(self, index: int) -> Frame:
+        """Read one frame."""
         frame = self.recording.key_frames[index]
         name = self.recording.frame_names[frame]
         try:

@@ -16,8 +16,7 @@ from torchcover.coverage.quantities import MEASURED_WITHIN_M
 from torchcover.detection.boxes import Boxes
 from torchcover.detection.inside import add_point_counts
 from torchcover.frames.frame import Frame, Measurement
-from torchcover.frames.source import FrameDataset
-from torchcover.geometry.arrays import Float64
+from torchcover.frames.source import FrameDataset, FrameMetadata
 from torchcover.simulation.kinds import REFERENCE_SENSORS
 from torchcover.simulation.mounted_sensor import describe_self_hits
 from torchcover.simulation.reference_sensor import PaperReference, ReferenceSensor
@@ -25,8 +24,6 @@ from torchcover.simulation.regions_of_interest import QueryPlan, RegionsOfIntere
 from torchcover.simulation.rig import Rig, is_roadside, set_ego
 from torchcover.simulation.scenario import Scenario
 from torchcover.simulation.scene_snapshot import SensorScan
-from torchcover.simulation.sensor import Sensor
-from torchcover.simulation.shapes import Mesh
 from torchcover.simulation.simulator import Observation, Simulator
 from torchcover.simulation.surface_reference import SurfaceReference
 
@@ -70,7 +67,7 @@ class SimulatedFrames(FrameDataset):
 
     Example:
         >>> frames = SimulatedFrames("courtyard", "front_roof_128", num_frames=2, seed=0)
-        >>> len(frames), frames[0].sensor.shape[1], frames[0].reference.dtype, frames.has_area_weights
+        >>> len(frames), frames[0].sensor.shape[1], frames[0].reference.dtype, frames.metadata.has_area_weights
         (2, 3, torch.float32, True)
     """
 
@@ -140,14 +137,26 @@ class SimulatedFrames(FrameDataset):
         return self.simulator.frame_interval_s
 
     @property
-    def sensors(self) -> Mapping[str, Sequence[Sensor]]:
-        """Sensors of each rig."""
-        return {name: rig.sensors for name, rig in self.rigs.items()}
-
-    @property
-    def sensor_names(self) -> Mapping[str, Sequence[str]]:
-        """Names of the sensors of each rig."""
-        return {name: [sensor.name for sensor in rig.sensors] for name, rig in self.rigs.items()}
+    def metadata(self) -> FrameMetadata:
+        """Rigs and their sensors, ego vehicle, and for `summary.json` scenario, sensor models, weather and seed."""
+        rigs, scenario = self.rigs, self.scenario
+        return FrameMetadata(
+            rigs=tuple(rigs),
+            description={
+                "scenario": scenario.name,
+                "vehicle": scenario.ego_name,
+                "sensor_model": {name: rig.sensor_model for name, rig in rigs.items()},
+                "weather": {name: (rig.weather or scenario.weather).name for name, rig in rigs.items()},
+                "frames": None,
+                "seed": self.seed,
+            },
+            has_area_weights=self.reference_sensor.has_area_weights,
+            has_boxes=self.boxes,
+            sensors={name: rig.sensors for name, rig in rigs.items()},
+            sensor_names={name: rig.sensor_names for name, rig in rigs.items()},
+            ego_outline_m=scenario.compute_ego_box().outline_m,
+            ego_mesh=scenario.build_ego_mesh(),
+        )
 
     def get_scene_id(self, index: int) -> int:
         """Get the scene of a frame; the index itself if the scenario repeats, since every process holds that scene.
@@ -165,44 +174,13 @@ class SimulatedFrames(FrameDataset):
         """
         return self.simulator.get_block_index(index)
 
-    def has_boxes(self) -> bool:
-        """Return True if frames have boxes."""
-        return self.boxes
-
     def has_heights(self) -> bool:
         """Return True if reference points have heights above the local ground."""
         return self.reference_sensor.band_frame == "ground"
 
-    def get_ego_mesh(self) -> Mesh:
-        """Build the mesh of the ego vehicle in the vehicle frame, without building a scene."""
-        return self.scenario.build_ego_mesh()
-
-    @property
-    def ego_outline_m(self) -> Float64:
-        """(4, 2) corners x, y of the ego vehicle in bird's-eye view, counter-clockwise."""
-        return self.scenario.compute_ego_box().outline_m
-
-    @property
-    def description(self) -> Mapping[str, object]:
-        """Names of scenario and vehicle, sensor models, weather, and seed, for `summary.json`."""
-        return {
-            "scenario": self.scenario.name,
-            "vehicle": self.scenario.ego_name,
-            "sensor_model": {name: rig.sensor_model for name, rig in self.rigs.items()},
-            "weather": {name: (rig.weather or self.scenario.weather).name for name, rig in self.rigs.items()},
-            "frames": None,
-            "seed": self.seed,
-        }
-
-    @property
-    def has_area_weights(self) -> bool:
-        """True if reference points have area weights in m²."""
-        return self.reference_sensor.has_area_weights
-
-    @property
-    def reference_record(self) -> Mapping[str, object]:
-        """Reference sensor, frame interval, and notes on ground, traffic and self hits, for `summary.json`."""
-        traffic, ego_mesh = self.scenario.traffic, self.get_ego_mesh()
+    def describe_reference(self) -> Mapping[str, object]:
+        """Describe the reference sensor, with frame interval and notes on ground, traffic and self hits."""
+        traffic, ego_mesh = self.scenario.traffic, self.scenario.build_ego_mesh()
         notes = [self.simulator.ground_note, traffic.sampling_note if traffic else ""]
         if getattr(self.reference_sensor, "is_over_areas", False):
             notes.append("Reference positions: anywhere in the regions, for the rig is on a mast and not on a vehicle.")
@@ -215,9 +193,8 @@ class SimulatedFrames(FrameDataset):
             "notes": [note for note in notes if note],
         }
 
-    @property
-    def content(self) -> Mapping[str, object]:
-        """Content of all documents and of the files that they name, and the settings.
+    def collect_content(self) -> Mapping[str, object]:
+        """Collect the content of all documents and of the files that they name, and the settings.
 
         Raises:
             FileNotFoundError: A file is missing.
@@ -251,8 +228,9 @@ class SimulatedFrames(FrameDataset):
     def __len__(self) -> int:
         return self.num_frames
 
-    def _frame_at(self, position: int) -> Frame:
-        return self.build_frame(self.simulator.simulate_frame(position), position)
+    def make_frame(self, index: int) -> Frame:
+        """Simulate one frame."""
+        return self.build_frame(self.simulator.simulate_frame(index), index)
 
     def build_frame(self, observation: Observation, index: int) -> Frame:
         """Build the frame of an observation.

@@ -56,7 +56,7 @@ def write_recording(
     manifest = read_recording_manifest(folder / RECORDING) if (folder / RECORDING).exists() else {}
     files = AtomicOutput(folder, RECORDING, manifest.get("files"))
     recorder = RECORDERS[layout](files.add, build_recording_setup(frames))
-    content = {"layout": layout, **hash_values(frames.content)}
+    content = {"layout": layout, **hash_values(frames.collect_content())}
     names = [format_frame_name(index) for index in range(len(frames))]
     is_incomplete = bool(manifest.get(WRITING))
     # A complete recording has nothing to resume.
@@ -127,7 +127,7 @@ def build_recording_setup(frames: SimulatedFrames) -> RecordingSetup:
         {sensor.name: sensor.mount.to_matrix() for sensor in rig.sensors},
         [sensor.name for sensor in rig.sensors if isinstance(sensor, Lidar)],
         frames.scenario.compute_ego_box(),
-        frames.has_area_weights,
+        frames.reference_sensor.has_area_weights,
         frames.boxes,
     )
 

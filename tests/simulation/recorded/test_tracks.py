@@ -389,7 +389,7 @@ def test_sampled_scenery_avoids_recorded_tracks(written):
             assert np.linalg.norm(houses_m - place_m, axis=1).min() > 2.0
     said = "Sampled, not recorded: scenery along the tracks, with houses on 100% of the sides."
     for traffic, notes in ((build_scenario(path), []), (build_scenario(path, built_share=1.0), [said])):
-        record = SimulatedFrames(traffic, RIG, num_frames=1, reference_sensor=FEW).reference_record
+        record = SimulatedFrames(traffic, RIG, num_frames=1, reference_sensor=FEW).describe_reference()
         assert [note for note in record["notes"] if "own vehicle" not in note] == notes
     # Scenery begins on the ground, next to hills below their top.
     assert drawn.static_meshes[1].vertices_m[:, 2].min() < bare.static_meshes[0].vertices_m[:, 2].max()
