@@ -20,7 +20,7 @@ from tests.files import isolated_readers
 from torchcover.data import Frame
 from torchcover.evaluation import observe
 from torchcover.evaluation.heartbeat import Heartbeat, HeartbeatParams, report_silent_ranks
-from torchcover.files import end_with_parent, isolated, report_stopped_processes
+from torchcover.files import end_with_parent, isolated, processes, report_stopped_processes
 from torchcover.simulation.sumo import simulating
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="needs Linux, which ends processes with their parent")
@@ -182,6 +182,14 @@ def test_a_stopped_sumo_is_reported(stopped, tmp_path, monkeypatch):
     monkeypatch.setattr(simulating, "find_sumo_home", lambda: tmp_path)
     assert list(simulating.stream_output("sumo")) == [b"more\n"]
     assert [message.split(" (process ")[0] for message in stopped] == ["SUMO's sumo"]
+
+
+def test_program_that_is_stopped_before_it_runs_is_reported(stopped, tmp_path, monkeypatch):
+    monkeypatch.setattr(processes, "report_stopped_processes", partial(report_stopped_processes, poll_interval_s=0.1))
+    stop = lambda *_: os.kill(os.getpid(), signal.SIGSTOP)  # noqa: E731
+    monkeypatch.setattr(isolated, "end_with_parent", lambda: stop)
+    isolated._ReaderProcess().kill()
+    assert [message.split(" (process ")[0] for message in stopped] == ["the process that reads files"]
 
 
 def test_stopped_reader_is_reported_and_times_out(stopped, tmp_path, monkeypatch):

@@ -3,7 +3,6 @@
 import json
 import os
 import sys
-from types import SimpleNamespace
 
 import pytest
 
@@ -18,7 +17,7 @@ def test_study_prints_tables_and_recommendations(torchcover, tmp_path, monkeypat
 
         pid = os.getpid()
 
-        def __init__(self, words, **_):
+        def __init__(self, words, role, **_):
             self.returncode = run(words)
 
         def __enter__(self):
@@ -39,7 +38,7 @@ def test_study_prints_tables_and_recommendations(torchcover, tmp_path, monkeypat
         return stop.value.code
 
     codes = []
-    monkeypatch.setattr("torchcover.evaluation.study.subprocess", SimpleNamespace(Popen=Timed, DEVNULL=None, PIPE=None))
+    monkeypatch.setattr("torchcover.evaluation.study.start_program", Timed)
     out = tmp_path / "out"
     options = ["--num-rays", "256", "--set", "cell_m=4", "--num-frames", "8"]
     code, text, stderr = torchcover("study", "front_roof_32", "--scenario", "courtyard", *options, "--out", out)

@@ -23,7 +23,7 @@ from torchcover.evaluation.settings import Settings
 from torchcover.evaluation.study_plan import StudiedNumber, StudyParams, StudyPlan, Trial
 from torchcover.evaluation.target_error import MIN_FRAMES, round_up_frames
 from torchcover.evaluation.task import build_simulation_task
-from torchcover.files import AtomicOutput, end_with_parent, report_stopped_processes
+from torchcover.files import AtomicOutput, end_with_parent, report_stopped_processes, start_program
 from torchcover.report import (
     PageTable,
     build_text_cells,
@@ -353,12 +353,13 @@ def measure_command_s(plan: StudyPlan) -> float:
         # With `-m`, modules in the working directory would be imported instead of packages.
         program = f"import sys; sys.path[:] = {sys.path!r}; from torchcover.cli.app import main; main()"
         command = [sys.executable, "-c", program, *arguments, f"--out={folder}"]
-        process = subprocess.Popen(
+        process = start_program(
             command,
+            "the timed command",
             text=True,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
-            preexec_fn=end_with_parent(),  # noqa: PLW1509  (one system call without locks)
+            preexec_fn=end_with_parent(),
         )
         with process, report_stopped_processes([process.pid], "the timed command"):
             messages = process.communicate()[1]

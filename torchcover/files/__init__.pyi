@@ -31,6 +31,7 @@ from .isolated import run_isolated as run_isolated
 from .processes import end_with_parent as end_with_parent
 from .processes import is_stopped as is_stopped
 from .processes import report_stopped_processes as report_stopped_processes
+from .processes import start_program as start_program
 from .tables import DEFLATE_MAX_RATIO as DEFLATE_MAX_RATIO
 from .tables import NpyHeader as NpyHeader
 from .tables import check_dtype_kind as check_dtype_kind

@@ -30,6 +30,7 @@ from torchcover.files.processes import (
     is_stopped,
     limit_resources,
     report_stopped_processes,
+    start_program,
 )
 
 Arguments = ParamSpec("Arguments")
@@ -73,13 +74,14 @@ class _ReaderProcess:
         self.lock = threading.Lock()
         self._connection, child_connection = Pipe()
         with child_connection:
-            self.popen = subprocess.Popen(
+            self.popen = start_program(
                 [sys.executable, "-c", PROGRAM.format(path=sys.path)],
+                "the process that reads files",
                 stdin=child_connection.fileno(),
                 stdout=subprocess.DEVNULL,  # output of libraries must not mix with answers
                 stderr=subprocess.DEVNULL,  # OpenEXR prints its errors
                 env={**os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
-                preexec_fn=end_with_parent(),  # noqa: PLW1509  (it calls prctl only)
+                preexec_fn=end_with_parent(),
             )
 
     def send(self, request: list[Any], timeout_s: float) -> Arrays:

@@ -4,15 +4,18 @@ import ctypes
 import math
 import os
 import signal
+import subprocess
 import sys
 import warnings
-from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from functools import partial
 from multiprocessing import parent_process
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from threading import Event, Thread
+from typing import Any
 
 if sys.platform == "linux":
     import resource
@@ -62,11 +65,13 @@ def is_stopped(pid: int) -> bool:
 
 
 @contextmanager
-def report_stopped_processes(pids: Collection[int], role: str, poll_interval_s: float = 5.0) -> Iterator[None]:
+def report_stopped_processes(
+    pids: Collection[int] | Callable[[], Collection[int]], role: str, poll_interval_s: float = 5.0
+) -> Iterator[None]:
     """Warn about stopped processes inside the block, since the program would wait for them silently.
 
     Args:
-        pids: Process ids.
+        pids: Process ids, or a function that returns them at each poll.
         role: Role of the processes for the warning: "a worker".
         poll_interval_s: Seconds between two polls. A process that is stopped at two successive polls is reported, so
             that Ctrl-Z and `fg`, which stop and continue all processes of a command, cause no warning.
@@ -77,9 +82,9 @@ def report_stopped_processes(pids: Collection[int], role: str, poll_interval_s: 
     ended = Event()
 
     def watch() -> None:
-        stopped_polls = dict.fromkeys(pids, 0)
+        stopped_polls = Counter[int]()
         while not ended.wait(poll_interval_s):
-            for pid in pids:
+            for pid in pids() if callable(pids) else pids:
                 stopped_polls[pid] = stopped_polls[pid] + 1 if is_stopped(pid) else 0
                 if stopped_polls[pid] == 2:
                     warnings.warn(
@@ -96,6 +101,31 @@ def report_stopped_processes(pids: Collection[int], role: str, poll_interval_s: 
     finally:
         ended.set()
         watcher.join()
+
+
+def start_program(command: Sequence[str], role: str, **options: Any) -> "subprocess.Popen[Any]":  # noqa: ANN401
+    """Start a program, and warn if it is stopped before it runs, since the start would wait for it silently.
+
+    Args:
+        command: Program and arguments.
+        role: As in `report_stopped_processes`.
+        options: Options of `subprocess.Popen`.
+
+    Returns:
+        The process.
+    """
+    earlier_children = _list_children()
+    with report_stopped_processes(lambda: _list_children() - earlier_children, role):
+        return subprocess.Popen(command, **options)
+
+
+def _list_children() -> set[int]:
+    """Return the ids of the child processes of this process; empty on other systems than Linux."""
+    children = set[int]()
+    for path in Path("/proc/self/task").glob("*/children"):
+        with suppress(OSError):  # the thread has ended
+            children.update(map(int, path.read_text().split()))
+    return children
 
 
 def limit_resources(memory_gb: float) -> None:

@@ -16,7 +16,14 @@ from threading import Thread
 from typing import IO, NamedTuple
 from xml.etree import ElementTree
 
-from torchcover.files import end_with_parent, find_memory_limit_gb, guard_reader, parse_xml, report_stopped_processes
+from torchcover.files import (
+    end_with_parent,
+    find_memory_limit_gb,
+    guard_reader,
+    parse_xml,
+    report_stopped_processes,
+    start_program,
+)
 from torchcover.files.bad_file import VARIABLE
 from torchcover.simulation.sumo.checked_inputs import check_attribute_count, check_projection, copy_checked
 from torchcover.simulation.sumo.floating import ATTRIBUTES
@@ -60,14 +67,15 @@ def stream_output(
     # Validation would look for schemas on the network.
     command = [str(sumo_home / "bin" / program), "--xml-validation", "never", *(str(option) for option in options)]
     with TemporaryDirectory() as working_folder:
-        process = subprocess.Popen(
+        process = start_program(
             command,
+            f"SUMO's {program}",
             cwd=working_folder,
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             env={**os.environ, "SUMO_HOME": str(sumo_home), "PROJ_NETWORK": "OFF"},
-            preexec_fn=end_with_parent(find_memory_limit_gb(), max_cpu_s, can_write=can_write),  # noqa: PLW1509  (system calls, no lock)
+            preexec_fn=end_with_parent(find_memory_limit_gb(), max_cpu_s, can_write=can_write),
         )
         assert process.stdout is not None  # because of PIPE
         assert process.stderr is not None
