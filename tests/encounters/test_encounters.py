@@ -19,7 +19,7 @@ from torchcover.encounters.detection import (
     find_first_run,
     group_sensors,
 )
-from torchcover.evaluation import build_flat_ground, evaluate_encounters, plot_encounter_animation
+from torchcover.evaluation import build_flat_ground, encounter_evaluation, evaluate_encounters, plot_encounter_animation
 from torchcover.geometry import convert_rotation_to_euler, find_overlaps
 from torchcover.simulation import PaperReference, Rig, Scenario, Simulator, set_ego
 from torchcover.simulation.bodies import get_shape_name
@@ -500,3 +500,30 @@ def test_invalid_encounters_are_refused_before_the_first_scan(monkeypatch):
     both = build_crossing(), build_crossing(36, {"impact_location": 3.0, "yaw_deg": 0, "approach_distance_m": 4})
     with pytest.raises(ValueError, match="never touch"):
         evaluate_encounters(build_rig(), EncounterSet(name="s", encounters=both))
+
+
+def test_preparation_of_many_encounters_shows_progress(monkeypatch):
+    class CountingProgress:
+        def __init__(self, total, title, *, is_shown):
+            bars.append((total, title, is_shown))
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            pass
+
+        def advance(self, expected_total):
+            pass
+
+    bars = []
+    monkeypatch.setattr(encounter_evaluation, "Progress", CountingProgress)
+    for name in ("StagedEncounter", "detect_encounter", "EncounterResults"):
+        monkeypatch.setattr(encounter_evaluation, name, lambda *_, **__: None)
+    road_user = {"body": "adult", "speed_kmh": 5, "approach_distance_m": 2}
+    for num_encounters in (2, 100):
+        crossing = {"name": "a", "ego": {"speed_kmh": [30] * num_encounters}, "road_user": road_user}
+        encounters = EncounterSet.model_validate({"name": "crossings", "encounters": [crossing]})
+        evaluate_encounters("front_roof_32", encounters, progress=True)
+    assert [(bar[1], bar[2]) for bar in bars if bar[0] == 2] == [("preparing", False), ("encounters", True)]
+    assert [(bar[1], bar[2]) for bar in bars if bar[0] == 100] == [("preparing", True), ("encounters", True)]

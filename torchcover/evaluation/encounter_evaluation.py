@@ -76,11 +76,15 @@ def evaluate_encounters(
     criterion = Criterion() if criterion is None else criterion
     loaded_rigs = load_rigs(rigs, sensor_model)
     encounter_set = encounters if isinstance(encounters, EncounterSet) else EncounterSet.load(encounters)
-    staged = []
-    for name, rig in loaded_rigs.items():
-        mounted = MountedRig(rig, set_ego(build_flat_ground(), {name: rig}, vehicle))
-        # Encounters are staged before the first scan, so that mistakes are reported at once.
-        staged += [(mounted, StagedEncounter(encounter, mounted.ego_solid)) for encounter in encounter_set.encounters]
+    staged, num_encounters = [], len(loaded_rigs) * len(encounter_set.encounters)
+    min_encounters = 100  # staging takes about 0.05 s each
+    with Progress(num_encounters, "preparing", is_shown=progress and num_encounters >= min_encounters) as bar:
+        for name, rig in loaded_rigs.items():
+            mounted = MountedRig(rig, set_ego(build_flat_ground(), {name: rig}, vehicle))
+            # Encounters are staged before the first scan, so that mistakes are reported at once.
+            for encounter in encounter_set.encounters:
+                staged.append((mounted, StagedEncounter(encounter, mounted.ego_solid)))
+                bar.advance(num_encounters)
     detections = []
     with Progress(len(staged), "encounters", is_shown=progress) as bar:
         for mounted, encounter in staged:
