@@ -242,9 +242,7 @@ def test_order_chunks_and_threads_change_no_bit(name, backend, threads, monkeypa
 
 @if_installed
 @pytest.mark.parametrize(("count", "asked"), [(1, 0), (2, 2)])
-def test_sort_and_search_use_several_threads(
-    installed, threads, monkeypatch, count, asked
-):
+def test_sort_and_search_use_several_threads(installed, threads, monkeypatch, count, asked):
     threads(count)
     calls = []
 

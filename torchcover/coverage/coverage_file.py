@@ -68,7 +68,7 @@ def _build_header(attributes: Mapping[str, Any]) -> dict[str, Any]:
     """Collect all parts of a coverage that are no arrays, as JSON values."""
     aggregated, redundancy = attributes["aggregated_numbers"], attributes["redundancy"]
     aggregated_quantities = () if aggregated is None else aggregated.quantities
-    redundancy_layers = () if redundancy is None else redundancy.sparse_layers.values()
+    redundancy_quantities = () if redundancy is None else redundancy.quantities
     return {
         "format": FORMAT_VERSION,
         "grid": asdict(attributes["grid"]),
@@ -83,7 +83,7 @@ def _build_header(attributes: Mapping[str, Any]) -> dict[str, Any]:
         "has_region_sums": attributes["region_sums"] is not None,
         "aggregated_quantities": [quantity._asdict() for quantity in aggregated_quantities],
         "sensor_names": None if redundancy is None else redundancy.sensor_names,
-        "redundancy_layers": [layer.quantity._asdict() for layer in redundancy_layers],
+        "redundancy_layers": [quantity._asdict() for quantity in redundancy_quantities],
     }
 
 

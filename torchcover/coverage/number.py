@@ -5,7 +5,6 @@ from dataclasses import replace
 from difflib import get_close_matches
 
 from torchcover.coverage.quantities import make_cells_quantity
-from torchcover.coverage.redundancy import list_redundancy_quantities
 from torchcover.coverage.regions import Region
 from torchcover.coverage.result import Coverage
 from torchcover.estimation import Estimate, Quantity
@@ -56,6 +55,5 @@ def _list_estimators(coverage: Coverage) -> list[tuple[tuple[Quantity, ...], Est
     if coverage.average == "area":
         estimators.append((tuple(make_cells_quantity(quantity) for quantity in means), coverage.paper_mean))
     if coverage.redundancy is not None:
-        quantities = list_redundancy_quantities(coverage.redundancy.sensor_names, coverage.thresholds_m)
-        estimators.append(((*means, *quantities), coverage.estimate_redundancy))
+        estimators.append(((*means, *coverage.redundancy.quantities), coverage.estimate_redundancy))
     return estimators

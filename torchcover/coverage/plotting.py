@@ -9,21 +9,27 @@ from torchcover.coverage.grid import BevGrid
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 
-def plot_layer(ax: "Axes", layer: Layer, grid: BevGrid, band: str, num_frames: int) -> None:
+def plot_layer(ax: "Axes | None", layer: Layer, grid: BevGrid, band: str | None, num_frames: int) -> "Figure":
     """Plot one layer in one height band in bird's-eye view: x to the right, y up, the vehicle at the origin.
 
     Dark cells are blind, gray cells unobserved. Values beyond the color scale, such as an infinite radius, have its
     last color.
 
     Args:
-        ax: Axes to plot on.
+        ax: Axes to plot on; None for those of a new figure that pyplot does not manage.
         layer: (H, Y, X) layer.
         grid: Cells and height bands.
-        band: Name of the height band.
+        band: Name of the height band; None for the first.
         num_frames: Number of frames, for the title.
     """
+    if ax is None:
+        from matplotlib.figure import Figure
+
+        ax = Figure(figsize=(9.0, 4.5), layout="constrained").subplots()
+    band = next(iter(grid.heights)) if band is None else band
     quantity, values = layer.quantity, layer.values[grid.get_band_index(band)].cpu().numpy()
     finite = values[np.isfinite(values)]
     vmax = 1.0
@@ -54,3 +60,4 @@ def plot_layer(ax: "Axes", layer: Layer, grid: BevGrid, band: str, num_frames: i
     )
     label = f"{quantity.title} (m)" if quantity.unit == "m" else quantity.title
     ax.figure.colorbar(mesh, ax=ax, label=label, shrink=0.7, extend="max" if (values > vmax).any() else "neither")
+    return ax.figure  # type: ignore[return-value]  # the figure around a subfigure is not needed

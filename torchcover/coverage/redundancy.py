@@ -37,6 +37,11 @@ class Redundancy:
     sparse_layers: Mapping[str, Layer]
 
     @property
+    def quantities(self) -> tuple[Quantity, ...]:
+        """Quantities of the layers, as in `list_redundancy_quantities`."""
+        return tuple(layer.quantity for layer in self.sparse_layers.values())
+
+    @property
     def layers(self) -> Mapping[str, Layer]:
         """Layers over the full grid."""
         return expand_layers(self.sparse_layers, self.observed_cells)

@@ -175,25 +175,29 @@ class Region:
                 )
         return self.mask_points(grid.x_centers_m[None, :], grid.y_centers_m[:, None])
 
-    def has_whole_cells(self, grid: BevGrid) -> bool:
-        """Return whether all bounds are cell edges, so that the points in its cells are the points in the region.
+    def check_whole_cells(self, grid: BevGrid) -> None:
+        """Check that all bounds are cell edges, so that the points in its cells are the points in the region.
 
         Args:
             grid: Cells.
 
+        Raises:
+            ValueError: A bound is no cell edge, or the region is a polygon.
+
         Example:
             >>> grid = BevGrid(x_m=(0.0, 4.0), y_m=(0.0, 1.0), cell_m=0.5)
-            >>> [Region("ahead", (0.0, far), (0.0, 1.0)).has_whole_cells(grid) for far in (2.5, 2.6)]
-            [True, False]
+            >>> Region("ahead", (0.0, 2.5), (0.0, 1.0)).check_whole_cells(grid)
         """
-        if self.corners_m:
-            return False
         tolerance_m = 1e-6 * grid.cell_m  # bounds and edges are both written in decimals
+        is_whole = not self.corners_m
         for bounds, edges in ((self.x_m, grid.x_edges_m), (self.y_m, grid.y_edges_m)):
             for bound in bounds:
-                if float((edges - bound).abs().min()) > tolerance_m:
-                    return False
-        return True
+                is_whole &= float((edges - bound).abs().min()) <= tolerance_m
+        if not is_whole:
+            raise ValueError(
+                f"region {self.name!r}: its points were not summed, and its bounds are not edges of the cells of "
+                f"{grid.cell_m:g} m; give the region to the metric, or move its bounds to cell edges"
+            )
 
 
 def _is_between(bounds: tuple[float, float], limits: tuple[float, float]) -> bool:

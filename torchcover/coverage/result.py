@@ -43,7 +43,8 @@ class Coverage:
         thresholds_m: Detection thresholds in meters.
         max_radius_m: Radius in meters at which r saturates.
         observed_cells: Observed cells with their numbers of frames and points.
-        layers: (K,) layers: the mean radius, the detection at each threshold, then those of other aggregations.
+        layers: (K,) layers, which the attribute `sparse_layers` has by key: the mean radius, the detection at each
+            threshold, then those of other aggregations.
         counts: Numbers of frames and points by the names in `COUNTS`.
         block_sums: Sums in blocks of contiguous frames, for errors; None without blocks.
         area_sums: Sums over the visible surface; None without area weights.
@@ -51,9 +52,6 @@ class Coverage:
         region_sums: Sums over area in `regions`, by the position of each point; None without area weights.
         aggregated_numbers: Numbers of other aggregations in `regions`; None without them.
         redundancy: Coverage without each sensor; None if the metric does not distinguish sensors.
-
-    Attributes:
-        sparse_layers: (K,) layers by the key of their quantity.
     """
 
     COUNTS: ClassVar[tuple[str, ...]] = (
@@ -82,24 +80,18 @@ class Coverage:
         aggregated_numbers: AggregatedNumbers | None = None,
         redundancy: Redundancy | None = None,
     ) -> None:
-        self.grid = grid
-        self.thresholds_m = tuple(thresholds_m)
-        self.max_radius_m = max_radius_m
+        self.grid, self.thresholds_m, self.max_radius_m = grid, tuple(thresholds_m), max_radius_m
         self.observed_cells = observed_cells
         self.sparse_layers: Mapping[str, Layer] = {layer.quantity.key: layer for layer in layers}
         self.counts = dict(counts)
-        self.block_sums = block_sums
-        self.area_sums = area_sums
+        self.block_sums, self.area_sums, self.region_sums = block_sums, area_sums, region_sums
         self.regions = get_paper_regions(grid) if regions is None else tuple(regions)
-        self.region_sums = region_sums
-        self.aggregated_numbers = aggregated_numbers
-        self.redundancy = redundancy
+        self.aggregated_numbers, self.redundancy = aggregated_numbers, redundancy
         self._paper_means: dict[tuple[Region, str], Estimate] = {}
 
     def __repr__(self) -> str:
-        observed_share = len(self.observed_cells.cell_indices) / self.grid.num_cells
-        num_frames = self.counts["num_frames"]
-        return f"Coverage({self.grid.shape} cells, {num_frames} frames, {observed_share:.1%} of the cells observed)"
+        share, num_frames = len(self.observed_cells.cell_indices) / self.grid.num_cells, self.counts["num_frames"]
+        return f"Coverage({self.grid.shape} cells, {num_frames} frames, {share:.1%} of the cells observed)"
 
     def _repr_html_(self) -> str:
         return build_result_html([repr(self)], self.plot())
@@ -121,13 +113,7 @@ class Coverage:
             quantity_key = (quantity if self.average == "cells" else make_area_quantity(quantity)).key
         if quantity_key not in self.layers:
             raise ValueError(f"layer: one of {', '.join(self.layers)} is needed; got {quantity_key!r}")
-        band = next(iter(self.grid.heights)) if band is None else band
-        if ax is None:
-            from matplotlib.figure import Figure
-
-            ax = Figure(figsize=(9.0, 4.5), layout="constrained").subplots()
-        plot_layer(ax, self.layers[quantity_key], self.grid, band, self.counts["num_frames"])
-        return ax.figure  # type: ignore[return-value]  # the figure around a subfigure is not needed
+        return plot_layer(ax, self.layers[quantity_key], self.grid, band, self.counts["num_frames"])
 
     def to_dataframe(self, regions: Sequence[Region] | None = None) -> "pandas.DataFrame":
         """Convert the numbers of `scalars` to a table with one row per region and height band.
@@ -156,11 +142,8 @@ class Coverage:
         maps = {key: layer.values for key, layer in self.layers.items()}
         maps |= {f"{key}_error": values for key, values in self.errors.items()}
         maps |= {"point_counts": self.point_counts, "observed_frames": self.observed_frames}
-        axes: dict[str, Any] = {
-            "band": list(self.grid.heights),
-            "y_m": self.grid.y_centers_m.numpy(),
-            "x_m": self.grid.x_centers_m.numpy(),
-        }
+        y_m, x_m = self.grid.y_centers_m.numpy(), self.grid.x_centers_m.numpy()
+        axes: dict[str, Any] = {"band": list(self.grid.heights), "y_m": y_m, "x_m": x_m}
         return build_xarray_dataset({key: values.cpu().numpy() for key, values in maps.items()}, axes)
 
     @property
@@ -211,9 +194,8 @@ class Coverage:
             return {}
         errors = estimate_cell_errors(self.quantities, self.observed_cells, self.block_sums)
         if self.area_sums is not None:
-            area_errors = estimate_cell_errors(self.quantities, self.observed_cells, self.area_sums)
-            for quantity in self.quantities:
-                errors[make_area_quantity(quantity).key] = area_errors[quantity.key]
+            area_quantities = [make_area_quantity(quantity) for quantity in self.quantities]
+            errors |= estimate_cell_errors(area_quantities, self.observed_cells, self.area_sums)
         return errors
 
     def summary(self, regions: Sequence[Region] | None = None) -> list[RegionSummary]:
@@ -228,8 +210,8 @@ class Coverage:
         Raises:
             ValueError: A region reaches beyond the grid, or contains no cell center.
         """
-        region_bands = list_region_bands(self.regions if regions is None else regions, self.grid)
-        return [self._summarize_region(region, band) for region, band in region_bands]
+        regions = self.regions if regions is None else regions
+        return [self._summarize_region(region, band) for region, band in list_region_bands(regions, self.grid)]
 
     @property
     def average(self) -> Average:
@@ -310,21 +292,13 @@ class Coverage:
         return self._paper_means[key]
 
     def _sum_area_by_block(self, region: Region, band: str) -> tuple[Tensor, Tensor]:
-        """Return (B,) frames per block and (B, 1 + Q) sums over the visible surface: area in m2, area times values.
-
-        Either the metric assigned the points to the region by their position, or its bounds are cell edges, so that its
-        cells contain the same points.
-        """
+        """Return (B,) frames per block and (B, 1 + Q) sums over the visible surface: area in m2, area times values."""
         assert self.area_sums is not None
         index, region_sums = self.find_region_band(region, band), self.region_sums
         if region_sums is not None and index is not None:
             sums = region_sums.sums[:, : len(self.quantities), index]
             return region_sums.frame_counts, torch.cat([region_sums.areas_m2[:, index, None], sums], dim=1)
-        if not region.has_whole_cells(self.grid):
-            raise ValueError(
-                f"region {region.name!r}: its points were not summed, and its bounds are not edges of the cells of "
-                f"{self.grid.cell_m:g} m; give the region to the metric, or move its bounds to cell edges"
-            )
+        region.check_whole_cells(self.grid)  # only then do its cells contain the same points as the region
         sums = self.area_sums.sum_cells(self.get_cell_mask(region), self.grid.get_band_index(band))
         return self.area_sums.frame_counts, sums
 
@@ -354,8 +328,7 @@ class Coverage:
             By area, numbers are NaN for regions that the metric did not sum. Over cells, numbers have no errors.
         """
         assert self.redundancy is not None
-        layers = self.redundancy.sparse_layers.values()
-        quantities = (*self.quantities, *(layer.quantity for layer in layers))
+        quantities = (*self.quantities, *self.redundancy.quantities)
         index = self.find_region_band(region, band)
         if self.region_sums is not None and index is not None:
             return self.region_sums.estimate(quantities, index)
@@ -363,7 +336,7 @@ class Coverage:
             unknown = torch.full((len(quantities),), math.nan, dtype=torch.float64, device="cpu")
             return Estimate.from_values(quantities, unknown)
         observed = self.mask_observed_cells(region, band)
-        means = torch.stack([layer.values[observed].mean() for layer in layers])
+        means = torch.stack([layer.values[observed].mean() for layer in self.redundancy.sparse_layers.values()])
         return Estimate.from_values(quantities, torch.cat([self.paper_mean(region, band).value, means]))
 
     def scalars(self, regions: Sequence[Region] | None = None) -> dict[str, float]:
@@ -373,8 +346,7 @@ class Coverage:
             regions: As in `summary`.
 
         Returns:
-            `"radius_m/20m/ground"`, `"detection_0.4m/20m/ground"`, `"observed_share/20m/ground"` and so on, and
-            `"visible_m2/20m/ground"` with area weights.
+            Values by region and band: `"radius_m/20m/ground"`; with area weights `"visible_m2/20m/ground"`, too.
         """
         values: dict[str, float] = {}
         for row in self.summary(regions):
@@ -390,7 +362,7 @@ class Coverage:
             path: File; it is replaced atomically.
             further_arrays: Arrays by name that the file also contains; `load` skips them.
         """
-        attributes = vars(self) | {"sparse_errors": self.sparse_errors}
+        attributes = {**vars(self), "sparse_errors": self.sparse_errors}
         write_atomically(Path(path), partial(write_coverage, attributes, further_arrays or {}))
 
     @classmethod
