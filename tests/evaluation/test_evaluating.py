@@ -401,7 +401,7 @@ def test_earlier_files_stay_until_new_numbers_are_complete(tmp_path, monkeypatch
     result = torchcover.evaluate(frames=Single(), cell_m=8.0, num_frames=2)
     result.save(tmp_path)
     before = read_files(tmp_path)
-    monkeypatch.setattr(Coverage, "save", lambda self, path: fail_halfway(path))
+    monkeypatch.setattr(Coverage, "save", lambda self, path, *_, **__: fail_halfway(path))
     with pytest.raises(OSError, match="no space left"):
         result.save(tmp_path)
     assert read_files(tmp_path) == before
