@@ -11,7 +11,7 @@ from torchcover.coverage.result import Coverage
 from torchcover.coverage.target_sums import TargetMixture, TargetSums
 from torchcover.estimation import Difference, Estimate
 
-# Numbers of one rig that can be compared with those of other rigs.
+# Results of one rig that are compared with the results of other rigs.
 MeasuredRig = Coverage | CoverageMixture | TargetSums | TargetMixture
 
 

@@ -19,7 +19,7 @@ def plot_layer(ax: "Axes | None", layer: Layer, grid: BevGrid, band: str | None,
     last color.
 
     Args:
-        ax: Axes to plot on; None for those of a new figure that pyplot does not manage.
+        ax: Axes to plot on; None for a new figure that pyplot does not manage.
         layer: (H, Y, X) layer.
         grid: Cells and height bands.
         band: Name of the height band; None for the first.
