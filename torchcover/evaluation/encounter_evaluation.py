@@ -87,9 +87,9 @@ def evaluate_encounters(
                 bar.advance(num_encounters)
     detections = []
     with Progress(len(staged), "encounters", is_shown=progress) as bar:
-        for mounted, encounter in staged:
+        for mounted, staged_encounter in staged:
             detections.append(
-                detect_encounter(mounted, encounter, criterion, num_start_offsets=num_start_offsets, seed=seed)
+                detect_encounter(mounted, staged_encounter, criterion, num_start_offsets=num_start_offsets, seed=seed)
             )
             bar.advance(len(staged))
     sensor_names = {name: rig.sensor_names for name, rig in loaded_rigs.items()}
