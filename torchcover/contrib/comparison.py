@@ -66,10 +66,8 @@ class MetricComparison:
         """Compute tau for all pairs of main and coverage numbers; empty for fewer than three rigs."""
         if len(self.rigs) < LEAST:
             return []
-        return [
-            compute_tau(first, second)
-            for first, second in combinations([*self.main_rankings, *self.coverage_rankings], 2)
-        ]
+        pairs = combinations([*self.main_rankings, *self.coverage_rankings], 2)
+        return [compute_tau(first, second) for first, second in pairs]
 
     def iterate_rows(self) -> Iterator[dict[str, Any]]:
         """Iterate over rows with `COLUMNS`, one for each rig and number; NaN if unknown."""
@@ -106,10 +104,7 @@ class MetricComparison:
         Returns:
             The tables.
         """
-        rows = [
-            [TextCell(cell) for cell in _format_row(ranking)]
-            for ranking in (self.rankings if include_parts else self.main_rankings)
-        ]
+        rows = [_format_row(ranking) for ranking in (self.rankings if include_parts else self.main_rankings)]
         headings = ["metric", "unit", "better", *self.rigs]
         title = f"{TITLE} (rank)" if len(self.rigs) > 1 else TITLE
         return [PageTable(title, headings, rows, 3, self.notes), *_build_tau_tables(self)]
@@ -159,12 +154,14 @@ def compute_tau(first: Ranking, second: Ranking) -> KendallTau:
     return KendallTau(first.name, second.name, value, low, high, num_known)
 
 
-def _format_row(ranking: Ranking) -> list[str]:
+def _format_row(ranking: Ranking) -> list[TextCell]:
     """Format the cells of a table for one ranking."""
     better = "less" if ranking.quantity.lower_is_better else "more"
     ranks = ranking.ranks.tolist() if len(ranking.numbers) > 1 else [math.nan]
-    cells = [_format_ranked_number(number, rank) for number, rank in zip(ranking.numbers, ranks, strict=True)]
-    return [ranking.name, get_display_unit(ranking.quantity.unit).name, better, *cells]
+    cells = [TextCell(ranking.name), TextCell(get_display_unit(ranking.quantity.unit).name), TextCell(better)]
+    for number, rank in zip(ranking.numbers, ranks, strict=True):
+        cells.append(TextCell(_format_ranked_number(number, rank)))
+    return cells
 
 
 def _format_ranked_number(number: Number, rank: float) -> str:

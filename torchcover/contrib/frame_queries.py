@@ -115,11 +115,8 @@ class FrameQueryCache:
         """
         if self.searches_by_sensor:
             return self.find_sensor_distances_m(frame, rig_name, max_distance_m).amin(dim=0)
-        return self.get_or_compute(
-            frame,
-            ("rig", rig_name, max_distance_m),
-            lambda: _find_distances_m(frame, frame.get_cloud(rig_name, max_error_m=max_distance_m), max_distance_m),
-        )
+        key = ("rig", rig_name, max_distance_m)
+        return self.get_or_compute(frame, key, _find_rig_distances_m, frame, rig_name, max_distance_m)
 
     def find_sensor_distances_m(self, frame: Frame, rig_name: str, max_distance_m: float) -> Tensor:
         """Find the distance from each reference point to the nearest point of each sensor.
@@ -135,13 +132,8 @@ class FrameQueryCache:
         Raises:
             ValueError: The sensor of each point is unknown.
         """
-
-        def search() -> Tensor:
-            clouds = list(frame.get_clouds_by_sensor(rig_name, max_error_m=max_distance_m).values())
-            backend = choose_shared_backend(frame.reference, clouds)
-            return torch.stack([_find_distances_m(frame, cloud, max_distance_m, backend) for cloud in clouds])
-
-        return self.get_or_compute(frame, ("sensors", rig_name, max_distance_m), search)
+        key = ("sensors", rig_name, max_distance_m)
+        return self.get_or_compute(frame, key, _find_sensor_distances_m, frame, rig_name, max_distance_m)
 
     def get_boxes(self, frame: Frame) -> Boxes:
         """Return the objects of a frame.
@@ -168,9 +160,7 @@ class FrameQueryCache:
         Returns:
             Pairs of a box and a reference point in it.
         """
-        return self.get_or_compute(
-            frame, ("boxes",), lambda: find_points_in_boxes(frame.reference, self.get_boxes(frame))
-        )
+        return self.get_or_compute(frame, ("boxes",), find_points_in_boxes, frame.reference, self.get_boxes(frame))
 
     def compute_membership(self, frame: Frame, strata: ObjectStrata) -> Tensor:
         """Compute which objects of a frame belong to which stratum.
@@ -183,7 +173,7 @@ class FrameQueryCache:
             (strata, K) float64, 1 where an object belongs to the stratum, else 0.
         """
         key = ("strata", *strata.definition.values())
-        return self.get_or_compute(frame, key, lambda: strata.compute_membership(self.get_boxes(frame)))
+        return self.get_or_compute(frame, key, strata.compute_membership, self.get_boxes(frame))
 
     def count_points_in_boxes(self, frame: Frame, rig_name: str) -> Tensor:
         """Count the points of a rig in each object.
@@ -199,7 +189,7 @@ class FrameQueryCache:
         if rig_name in boxes.points_in_box:
             return boxes.points_in_box[rig_name]
         points = frame.get_cloud(rig_name, max_error_m=MEASURED_WITHIN_M)
-        return self.get_or_compute(frame, ("hits", rig_name), lambda: count_points_in_boxes(points, boxes))
+        return self.get_or_compute(frame, ("hits", rig_name), count_points_in_boxes, points, boxes)
 
     def assign_cells(self, frame: Frame, grid: BevGrid) -> CellAssignment:
         """Assign the reference points of a frame to the cells of a grid.
@@ -211,17 +201,23 @@ class FrameQueryCache:
         Returns:
             Cells of the points.
         """
-        return self.get_or_compute(
-            frame, ("bins", grid), lambda: grid.assign_cells(frame.reference, frame.get_heights_m(grid.band_frame))
-        )
+        heights_m = frame.get_heights_m(grid.band_frame)
+        return self.get_or_compute(frame, ("bins", grid), grid.assign_cells, frame.reference, heights_m)
 
-    def get_or_compute(self, frame: Frame, key: tuple[Any, ...], compute: Callable[[], ResultT]) -> ResultT:
+    def get_or_compute(
+        self,
+        frame: Frame,
+        key: tuple[Any, ...],
+        compute: Callable[..., ResultT],
+        *arguments: Any,  # noqa: ANN401  (of `compute`)
+    ) -> ResultT:
         """Return a result for a frame, computed at the first request.
 
         Args:
             frame: Frame; results of the previous frame are dropped.
             key: Name and parameters of the result.
             compute: Function that computes the result.
+            *arguments: Its arguments.
 
         Returns:
             The result.
@@ -229,7 +225,7 @@ class FrameQueryCache:
         if frame is not self._frame:
             self._frame, self._results = frame, {}
         if key not in self._results:
-            self._results[key] = compute()
+            self._results[key] = compute(*arguments)
         result: ResultT = self._results[key]
         return result
 
@@ -277,6 +273,18 @@ def count_points_in_boxes(cloud: Tensor, boxes: Boxes) -> Tensor:
         (K,) int64 counts.
     """
     return torch.bincount(find_points_in_boxes(cloud, boxes).box_indices, minlength=len(boxes))
+
+
+def _find_rig_distances_m(frame: Frame, rig_name: str, max_distance_m: float) -> Tensor:
+    """Find (M,) distances from reference points to the cloud of a rig."""
+    return _find_distances_m(frame, frame.get_cloud(rig_name, max_error_m=max_distance_m), max_distance_m)
+
+
+def _find_sensor_distances_m(frame: Frame, rig_name: str, max_distance_m: float) -> Tensor:
+    """Find (S, M) distances from reference points to the cloud of each sensor."""
+    clouds = list(frame.get_clouds_by_sensor(rig_name, max_error_m=max_distance_m).values())
+    backend = choose_shared_backend(frame.reference, clouds)
+    return torch.stack([_find_distances_m(frame, cloud, max_distance_m, backend) for cloud in clouds])
 
 
 def _find_distances_m(frame: Frame, cloud: Tensor, max_distance_m: float, backend: str = "auto") -> Tensor:

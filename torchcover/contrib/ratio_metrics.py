@@ -70,17 +70,14 @@ class ObjectCoverage(SceneRatios):
                 f"min_point_counts: different numbers of points from 1 on are needed; got {tuple(min_point_counts)}"
             )
         strata = ObjectStrata(categories, range_borders_m)
-        names = [f"object_coverage_{threshold_m:g}m", *(f"objects_hit_{count}" for count in min_point_counts)]
-        parameters: list[dict[str, Any]] = [
-            {"threshold_m": threshold_m},
-            *({"hits": count} for count in min_point_counts),
-        ]
-        range_limit: dict[str, Any] = {"range_m": strata.range_borders_m[-1]}
-        ratios = [
-            describe_number(name + stratum, "share", "objects", **row, **range_limit)
-            for name, row in zip(names, parameters, strict=True)
-            for stratum in strata.name_suffixes
-        ]
+        parameters: dict[str, dict[str, Any]] = {f"object_coverage_{threshold_m:g}m": {"threshold_m": threshold_m}}
+        for count in min_point_counts:
+            parameters[f"objects_hit_{count}"] = {"hits": count}
+        ratios = []
+        for name, row in parameters.items():
+            row["range_m"] = strata.range_borders_m[-1]
+            for stratum in strata.name_suffixes:
+                ratios.append(describe_number(name + stratum, "share", "objects", **row))
         super().__init__(
             ratios,
             {"threshold_m": float(threshold_m), "min_point_counts": tuple(min_point_counts), **strata.definition},
@@ -191,11 +188,10 @@ class PerceptionEntropy(SceneRatios):
         cameras = {sensor.name: sensor.pixels_per_sample for sensor in sensors if isinstance(sensor, CameraSensor)}
         strata = ObjectStrata(categories, range_borders_m)
         parameters = {"range_m": strata.range_borders_m[-1], "constants": dict(CONSTANTS), "cameras": sorted(cameras)}
-        ratios = [
-            describe_number(form + name, "nats", "objects", lower_is_better=True, **parameters)
-            for form in ("perception_entropy", "perception_entropy_bounded")
-            for name in strata.name_suffixes
-        ]
+        ratios = []
+        for form in ("perception_entropy", "perception_entropy_bounded"):
+            for name in strata.name_suffixes:
+                ratios.append(describe_number(form + name, "nats", "objects", lower_is_better=True, **parameters))
         super().__init__(ratios, {**strata.definition, "cameras": tuple(sorted(cameras.items()))}, **kwargs)
         self.strata = strata
         self.pixels_per_sample = cameras
@@ -216,9 +212,8 @@ class PerceptionEntropy(SceneRatios):
             kind = "camera" if name in self.pixels_per_sample else "lidar"
             sensor_counts = self.pixels_per_sample.get(name, 1) * count_points_in_boxes(cloud, boxes)
             measurements[kind] = measurements.get(kind, torch.zeros_like(sensor_counts)) + sensor_counts
-        return fuse_standard_deviations(
-            [compute_standard_deviation(count, kind) for kind, count in measurements.items()]
-        )
+        sigmas = [compute_standard_deviation(count, kind) for kind, count in measurements.items()]
+        return fuse_standard_deviations(sigmas)
 
 
 class KCover(SceneRatios):
@@ -269,11 +264,11 @@ class KCover(SceneRatios):
         region_bands = RegionBands(regions, grid)
         names = ["", *(f":{region.name}_{band}" for region in region_bands.regions for band in grid.heights)]
         counted = "reference points, by square metres" if has_area_weights else "reference points"
-        ratios = [
-            describe_number(f"k_cover_{k}_{threshold_m:g}m{name}", "share", counted, k=k, threshold_m=threshold_m)
-            for k in min_sensor_counts
-            for name in names
-        ]
+        ratios = []
+        for k in min_sensor_counts:
+            for name in names:
+                key = f"k_cover_{k}_{threshold_m:g}m{name}"
+                ratios.append(describe_number(key, "share", counted, k=k, threshold_m=threshold_m))
         definition = {
             "threshold_m": float(threshold_m),
             "min_sensor_counts": tuple(min_sensor_counts),

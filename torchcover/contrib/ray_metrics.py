@@ -97,7 +97,7 @@ class MSog(BlockedSums, FrameMetric):
     def _add_frame(self, frame: Frame) -> None:
         check_cloud(frame.reference, "reference")
         key = ("labels", self.category, self.grid)
-        label_voxels = self.query_cache.get_or_compute(frame, key, partial(self._label_voxels, frame))
+        label_voxels = self.query_cache.get_or_compute(frame, key, self._label_voxels, frame)
         block = self._assign_block(frame.block_index)
         for label, voxels in enumerate(label_voxels):
             self.label_counts[block, label, voxels.to(self.label_counts.device)] += 1

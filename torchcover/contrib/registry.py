@@ -1,7 +1,8 @@
 """Registry of the published metrics: names for `--set metrics=NAME`, required data and construction."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Literal, NamedTuple, TypeAlias
 
 from torchcover.contrib.comparison import MetricComparison
@@ -51,81 +52,81 @@ class MetricSetup:
     threshold_m: float = 0.4
     query_cache: FrameQueryCache = field(default_factory=FrameQueryCache)
 
-    @property
-    def common_arguments(self) -> dict[str, Any]:
-        """Keyword arguments of all metrics."""
-        return {"rig_name": self.rig_name, "query_cache": self.query_cache}
-
 
 @dataclass(frozen=True)
 class PublishedMetric:
     """Entry of the registry.
 
     Args:
-        build: Function that builds the metric.
+        create: Class of the metric, or function that creates it.
+        arguments: Fields of `MetricSetup` that it takes, besides `rig_name` and `query_cache`.
         needs: Data that the metric requires.
         description: Description of its numbers in one line.
     """
 
-    build: Callable[[MetricSetup], FrameMetric]
-    needs: frozenset[Need]
+    create: Callable[..., FrameMetric]
+    arguments: tuple[str, ...]
+    needs: Set[Need]
     description: str
 
+    def build(self, setup: MetricSetup) -> FrameMetric:
+        """Build the metric of one rig.
 
-def _build_point_density(setup: MetricSetup) -> PointDensity:
-    """Build the metric on cells of 1 m, or on the cells of the run for smaller regions."""
+        Args:
+            setup: Inputs of the metrics.
+        """
+        names = (*self.arguments, "rig_name", "query_cache")
+        return self.create(**{name: getattr(setup, name) for name in names})
+
+
+def _create_point_density(
+    grid: BevGrid,
+    regions: Sequence[Region],
+    **kwargs: Any,  # noqa: ANN401  (arguments of `FrameMetric`)
+) -> PointDensity:
+    """Create the metric on cells of 1 m, or on the cells of the run for smaller regions."""
     # Regions smaller than a cell of 1 m need the cells of the run.
-    coarse = build_coarse_grid(setup.grid, UNIFORMITY_CELL_M)
-    covers_regions = all(region.mask_cells(coarse).any() for region in setup.regions)
-    return PointDensity(coarse if covers_regions else setup.grid, setup.regions, **setup.common_arguments)
+    coarse = build_coarse_grid(grid, UNIFORMITY_CELL_M)
+    covers_regions = all(region.mask_cells(coarse).any() for region in regions)
+    return PointDensity(coarse if covers_regions else grid, regions, **kwargs)
 
 
 PUBLISHED: Mapping[str, PublishedMetric] = {
     "object_coverage": PublishedMetric(
-        lambda setup: ObjectCoverage(setup.threshold_m, **setup.common_arguments),
-        frozenset({"boxes"}),
+        ObjectCoverage,
+        ("threshold_m",),
+        {"boxes"},
         "share of an object within the threshold; objects with 1, 5, 10 points",
     ),
     "perception_entropy": PublishedMetric(
-        lambda setup: PerceptionEntropy(setup.sensors, **setup.common_arguments),
-        frozenset({"boxes"}),
-        "nats of a detector's error, from points on objects (Ma 2021)",
+        PerceptionEntropy, ("sensors",), {"boxes"}, "nats of a detector's error, from points on objects (Ma 2021)"
     ),
     "k_cover": PublishedMetric(
-        lambda setup: KCover(
-            setup.grid,
-            setup.regions,
-            setup.threshold_m,
-            has_area_weights=setup.has_area_weights,
-            **setup.common_arguments,
-        ),
-        frozenset({"sensor_point_counts"}),
+        KCover,
+        ("grid", "regions", "threshold_m", "has_area_weights"),
+        {"sensor_point_counts"},
         "share of the surface detected by 1, 2, 3 sensors",
     ),
     "point_density": PublishedMetric(
-        _build_point_density, frozenset(), "points, points per square meter, and their uniformity"
+        _create_point_density, ("grid", "regions"), set(), "points, points per square meter, and their uniformity"
     ),
     "false_visible": PublishedMetric(
-        lambda setup: FalseVisible(
-            setup.sensors, setup.ego_mesh, setup.grid, setup.threshold_m, **setup.common_arguments
-        ),
-        frozenset({"sensors"}),
+        FalseVisible,
+        ("sensors", "ego_mesh", "grid", "threshold_m"),
+        {"sensors"},
         "blind cells within the field of view (Börger 2022)",
     ),
     "s_mig": PublishedMetric(
-        lambda setup: SMig(setup.sensors, **setup.common_arguments),
-        frozenset({"boxes", "sensors"}),
-        "minus the entropy of objects along the rays, in nats (Hu 2022)",
+        SMig, ("sensors",), {"boxes", "sensors"}, "minus the entropy of objects along the rays, in nats (Hu 2022)"
     ),
     "s_mig_occluded": PublishedMetric(
-        lambda setup: SMig(setup.sensors, ends_at_hits=True, **setup.common_arguments),
-        frozenset({"boxes", "sensors", "sensor_point_counts"}),
+        partial(SMig, ends_at_hits=True),
+        ("sensors",),
+        {"boxes", "sensors", "sensor_point_counts"},
         "s_mig with rays that end at their hits",
     ),
     "m_sog": PublishedMetric(
-        lambda setup: MSog(setup.sensors, **setup.common_arguments),
-        frozenset({"boxes", "sensors"}),
-        "minus the mean entropy of labels along the rays (Place3D 2024)",
+        MSog, ("sensors",), {"boxes", "sensors"}, "minus the mean entropy of labels along the rays (Place3D 2024)"
     ),
 }
 
@@ -142,9 +143,9 @@ def parse_metric_names(names_or_text: str | Iterable[str]) -> tuple[str, ...]:
     Raises:
         ValueError: An unknown metric.
     """
-    names = (
-        [name.strip() for name in names_or_text.split(",")] if isinstance(names_or_text, str) else list(names_or_text)
-    )
+    names = []
+    for name in names_or_text.split(",") if isinstance(names_or_text, str) else names_or_text:
+        names.append(name.strip() if isinstance(names_or_text, str) else name)
     if names == ["all"]:
         return tuple(PUBLISHED)
     for name in names:
@@ -174,7 +175,11 @@ class RunMetrics(NamedTuple):
     @property
     def observers(self) -> dict[str, FrameMetric]:
         """Metrics of all rigs by unique names, as the observers of a run."""
-        return {f"{name} of {rig}": metric for name, metrics in self.by_rig.items() for rig, metric in metrics.items()}
+        observers = {}
+        for name, metrics in self.by_rig.items():
+            for rig, metric in metrics.items():
+                observers[f"{name} of {rig}"] = metric
+        return observers
 
     def update_from(self, observers: Mapping[str, Any]) -> "RunMetrics":
         """Return the metrics in the state after a run.
@@ -185,7 +190,9 @@ class RunMetrics(NamedTuple):
         Returns:
             The metrics by rig.
         """
-        by_rig = {name: {rig: observers[f"{name} of {rig}"] for rig in rigs} for name, rigs in self.by_rig.items()}
+        by_rig: dict[str, dict[str, FrameMetric]] = {}
+        for name, rigs in self.by_rig.items():
+            by_rig[name] = {rig: observers[f"{name} of {rig}"] for rig in rigs}
         return RunMetrics(by_rig, self.omissions)
 
 
@@ -205,11 +212,16 @@ def build_metrics(task: Task[FrameDataset], settings: Settings) -> RunMetrics:
     query_cache = FrameQueryCache()
     threshold_m = settings.thresholds_m[0] if settings.thresholds_m else 0.4
     missing, ego_mesh = _find_missing_needs(task.metadata), task.metadata.ego_mesh
-    unmet = {name: PUBLISHED[name].needs & missing for name in settings.metrics}
-    omissions = {name: REASONS[min(needs)] for name, needs in unmet.items() if needs}
-    if len(omissions) == len(settings.metrics):
+    omissions: dict[str, str] = {}
+    by_rig: dict[str, dict[str, FrameMetric]] = {}
+    for name in settings.metrics:
+        unmet = PUBLISHED[name].needs & missing
+        if unmet:
+            omissions[name] = REASONS[min(unmet)]
+        else:
+            by_rig[name] = {}
+    if not by_rig:
         raise ValueError("; ".join(f"metric {name}: {reason}" for name, reason in omissions.items()))
-    by_rig: dict[str, dict[str, FrameMetric]] = {name: {} for name in settings.metrics if name not in omissions}
     for rig in task.metadata.rigs:
         setup = MetricSetup(
             rig_name=rig,
@@ -228,12 +240,13 @@ def build_metrics(task: Task[FrameDataset], settings: Settings) -> RunMetrics:
 
 def _find_missing_needs(metadata: FrameMetadata) -> frozenset[Need]:
     """Find the data that a source of frames does not provide for all of its rigs."""
-    available: dict[Need, bool] = {
-        "sensors": all(metadata.sensors.get(rig) for rig in metadata.rigs),
-        "boxes": metadata.has_boxes,
-        "sensor_point_counts": metadata.sensor_names.keys() >= set(metadata.rigs),
-    }
-    return frozenset(need for need, is_available in available.items() if not is_available)
+    missing: set[Need] = set() if metadata.has_boxes else {"boxes"}
+    for rig in metadata.rigs:
+        if not metadata.sensors.get(rig):
+            missing.add("sensors")
+        if rig not in metadata.sensor_names:
+            missing.add("sensor_point_counts")
+    return frozenset(missing)
 
 
 def compare_metrics(
@@ -265,13 +278,12 @@ def compare_metrics(
 
 def _rank_by_coverage(coverages: Sequence[Coverage], region: Region, band: str, seed: int) -> list[Ranking]:
     """Rank rigs by the coverage numbers of a region and band."""
-    numbers = []
+    numbers, estimates = [], []
     for coverage in coverages:
         (row,) = (row for row in coverage.summary([region]) if row.band == band)
         parameters = {"measure": row.average, "cell_m": coverage.grid.cell_m}
         # The row also has the numbers of other aggregations, which the estimate does not resample.
-        coverage_numbers = [row.numbers[quantity.key] for quantity in coverage.quantities]
-        numbers.append([number._replace(parameters=parameters) for number in coverage_numbers])
-    estimates = [coverage.estimate(region, band) for coverage in coverages]
+        numbers.append([row.numbers[name.key]._replace(parameters=parameters) for name in coverage.quantities])
+        estimates.append(coverage.estimate(region, band))
     ranked = build_rankings(OWN, numbers, estimates, seed)
     return [ranking._replace(name=f"{ranking.name} {region.name} {band}") for ranking in ranked]

@@ -114,10 +114,9 @@ class SMig(FrameMetric):
     def _add_frame(self, frame: Frame) -> None:
         check_cloud(frame.reference, "reference")
         boxes = self.query_cache.get_boxes(frame)
+        inputs = (self.categories, self.grid.region)
         rows = self.query_cache.get_or_compute(
-            frame,
-            ("occupancy", self.categories, self.grid.region),
-            partial(build_occupancy_rows, boxes, frame.block_index, self.categories, self.grid.region),
+            frame, ("occupancy", *inputs), build_occupancy_rows, boxes, frame.block_index, *inputs
         )
         if self.ends_at_hits:
             crossed = mark_crossed_before_hits(self.sensors, frame, self.rig_name, self.grid)

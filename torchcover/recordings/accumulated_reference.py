@@ -201,13 +201,14 @@ class AccumulatedReference:
             if frame != index or sensor not in evaluated_sensors:
                 scans[sensor, frame] = sweeps.get_thinned_scan(recording, sensor, frame)
         window = set(sweeps.find_frames_in_window(recording, index))
-        used = {key: scan for key, scan in scans.items() if key[1] in window}
-        counts = Counter[str](sweeps=sum(not scan.excluded_counts["sweeps_skipped"] for scan in used.values()))
-        if skipped := sweeps.count_skipped_frames(recording, index):
-            counts["sweeps_skipped"] = len(sensors) * skipped
-        for scan in used.values():
-            counts += scan.excluded_counts
-            counts["unlabeled"] += scan.unnamed_object_point_count
+        used: dict[ScanKey, ThinnedScan] = {}
+        counts = Counter[str](sweeps_skipped=len(sensors) * sweeps.count_skipped_frames(recording, index))
+        for key, scan in scans.items():
+            if key[1] in window:
+                used[key] = scan
+                counts["sweeps"] += not scan.excluded_counts["sweeps_skipped"]
+                counts += scan.excluded_counts
+                counts["unlabeled"] += scan.unnamed_object_point_count
         objects = self._place_labeled_objects(recording.read_boxes(index), used.values(), counts)
         local_m = self._collect_unlabeled_points(recording, index, scans, used, votes, counts)
         # Noise and pose errors make the ground a thick layer that would count for more area and occlude what is behind.
@@ -221,12 +222,13 @@ class AccumulatedReference:
         level_m = np.concatenate([transform_points(vehicle_T_local, level_m[first]), *object_points_m])
         # Index of the object of each point; 0 for points of no labeled object.
         part = np.repeat(np.arange(1 + len(objects)), [len(first), *(len(points) for points in object_points_m)])
-        in_ego = _find_points_in_or_below(points_m, recording.ego_box)
-        counts["ego_vehicle"] += len(in_ego)
-        points_m, level_m, part = (
-            np.ascontiguousarray(np.delete(values, in_ego, axis=0)) for values in (points_m, level_m, part)
-        )
         ego_box = recording.ego_box or DEFAULT_EGO_BOX
+        if recording.ego_box is not None:
+            # No other sensor could observe points in or below the vehicle in the frame.
+            in_ego = find_points_in_box(points_m, BoundingBox((*ego_box.lower_m[:2], -np.inf), ego_box.upper_m))
+            counts["ego_vehicle"] += len(in_ego)
+            points_m, level_m = np.delete(points_m, in_ego, axis=0), np.delete(level_m, in_ego, axis=0)
+            part = np.delete(part, in_ego)
         share = estimate_visible_share(level_m, ego_box, self.voxel_m, index, self.params.visibility)
         is_visible = share > 0
         counts["occluded"] = int((~is_visible).sum())
@@ -277,22 +279,25 @@ class AccumulatedReference:
     ) -> Float64:
         """Collect (N, 3) static points, and moving ones where they are in the frame, one per voxel."""
         is_transient = self._mark_transient_points(recording, index, scans)
-        in_free_space = {key: votes[key] >= self.params.min_votes for key in scans}
-        is_dynamic = {key: in_free_space[key] | is_transient[key] for key in scans}
-        counts["rays"] = sum(len(scan.static_points_m) for scan in scans.values() if scan.range_image is not None)
-        counts["free_space"] = sum(int(in_free_space[key].sum()) for key in used)
-        counts["transient"] = sum(int((is_transient[key] & ~in_free_space[key]).sum()) for key in used)
-        dynamic_points_m = {key: scan.static_points_m[is_dynamic[key]] for key, scan in scans.items()}
+        counts["rays"] = counts["free_space"] = counts["transient"] = 0
+        dynamic_points_m: dict[ScanKey, Float64] = {}
+        parts_m, voxel_parts = [], []
+        for key, scan in scans.items():
+            in_free_space = votes[key] >= self.params.min_votes
+            is_dynamic = in_free_space | is_transient[key]
+            dynamic_points_m[key] = scan.static_points_m[is_dynamic]
+            counts["rays"] += 0 if scan.range_image is None else len(scan.static_points_m)
+            if key in used:
+                counts["free_space"] += int(in_free_space.sum())
+                counts["transient"] += int((is_transient[key] & ~in_free_space).sum())
+                parts_m.append(scan.static_points_m[~is_dynamic])
+                voxel_parts.append(scan.voxel_indices[~is_dynamic])
         clusters = self._find_moving_clusters(recording, index, dynamic_points_m)
         counts["moving_objects"] = 0
         for cluster in clusters:
             is_fast = np.linalg.norm(cluster.velocity_mps) > self.params.sweeps.min_object_speed_mps
             counts["moving_objects"] += len(cluster.points_m) >= self.params.min_cluster_points and bool(is_fast)
         cluster_points_m = np.concatenate([np.empty((0, 3)), *(cluster.points_m for cluster in clusters)])
-        parts_m, voxel_parts = [], []
-        for key, scan in used.items():
-            parts_m.append(scan.static_points_m[~is_dynamic[key]])
-            voxel_parts.append(scan.voxel_indices[~is_dynamic[key]])
         local_m = np.concatenate([*parts_m, cluster_points_m])
         voxel_indices = np.concatenate([*voxel_parts, compute_voxel_indices(cluster_points_m, self.voxel_m)])
         # Sorted rows keep the scans that are nearest in time first.
@@ -435,10 +440,3 @@ class AccumulatedReference:
 
     def _get_sensors(self, recording: Recording) -> tuple[str, ...]:
         return tuple(recording.sensors) if self.sensors is None else self.sensors
-
-
-def _find_points_in_or_below(points_m: Float64, ego_box: BoundingBox | None) -> NDArray[np.intp]:
-    """Find the points in or below the vehicle, which no other sensor could observe in the frame."""
-    if ego_box is None:
-        return np.empty(0, np.intp)
-    return find_points_in_box(points_m, BoundingBox((*ego_box.lower_m[:2], -np.inf), ego_box.upper_m))

@@ -5,6 +5,7 @@ Each check reads a few frames and names the remedy. Nothing is corrected unless 
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 import torch
@@ -87,15 +88,18 @@ def check_recording(
     Returns:
         A message with a remedy for each error.
     """
-    sensors = tuple(dict.fromkeys(sensor for rig_sensors in rigs.values() for sensor in rig_sensors))
+    sensors = tuple(dict.fromkeys(chain.from_iterable(rigs.values())))
     if num_frames and (message := check_units(recording, sensors[0], params)) is not None:
         return [f"{recording.path}: {message}"]
     reference_sensors = recording.reference_sensors if isinstance(reference, RecordedReference) else ()
     checked_sensors = tuple(dict.fromkeys((*sensors, *reference_sensors)))
     frames = list(_read_frames(recording, checked_sensors, num_frames, params))
-    clouds = {sensor: [frame.clouds[sensor] for frame in frames] for sensor in checked_sensors}
-    point_counts = [sum(len(cloud) for cloud in clouds[sensor]) for sensor in sensors]
-    densest_sensor = sensors[int(np.argmax(point_counts))]
+    clouds: dict[str, list[Cloud]] = {}
+    point_counts: dict[str, int] = {}
+    for sensor in checked_sensors:
+        clouds[sensor] = [frame.clouds[sensor] for frame in frames]
+        point_counts[sensor] = sum(len(cloud) for cloud in clouds[sensor])
+    densest_sensor = max(sensors, key=point_counts.__getitem__)
     messages = [
         check_ground_offset(clouds, params),
         *(check_mirrored_axis(sensor, frames, params) for sensor in clouds),

@@ -96,16 +96,15 @@ def read_bag_index(path: Path) -> dict[str, NDArray[Any]]:
     """
     with report_bad_file(path, "a bag"), _suggest_repair(path):
         bag = _open_bag(path)
+        empty = np.empty(0, np.int64)
         types: dict[str, str] = {}
+        parts_ns: dict[str, list[NDArray[np.int64]]] = {}
         for reader in bag.readers:
             for connection in reader.connections:
                 types[connection.topic] = str(connection.msgtype)
-        indices = [_index_ros1_bag(reader) if bag.is_ros1 else _index_ros2_bag(reader) for reader in bag.readers]
-        empty = np.empty(0, np.int64)
-        times_ns = []
-        for topic in types:
-            parts_ns = [index.get(topic, empty) for index in indices]
-            times_ns.append(np.sort(np.concatenate([empty, *parts_ns])))
+            for topic, part_ns in (_index_ros1_bag(reader) if bag.is_ros1 else _index_ros2_bag(reader)).items():
+                parts_ns.setdefault(topic, []).append(part_ns)
+        times_ns = [np.sort(np.concatenate([empty, *parts_ns.get(topic, ())])) for topic in types]
         return {
             "topics": np.array(list(types), dtype=str),
             "types": np.array(list(types.values()), dtype=str),
@@ -134,12 +133,10 @@ def read_bag_messages(path: Path, topic: str, start_ns: int | None, stop_ns: int
         messages: list[tuple[int, str, bytes]] = []
         total_bytes = 0
         object_bytes_per_byte = 20  # a message of small fields takes up to 20 times its bytes as Python objects
-        for reader in _open_bag(path).readers:
-            connections = [connection for connection in reader.connections if connection.topic == topic]
-            for connection, time_ns, raw in reader.messages(connections, start_ns, stop_ns) if connections else ():
-                total_bytes += len(raw)
-                check_memory(object_bytes_per_byte * total_bytes)
-                messages.append((time_ns, str(connection.msgtype), bytes(raw)))
+        for connection, time_ns, raw in _iterate_messages(_open_bag(path), topic, start_ns, stop_ns):
+            total_bytes += len(raw)
+            check_memory(object_bytes_per_byte * total_bytes)
+            messages.append((time_ns, str(connection.msgtype), bytes(raw)))
         messages.sort(key=itemgetter(0))
         return {
             "data": np.frombuffer(b"".join(raw for *_, raw in messages), np.uint8),
@@ -168,12 +165,20 @@ def read_header_stamps(path: Path, topic: str, times_ns: list[int] | None) -> di
         stamps: list[tuple[int, int]] = []  # log time, stamp
         intervals = [(None, None)] if times_ns is None else [(time_ns, time_ns + 1) for time_ns in times_ns]
         for start_ns, stop_ns in intervals:
-            for reader in bag.readers:
-                connections = [connection for connection in reader.connections if connection.topic == topic]
-                for _, time_ns, raw in reader.messages(connections, start_ns, stop_ns) if connections else ():
-                    stamps.append((time_ns, _parse_stamp_ns(bytes(raw[:12]), is_ros1=bag.is_ros1)))
+            for _, time_ns, raw in _iterate_messages(bag, topic, start_ns, stop_ns):
+                stamps.append((time_ns, _parse_stamp_ns(bytes(raw[:12]), is_ros1=bag.is_ros1)))
         stamps.sort(key=itemgetter(0))
         return {"stamps_ns": np.array([stamp_ns for _, stamp_ns in stamps], dtype=np.int64)}
+
+
+def _iterate_messages(
+    bag: _OpenBag, topic: str, start_ns: int | None, stop_ns: int | None
+) -> Iterator[tuple[Any, int, bytes]]:
+    """Iterate over connection, log time and bytes of the messages of a topic."""
+    for reader in bag.readers:
+        connections = [connection for connection in reader.connections if connection.topic == topic]
+        if connections:
+            yield from reader.messages(connections, start_ns, stop_ns)
 
 
 def _parse_stamp_ns(raw: bytes, *, is_ros1: bool) -> int:
@@ -251,8 +256,9 @@ def _index_mcap(storage: Any) -> TimesByTopic:  # noqa: ANN401
     counts: Counter[str] = Counter()
     for connection in storage.connections:
         counts[connection.topic] += connection.msgcount
-    if any(count != len(times_ns.get(topic, ())) for topic, count in counts.items()):
-        raise ValueError("the index of its messages is missing or incomplete; `mcap recover` creates one")
+    for topic, count in counts.items():
+        if count != len(times_ns.get(topic, ())):
+            raise ValueError("the index of its messages is missing or incomplete; `mcap recover` creates one")
     return times_ns
 
 

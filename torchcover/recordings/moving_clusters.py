@@ -79,9 +79,11 @@ def find_moving_clusters(
     scans_m, times_s = _join_simultaneous_scans(scans_m, times_s)
     if sum(len(points_m) for points_m in scans_m) < params.min_points or len(scans_m) < 2:
         return []
-    lower_m = np.min([points_m[:, :2].min(axis=0) for points_m in scans_m if len(points_m)], axis=0) - 2 * params.cell_m
-    cells = [((points_m[:, :2] - lower_m) / params.cell_m).astype(np.int64) for points_m in scans_m]
-    shape = np.max([cell.max(axis=0) for cell in cells if len(cell)], axis=0) + 3
+    xy_m = np.concatenate(scans_m)[:, :2]
+    lower_m = xy_m.min(axis=0) - 2 * params.cell_m
+    all_cells = ((xy_m - lower_m) / params.cell_m).astype(np.int64)
+    shape = all_cells.max(axis=0) + 3
+    cells = np.split(all_cells, np.cumsum([len(points_m) for points_m in scans_m])[:-1])
     occupancy = np.stack([_rasterize_occupancy(cell, shape) for cell in cells])
     is_free = [np.ones(len(points_m), np.bool_) for points_m in scans_m]  # points that belong to no object yet
     distance_s = np.abs(times_s)

@@ -3,8 +3,9 @@
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -129,83 +130,6 @@ def check_seconds(
         )
 
 
-class Recording(Protocol):
-    """Logged sensor data with poses; a reader of a format is a class with these members, see `FORMATS`.
-
-    Frames are ordered by time. A reader loads names, times and calibrations when it is created, and scans on request.
-
-    Args:
-        ego_box: Bounding box of the ego vehicle in the vehicle frame; None if unknown. Callers may set it.
-    """
-
-    ego_box: BoundingBox | None
-
-    @property
-    def path(self) -> Path:
-        """Folder or file of the recording."""
-
-    @property
-    def frame_names(self) -> Sequence[str]:
-        """Name of each frame."""
-
-    @property
-    def key_frames(self) -> Sequence[int]:
-        """Ascending indices of the frames to evaluate; the other frames only contribute to the reference."""
-
-    @property
-    def times_s(self) -> Float64 | None:
-        """(F,) ascending times of the frames; None if unknown."""
-
-    @property
-    def sensors(self) -> Sequence[str]:
-        """Names of the sensors on the vehicle."""
-
-    @property
-    def rigs(self) -> Mapping[str, Sequence[str]]:
-        """Default rigs: name and sensors of each."""
-
-    @property
-    def reference_sensors(self) -> Sequence[str]:
-        """Sensors that were recorded as the reference; empty if there are none."""
-
-    @property
-    def has_area_weights(self) -> bool:
-        """True if the scans of the reference sensors have area weights."""
-
-    @property
-    def block_indices(self) -> Sequence[int] | None:
-        """`Frame.block_index` of each frame for standard errors; None: every frame is its own block."""
-
-    def read_scan(self, sensor: str, index: int, /) -> Scan:
-        """Read the scan of a sensor in a frame.
-
-        Raises:
-            OSError: The file is missing.
-            ValueError: The file is invalid.
-        """
-
-    def get_world_T_vehicle(self, index: int, /) -> Matrix | None:
-        """Return the (4, 4) pose of the vehicle in a fixed world frame; None if unknown."""
-
-    def read_boxes(self, index: int, /) -> Boxes | None:
-        """Read the labeled objects of a frame in the vehicle frame; None if the frame has no labels."""
-
-
-class RecordingBase:
-    """Defaults that most formats share: all frames are key frames, and there is no reference sensor."""
-
-    frame_names: Sequence[str]
-    reference_sensors: Sequence[str] = ()
-    has_area_weights = False
-    block_indices: Sequence[int] | None = None
-    ego_box: BoundingBox | None = None
-
-    @property
-    def key_frames(self) -> range:
-        """Indices of all frames."""
-        return range(len(self.frame_names))
-
-
 class SensorCalibrations(NamedTuple):
     """Extrinsics of LiDARs and calibrations of cameras.
 
@@ -215,35 +139,86 @@ class SensorCalibrations(NamedTuple):
         cameras: Cameras with their extrinsics in the vehicle frame.
     """
 
-    source: str
-    mounts: Mapping[str, Matrix]
+    source: str = ""
+    mounts: Mapping[str, Matrix] = {}
     cameras: tuple[Calibration, ...] = ()
 
 
-@runtime_checkable
-class CalibratedRecording(Protocol):
-    """Recording that includes calibrations of its sensors."""
+class Recording:
+    """Logged sensor data with poses; the reader of a format is a subclass, see `FORMATS`.
+
+    Frames are ordered by time. A reader loads names, times and calibrations when it is created, and scans on request.
+
+    Args:
+        path: Folder or file of the recording.
+        frame_names: Name of each frame.
+        times_s: (F,) ascending times of the frames; None if unknown.
+        sensors: Names of the sensors on the vehicle.
+        rigs: Default rigs: name and sensors of each.
+        reference_sensors: Sensors that were recorded as the reference; empty if there are none.
+        has_area_weights: True if the scans of the reference sensors have area weights.
+        block_indices: `Frame.block_index` of each frame for standard errors; None: every frame is its own block.
+        ego_box: Bounding box of the ego vehicle in the vehicle frame; None if unknown. Callers may set it.
+    """
+
+    path: Path
+    frame_names: Sequence[str]
+    times_s: Float64 | None = None
+    sensors: Sequence[str]
+    rigs: Mapping[str, Sequence[str]]
+    reference_sensors: Sequence[str] = ()
+    has_area_weights = False
+    block_indices: Sequence[int] | None = None
+    ego_box: BoundingBox | None = None
+
+    @cached_property
+    def key_frames(self) -> Sequence[int]:
+        """Ascending indices of the frames to evaluate; other frames only contribute to the reference."""
+        return range(len(self.frame_names))
+
+    def read_scan(self, sensor: str, index: int) -> Scan:
+        """Read the scan of a sensor in a frame.
+
+        Args:
+            sensor: Name of the sensor.
+            index: Index of the frame.
+
+        Returns:
+            The scan.
+
+        Raises:
+            OSError: The file is missing.
+            ValueError: The file is invalid.
+        """
+        raise NotImplementedError
+
+    def get_world_T_vehicle(self, index: int) -> Matrix | None:
+        """Return the (4, 4) pose of the vehicle in a fixed world frame; None if unknown."""
+        return None
+
+    def read_boxes(self, index: int) -> Boxes | None:
+        """Read the labeled objects of a frame in the vehicle frame; None if the frame has no labels."""
+        return None
 
     def read_calibrations(self) -> SensorCalibrations:
-        """Read the calibrations; cameras match the images that the data set ships.
+        """Read the calibrations of the sensors, if there are any; cameras match the images that the data set ships.
 
         Raises:
             OSError: A calibration file is missing.
             ValueError: A calibration file is invalid.
         """
-
-
-@runtime_checkable
-class UndistortedRecording(Protocol):
-    """Recording with undistorted or rectified images that includes the original distortion as well."""
+        return SensorCalibrations()
 
     def read_raw_cameras(self) -> tuple[Calibration, ...]:
         """Read the cameras with their distortion before images were undistorted.
 
         Raises:
             OSError: A calibration file is missing.
-            ValueError: A calibration file is invalid.
+            ValueError: A calibration file is invalid, or the recording has no other lenses than those of its images.
         """
+        raise ValueError(
+            f"{self.path}: this recording has one model of each lens, that of its images; leave out --raw-images"
+        )
 
 
 def warn_about_missing_poses(path: Path, frames_without_pose: Sequence[str], num_frames: int) -> None:

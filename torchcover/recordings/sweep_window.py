@@ -156,7 +156,8 @@ class SweepWindow:
         begin = max(jumps[jumps < position] + 1, default=0)
         end = min(jumps[jumps >= position] + 1, default=len(frames))
         frames = frames[begin:end]
-        return [int(frame) for frame in frames[np.argsort(distance_s[frames], kind="stable")]]
+        nearest_first: list[int] = frames[np.argsort(distance_s[frames], kind="stable")].tolist()
+        return nearest_first
 
     def count_skipped_frames(self, recording: Recording, index: int) -> int:
         """Count the frames within the time of a window that discontinuities of the poses exclude.

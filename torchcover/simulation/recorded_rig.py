@@ -18,13 +18,7 @@ from torchcover.geometry import (
 )
 from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.formats.ros import RosBag
-from torchcover.recordings.recording import (
-    GROUND_CLEARANCE_M,
-    CalibratedRecording,
-    Recording,
-    SensorCalibrations,
-    UndistortedRecording,
-)
+from torchcover.recordings.recording import GROUND_CLEARANCE_M, Recording, SensorCalibrations
 from torchcover.simulation.bodies import build_actor_mesh, create_body_shape
 from torchcover.simulation.camera_sensor import MOUNT_T_CAMERA
 from torchcover.simulation.lidar import LidarModel
@@ -67,10 +61,8 @@ def build_rig_document(
         raise ValueError(
             f"{recording.path}: no LiDAR {', '.join(unknown_names)}; the recording has {', '.join(recording.sensors)}"
         )
-    calibrations = SensorCalibrations("", {})
-    if isinstance(recording, CalibratedRecording):
-        calibrations = recording.read_calibrations()
-    cameras = read_raw_cameras(recording) if raw_images else calibrations.cameras
+    calibrations = recording.read_calibrations()
+    cameras = recording.read_raw_cameras() if raw_images else calibrations.cameras
     sentences, sensors = [], []
     for name in lidar_names:
         sensor, source = build_lidar_document(recording, name, calibrations, lidar_models.get(name))
@@ -92,25 +84,6 @@ def build_rig_document(
     # A recording may contain values that no rig can have.
     Rig.model_validate(rig)
     return rig
-
-
-def read_raw_cameras(recording: Recording) -> tuple[Calibration, ...]:
-    """Read the cameras of raw images.
-
-    Args:
-        recording: The recording.
-
-    Returns:
-        Their calibrations.
-
-    Raises:
-        ValueError: The recording has no other lenses than those of its images.
-    """
-    if not isinstance(recording, UndistortedRecording):
-        raise ValueError(
-            f"{recording.path}: this recording has one model of each lens, that of its images; leave out --raw-images"
-        )
-    return recording.read_raw_cameras()
 
 
 def build_ego_box(recording: Recording, vehicle: str | Path) -> BoundingBox:

@@ -47,7 +47,7 @@ def check_records(data: bytes, num_columns: int) -> Float32:
         ValueError: Bytes are left over, or the numbers cannot be coordinates.
     """
     other_format = next((name for start, name in SIGNATURES.items() if data.startswith(start)), None)
-    if other_format is None and all(byte in string.printable.encode() for byte in data[:1024]):
+    if other_format is None and not data[:1024].translate(None, string.printable.encode()):
         other_format = "text (.csv or .xyz?)"
     if other_format is not None:
         raise ValueError(

@@ -89,7 +89,7 @@ def _parse_header(data: bytes) -> tuple[_Header, bytes]:
     lengths = [len(column) for column in (header.fields, header.sizes, header.types, header.counts)]
     if len(set(lengths)) > 1:
         raise ValueError(
-            f"FIELDS, SIZE, TYPE and COUNT of the PCD header differ in length; got {', '.join(map(str, lengths))}; "
+            f"FIELDS, SIZE, TYPE and COUNT of the PCD header differ in length; got {str(lengths)[1:-1]}; "
             "give each field one entry in each line"
         )
     if header.encoding not in ENCODINGS:

@@ -2,7 +2,7 @@
 
 import os
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -108,9 +108,9 @@ def _suggest_subfolders(folder: Path) -> str:
         children: list[Path] = []
         for path in paths:
             children.extend(sorted(path.iterdir()) if path.is_dir() else ())
-        recordings = [path for path in children if _has_known_format(path)]
+        recordings = [str(path) for path in children if _has_known_format(path)]
         if recordings:
-            return f"; name one of those in it: {_format_list([str(path) for path in recordings])}"
+            return f"; name one of those in it: {_format_list(recordings)}"
         paths = children
     return ""
 
@@ -120,10 +120,10 @@ def _has_known_format(path: Path) -> bool:
     return any(recording_format.can_read(path) for recording_format in FORMATS.values())
 
 
-def _format_list(names: Sequence[str], max_names: int = 6) -> str:
-    """Format the first names of a list and the number of others."""
-    text = ", ".join(names[:max_names])
-    return f"{text} and {len(names) - max_names:,} more" if len(names) > max_names else text
+def _format_list(names: Sequence[str]) -> str:
+    """Format the first six names of a list and the number of others."""
+    text = ", ".join(names[:6])
+    return f"{text} and {len(names) - 6:,} more" if len(names) > 6 else text
 
 
 def _find_manifest(path: Path) -> tuple[Path, dict[str, Any]] | None:
@@ -159,46 +159,6 @@ def _check_manifest(recording: Recording, folder_and_manifest: tuple[Path, dict[
     )
 
 
-class ObjectFormat(NamedTuple):
-    """Format whose objects over time can be read without scans.
-
-    Args:
-        can_read: Function that tests a path.
-        read: Function that reads the objects.
-    """
-
-    can_read: Callable[[Path], bool]
-    read: Callable[[Path], RecordedObjects]
-
-
-def _is_xml(path: Path) -> bool:
-    """Test for a CommonRoad scenario by its suffix."""
-    return path.suffix == ".xml"
-
-
-def _is_csv(path: Path) -> bool:
-    """Test for a table of boxes by its suffix."""
-    return path.suffix == ".csv"
-
-
-def _read_box_table(path: Path) -> RecordedObjects:
-    """Read a table of boxes, which has no ego vehicle."""
-    return RecordedObjects(read_box_tracks(path))
-
-
-# Description of each format for messages, and its functions.
-OBJECT_FORMATS = {
-    "tables of nuScenes (a folder with sample_annotation.json)": ObjectFormat(
-        nuscenes.has_objects, nuscenes.read_objects
-    ),
-    "a log of Argoverse 2 (a folder with annotations.feather)": ObjectFormat(
-        argoverse2.has_objects, argoverse2.read_objects
-    ),
-    "a scenario of CommonRoad (.xml)": ObjectFormat(_is_xml, read_commonroad),
-    "a table of boxes (.csv)": ObjectFormat(_is_csv, _read_box_table),
-}
-
-
 def read_objects(path: str | os.PathLike[str], scene: str | None = None) -> RecordedObjects:
     """Read the objects of a recording over time, and the drive of its ego vehicle.
 
@@ -217,18 +177,21 @@ def read_objects(path: str | os.PathLike[str], scene: str | None = None) -> Reco
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(f"{path}: no such file or folder; recorded tracks are needed")
-    if scene is not None:
-        if not nuscenes.has_objects(path):
-            raise ValueError(f"{path}: scene: applies to tables of nuScenes only; leave it out")
+    if nuscenes.has_objects(path):
         return nuscenes.read_objects(path, scene)
-    for object_format in OBJECT_FORMATS.values():
-        if object_format.can_read(path):
-            return object_format.read(path)
-    for recording_format in FORMATS.values():
-        if recording_format.can_read(path):
-            return extract_objects(open_recording(path))
+    if scene is not None:
+        raise ValueError(f"{path}: scene: applies to tables of nuScenes only; leave it out")
+    if argoverse2.has_objects(path):
+        return argoverse2.read_objects(path)
+    if path.suffix == ".xml":
+        return read_commonroad(path)
+    if path.suffix == ".csv":
+        return RecordedObjects(read_box_tracks(path))  # without an ego vehicle
+    if _has_known_format(path):
+        return extract_objects(open_recording(path))
     remedy = f"{find_remedy(path)}; " if find_remedy(path) else ""
     raise ValueError(
-        f"{path}: {remedy}recorded tracks are {'; '.join(OBJECT_FORMATS)}; or a recording with poses and boxes "
-        f"({', '.join(FORMATS)})"
+        f"{path}: {remedy}recorded tracks are tables of nuScenes (a folder with sample_annotation.json); a log of "
+        "Argoverse 2 (a folder with annotations.feather); a scenario of CommonRoad (.xml); a table of boxes (.csv); or "
+        f"a recording with poses and boxes ({', '.join(FORMATS)})"
     )

@@ -26,7 +26,7 @@ from torchcover.recordings.objects import (
     group_by_name,
 )
 from torchcover.recordings.recording import (
-    RecordingBase,
+    Recording,
     Scan,
     SensorCalibrations,
     check_times,
@@ -47,7 +47,7 @@ POSES_FILE = "city_SE3_egovehicle.feather"
 ANNOTATION_FILES = ("annotations.feather", "annotations_with_ego.feather")
 
 
-class Argoverse2(RecordingBase):
+class Argoverse2(Recording):
     """Log with `sensors/lidar/TIME.feather`, `city_SE3_egovehicle.feather` and optional `annotations.feather`.
 
     Clouds are motion-compensated and in the ego frame. Needs `torchcover[av2]`.
@@ -76,12 +76,12 @@ class Argoverse2(RecordingBase):
         if not files:
             raise FileNotFoundError(f"{sweeps}: no sweeps TIME.feather in it")
         self.rigs = {"argoverse2": self.sensors}
-        self._poses, has_pose = self._read_poses(np.array([_parse_time_ns(file) for file in files]))
-        missing = [files[row].stem for row in np.flatnonzero(~has_pose)]
-        warn_about_missing_poses(self.path / POSES_FILE, missing, len(files))
-        self._files = [files[row] for row in np.flatnonzero(has_pose)]
-        self._times_ns = np.array([_parse_time_ns(file) for file in self._files])
-        self.frame_names = tuple(file.stem for file in self._files)
+        times_ns = np.array([_parse_time_ns(file) for file in files])
+        self._poses, has_pose = self._read_poses(times_ns)
+        names = np.array([file.stem for file in files])
+        warn_about_missing_poses(self.path / POSES_FILE, names[~has_pose].tolist(), len(files))
+        self._files, self._times_ns = np.array(files)[has_pose].tolist(), times_ns[has_pose]
+        self.frame_names = tuple(names[has_pose].tolist())
         self.times_s = check_times(self._times_ns * 1e-9, len(self.frame_names), str(sweeps))
 
     @property
@@ -152,7 +152,18 @@ class Argoverse2(RecordingBase):
             cameras = []
             for values in zip(*lenses.values(), strict=True):
                 row = dict(zip(lenses, values, strict=True))
-                cameras.append(_build_camera(row, vehicle_T_ego @ ego_T[str(row["sensor_name"])]))
+                fx, fy, cx, cy, k1, k2, k3 = (float(row[name]) for name in lens_columns[:7])
+                cameras.append(
+                    Calibration(
+                        int(row["width_px"]),
+                        int(row["height_px"]),
+                        *(fx, fy, cx, cy),
+                        model="brown_conrady",
+                        coefficients=(k1, k2, 0.0, 0.0, k3),
+                        vehicle_T_camera=vehicle_T_ego @ ego_T[str(row["sensor_name"])],
+                        name=str(row["sensor_name"]),
+                    )
+                )
         return {name: vehicle_T_ego @ ego_T[name] for name in LASERS}, tuple(cameras)
 
     @cached_property
@@ -231,12 +242,12 @@ def read_objects(path: Path) -> RecordedObjects:
 
 def _build_states(columns: Mapping[str, NDArray[Any]], origin_ns: int) -> list[ObjectState]:
     """Build the states of cuboids in the ego frame at their times, relative to an origin."""
-    sizes_m = zip(*(columns[name].tolist() for name in SIZE_COLUMNS), strict=True)
     times_s, poses = _to_seconds(columns, origin_ns).tolist(), build_poses(columns)
+    sizes_m = np.column_stack([columns[name] for name in SIZE_COLUMNS]).tolist()
     rows = zip(columns["track_uuid"], columns["category"], times_s, poses, sizes_m, strict=True)
     states = []
     for name, category, time_s, pose, size_m in rows:
-        states.append(ObjectState(str(name), time_s, pose, size_m, str(category).lower()))
+        states.append(ObjectState(str(name), time_s, pose, tuple(size_m), str(category).lower()))
     return states
 
 
@@ -257,22 +268,6 @@ def build_poses(columns: Mapping[str, NDArray[Any]]) -> Matrix:
     quaternions = np.column_stack([columns[name] for name in POSE_COLUMNS[:4]])
     positions_m = np.column_stack([columns[name] for name in POSE_COLUMNS[4:]])
     return build_transform(convert_quaternion_to_rotation(quaternions), positions_m)
-
-
-def _build_camera(row: Mapping[str, Any], vehicle_T_camera: Matrix) -> Calibration:
-    """Build a Brown-Conrady camera from a row of intrinsics."""
-    return Calibration(
-        int(row["width_px"]),
-        int(row["height_px"]),
-        float(row["fx_px"]),
-        float(row["fy_px"]),
-        float(row["cx_px"]),
-        float(row["cy_px"]),
-        model="brown_conrady",
-        coefficients=(float(row["k1"]), float(row["k2"]), 0.0, 0.0, float(row["k3"])),
-        vehicle_T_camera=vehicle_T_camera,
-        name=str(row["sensor_name"]),
-    )
 
 
 def _parse_time_ns(path: Path) -> int:

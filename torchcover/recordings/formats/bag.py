@@ -71,12 +71,9 @@ class Bag:
                     f"{path / METADATA}: no such file; `ros2 bag reindex {path}` writes it, or name one file of the bag"
                 )
             check_metadata(path / METADATA)
+            files = [*path.glob("*.db3"), *path.glob("*.mcap")]
         elif not files:
             check_suffix(path)
-        if not files and path.is_dir():
-            for suffix in SUFFIXES.values():
-                files.extend(path.glob(f"*{suffix}"))
-        elif not files:
             files = [path]
         for file in files:
             check_storage(file)
@@ -135,8 +132,11 @@ class Bag:
         Args:
             types: Message types, such as `sensor_msgs/msg/PointCloud2`.
         """
-        topics = [topic for topic, type_name in self.type_by_topic.items() if type_name in types]
-        return sorted(topic for topic in topics if len(self.get_log_times_ns(topic)))
+        topics = []
+        for topic, type_name in sorted(self.type_by_topic.items()):
+            if type_name in types and len(self.get_log_times_ns(topic)):
+                topics.append(topic)
+        return topics
 
     def read_messages(self, topic: str, start_ns: int | None = None, stop_ns: int | None = None) -> list[Any]:
         """Read the messages of a topic with a log time in [start_ns, stop_ns).
@@ -342,9 +342,8 @@ def parse_cloud(
     Raises:
         ValueError: The cloud is inconsistent, or point times are far from its stamp.
     """
-    fields = {field.name: field for field in message.fields}
     time_field = _find_time_field(message) if point_times.unit != "none" else None
-    axes = [fields[axis] for axis in "xyz" if axis in fields]
+    axes = _find_axes(message)
     if len(axes) < 3 or any(field.datatype not in (7, 8) for field in axes):
         names = [f"{field.name} ({FIELD_TYPES.get(field.datatype, field.datatype)})" for field in message.fields]
         raise ValueError(f"fields x, y, z of float32 or float64 are needed; got {', '.join(names) or 'none'}")
@@ -353,7 +352,7 @@ def parse_cloud(
     table = _read_fields(message, [*axes, *optional_fields])
     has_rings = ring_field is not None and ring_field.datatype < 7
     rings = table[ring_field.name].astype(np.int64) if has_rings else None
-    points_m: Points = np.stack([table[axis] for axis in "xyz"], axis=1)
+    points_m: Points = np.column_stack((table["x"], table["y"], table["z"]))
     if points_m.dtype.byteorder == ">":
         points_m = points_m.astype(points_m.dtype.newbyteorder("="))
     stamp_ns = get_stamp_ns(message.header)
@@ -387,9 +386,9 @@ def choose_point_times(
     field, period_s = _find_time_field(message), period_s or params.default_period_s
     if field is None:
         return PointTimes("none", period_s), ""
-    axes = {axis.name: axis for axis in message.fields if axis.name in ("x", "y", "z")}
-    table = _read_fields(message, [field, *axes.values()])
-    points_m = np.stack([table[axis] for axis in "xyz" if axis in axes], axis=1)
+    axes = _find_axes(message)
+    table = _read_fields(message, [field, *axes])
+    points_m = np.stack([table[axis.name] for axis in axes], axis=1)
     is_measured = np.isfinite(points_m).all(axis=1) & (np.abs(points_m) > NO_RETURN_M).any(axis=1)
     stored, stamp_ns = table[field.name][is_measured & np.isfinite(table[field.name])], get_stamp_ns(message.header)
     is_integer = stored.dtype.kind in "iu"
@@ -426,6 +425,12 @@ def _find_field(message: Any, names: Sequence[str]) -> Any:  # noqa: ANN401
     return next((fields[name] for name in names if name in fields), None)
 
 
+def _find_axes(message: Any) -> list[Any]:  # noqa: ANN401
+    """Find the fields x, y and z that a cloud has."""
+    fields = {field.name: field for field in message.fields}
+    return [fields[axis] for axis in "xyz" if axis in fields]
+
+
 def _find_time_field(message: Any) -> Any:  # noqa: ANN401
     """Find the field of point times under the names that drivers use."""
     return _find_field(message, ("t", "time", "timestamp", "time_stamp", "offset_time", "time_offset"))
@@ -449,18 +454,16 @@ def _read_fields(message: Any, fields: list[Any]) -> NDArray[Any]:  # noqa: ANN4
             "the cloud"
         )
     byte_order = ">" if message.is_bigendian else "<"
-    types = [byte_order + FIELD_TYPES.get(field.datatype, "V1") for field in fields]
-    ends = [field.offset + np.dtype(type_code).itemsize for field, type_code in zip(fields, types, strict=True)]
-    if max(ends) > point_bytes or any("V" in type_code for type_code in types):
-        raise ValueError(f"fields within the {point_bytes} bytes of a point are needed; one ends at byte {max(ends)}")
-    layout = np.dtype(
-        {
-            "names": [field.name for field in fields],
-            "formats": types,
-            "offsets": [int(field.offset) for field in fields],
-            "itemsize": point_bytes,
-        }
-    )
+    names, types, offsets, end = [], [], [], 0
+    for field in fields:
+        type_code = byte_order + FIELD_TYPES.get(field.datatype, "V1")
+        names.append(field.name)
+        types.append(type_code)
+        offsets.append(int(field.offset))
+        end = max(end, offsets[-1] + np.dtype(type_code).itemsize)
+    if end > point_bytes or "V" in "".join(types):
+        raise ValueError(f"fields within the {point_bytes} bytes of a point are needed; one ends at byte {end}")
+    layout = np.dtype({"names": names, "formats": types, "offsets": offsets, "itemsize": point_bytes})
     grid = np.ndarray((height, width), layout, data, strides=(row_bytes, point_bytes))
     return grid.reshape(-1)
 

@@ -3,6 +3,7 @@
 import math
 import os
 import warnings
+from itertools import compress
 from pathlib import Path
 from typing import Annotated, ClassVar, Self
 
@@ -27,7 +28,7 @@ from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.clouds import read_cloud
 from torchcover.recordings.formats.folder import BOX_FOLDER, POSES_FILE, REFERENCE
 from torchcover.recordings.formats.frame_files import check_same_names, find_frame_files, find_frame_rows
-from torchcover.recordings.recording import GROUND_CLEARANCE_M, RecordingBase, Scan, check_times
+from torchcover.recordings.recording import GROUND_CLEARANCE_M, Recording, Scan, check_times
 
 # Blueprints of sensors that are read.
 LIDAR_TYPES = ("sensor.lidar.ray_cast", "sensor.lidar.ray_cast_semantic")
@@ -220,9 +221,7 @@ def read_carla_boxes(path: Path, vehicle_T_world: Matrix) -> Boxes:
     """
     table = read_csv(path, (*POSE_COLUMNS, *EXTENT_COLUMNS), ("id", "category"), VELOCITY_COLUMNS)
     has_size = np.all([table.numbers[name] > 0 for name in EXTENT_COLUMNS], axis=0)
-    rows = np.flatnonzero(has_size)
-    texts = {name: tuple(column[row] for row in rows) for name, column in table.texts.items()}
-    numbers, count = {name: column[has_size] for name, column in table.numbers.items()}, len(rows)
+    numbers, count = {name: column[has_size] for name, column in table.numbers.items()}, int(has_size.sum())
     if count < len(has_size):
         empty = int(np.argmin(has_size))
         extent = ", ".join(f"{name} {table.numbers[name][empty]:g}" for name in EXTENT_COLUMNS)
@@ -240,8 +239,8 @@ def read_carla_boxes(path: Path, vehicle_T_world: Matrix) -> Boxes:
         return Boxes.from_rows(
             build_upright_rows(poses[:, :3, 3], size_m, poses[:, :3, 0], vehicle_T_world),
             velocity_mps=torch.from_numpy(velocity_mps).float(),
-            ids=texts["id"],
-            categories=texts["category"],
+            ids=tuple(compress(table.texts["id"], has_size)),
+            categories=tuple(compress(table.texts["category"], has_size)),
         )
 
 
@@ -258,7 +257,7 @@ def to_right_handed(pose: list[float] | list[NDArray[np.float64]]) -> Matrix:
     return build_transform(convert_euler_to_rotation(-yaw, -pitch, roll), np.stack([x, -y, z], axis=-1))
 
 
-class Carla(RecordingBase):
+class Carla(Recording):
     """Folder with `sensors.json` and `ID/FRAME.ply` (or `.npy`; `.png` of a depth camera) of each of its sensors.
 
     All data are in CARLA's left-handed axes. `sensors.json` (or `.yaml`) is the list that an agent of CARLA's
@@ -293,18 +292,26 @@ class Carla(RecordingBase):
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
-        existing = [file for file in _list_sensor_files(self.path) if file.exists()]
-        sensors = read_carla_sensors(existing[0] if existing else self.path / SENSORS_FILES[0])
+        json_file, yaml_file = _list_sensor_files(self.path)
+        sensors = read_carla_sensors(yaml_file if yaml_file.exists() and not json_file.exists() else json_file)
         vehicle_file = self.path / "vehicle.json"
         vehicle = read_carla_vehicle(vehicle_file) if vehicle_file.exists() else None
         self.ego_box = None if vehicle is None else vehicle.ego_box
         self._vehicle_T_actor = np.eye(4) if vehicle is None else vehicle.vehicle_T_actor
-        self._mounts = {sensor.id: self._vehicle_T_actor @ sensor.parent_T_sensor for sensor in sensors}
-        self._cameras = {sensor.id: sensor.camera for sensor in sensors if sensor.camera is not None}
+        self._mounts, self._cameras, self._files = (
+            dict[str, Matrix](),
+            dict[str, Camera](),
+            dict[str, dict[str, Path]](),
+        )
+        for sensor in sensors:
+            self._mounts[sensor.id] = self._vehicle_T_actor @ sensor.parent_T_sensor
+            if sensor.camera is not None:
+                self._cameras[sensor.id] = sensor.camera
+            folder, is_depth = self.path / sensor.id, sensor.camera is not None
+            self._files[sensor.id] = find_frame_files(folder, ignored_files=(POSES_FILE,), is_depth=is_depth)
+        self.reference_sensors = (REFERENCE,) if REFERENCE in self._mounts else ()
         self.sensors = tuple(name for name in self._mounts if name != REFERENCE)
         self.rigs = {"carla": self.sensors}
-        self.reference_sensors = (REFERENCE,) if REFERENCE in self._mounts else ()
-        self._files = {name: self._find_files(name) for name in self._mounts}
         self._has_boxes = (self.path / BOX_FOLDER).is_dir()
         files_by_folder = dict(self._files)
         if self._has_boxes:
@@ -405,10 +412,6 @@ class Carla(RecordingBase):
     def _get_pose(self, number: int) -> Matrix | None:
         """Get the vehicle pose of a file; None without `poses.csv`."""
         return None if self._poses is None else self._poses[number] @ invert(self._vehicle_T_actor)
-
-    def _find_files(self, sensor: str) -> dict[str, Path]:
-        """Find the clouds or depth images of a sensor."""
-        return find_frame_files(self.path / sensor, ignored_files=(POSES_FILE,), is_depth=sensor in self._cameras)
 
     def _warn_about_sectors(self, sensors: list[CarlaSensor]) -> None:
         """Warn about rotating LiDARs whose first file covers only a sector."""

@@ -19,7 +19,7 @@ from torchcover.recordings.formats.frame_files import (
     make_natural_sort_key,
     read_boxes,
 )
-from torchcover.recordings.recording import RecordingBase, Scan, check_times
+from torchcover.recordings.recording import Recording, Scan, check_times
 
 # Files and folders of a recording next to its clouds.
 SETTINGS_FILE = "frames.yaml"
@@ -155,7 +155,7 @@ def _build_ego_box(vehicle: _VehicleEntry) -> BoundingBox:
         raise ValueError(f"vehicle: {error}") from error
 
 
-class FolderRecording(RecordingBase):
+class FolderRecording(Recording):
     """Folder with `sensor/FRAME.*` in natural order (frame2 before frame10) and optional files.
 
     Several sensors of one rig are in `sensors/NAME/FRAME.*`, several rigs in `rigs/NAME/FRAME.*`. Clouds have any

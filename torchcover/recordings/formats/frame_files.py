@@ -125,8 +125,9 @@ def make_natural_sort_key(name: str) -> tuple[list[str | int], str]:
         The parts of the name, and the name itself to break ties.
     """
     # Text and number alternate, starting with text, so that two keys are always comparable.
-    parts = re.split(r"(\d+)", name)
-    return [int(part) if position % 2 else part for position, part in enumerate(parts)], name
+    parts: list[str | int] = [*re.split(r"(\d+)", name)]
+    parts[1::2] = [int(part) for part in parts[1::2]]
+    return parts, name
 
 
 def _parse_number(name: str) -> tuple[int, str]:
@@ -134,14 +135,13 @@ def _parse_number(name: str) -> tuple[int, str]:
     return int(name), name
 
 
-def format_names(names: Sequence[str], max_names: int = 5) -> str:
-    """Format the first of many names for a message.
+def format_names(names: Sequence[str]) -> str:
+    """Format the first five of many names for a message; an ellipsis stands for the others.
 
     Args:
         names: Names.
-        max_names: Number of names to show; the others become an ellipsis.
     """
-    return ", ".join(names) if len(names) <= max_names else ", ".join([*names[:max_names], "..."])
+    return ", ".join(names if len(names) <= 5 else [*names[:5], "..."])
 
 
 class PoseTable:
@@ -168,7 +168,13 @@ class PoseTable:
             columns = {name: values[order] for name, values in table.numbers.items()}
             self._positions_m = np.column_stack([columns[name] for name in POSITION_COLUMNS])
             self._wxyz = np.column_stack([columns[name] for name in QUATERNION_COLUMNS])
-            self._check_norms(frame_names)
+            norms = np.linalg.norm(self._wxyz, axis=1)
+            bad = np.flatnonzero(~(np.abs(norms - 1) <= RIGID_TOLERANCE))
+            if len(bad):
+                raise ValueError(
+                    f"frame {frame_names[bad[0]]}: qw, qx, qy, qz: the quaternion of a rotation has norm 1; got "
+                    f"{norms[bad[0]]:.6g}; {len(bad)} of {len(frame_names)} frames have such quaternions"
+                )
             self.block_indices: list[int] | None = None
             if "block_index" in columns:
                 self.block_indices = _to_integers("block_index", columns["block_index"])
@@ -177,16 +183,6 @@ class PoseTable:
     def __getitem__(self, index: int) -> Matrix:
         """Return the (4, 4) pose of a frame."""
         return build_transform(convert_quaternion_to_rotation(self._wxyz[index]), self._positions_m[index])
-
-    def _check_norms(self, names: Sequence[str]) -> None:
-        """Check that all quaternions have norm 1."""
-        norms = np.linalg.norm(self._wxyz, axis=1)
-        bad = np.flatnonzero(~(np.abs(norms - 1) <= RIGID_TOLERANCE))
-        if len(bad):
-            raise ValueError(
-                f"frame {names[bad[0]]}: qw, qx, qy, qz: the quaternion of a rotation has norm 1; got "
-                f"{norms[bad[0]]:.6g}; {len(bad)} of {len(names)} frames have such quaternions"
-            )
 
 
 def read_boxes(path: Path) -> Boxes:

@@ -17,7 +17,7 @@ from torchcover.geometry import BoundingBox, build_transform, check_rigid, conve
 from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.clouds import read_cloud
 from torchcover.recordings.formats.frame_files import check_same_names, find_frame_files
-from torchcover.recordings.recording import RecordingBase, Scan, SensorCalibrations
+from torchcover.recordings.recording import Recording, Scan, SensorCalibrations
 
 # Semi-major axis of the WGS84 ellipsoid, as in the development kit.
 EARTH_RADIUS_M = 6_378_137.0
@@ -298,7 +298,7 @@ def read_timestamps(path: Path, frame_numbers: Sequence[int]) -> NDArray[np.date
         raise ValueError(f"lines of date and time are needed: {error}") from error
 
 
-class KittiObject(RecordingBase):
+class KittiObject(Recording):
     """3D object benchmark with `velodyne/FRAME.bin`, `calib/FRAME.txt` and optional `label_2/FRAME.txt`.
 
     Frames are not consecutive, so no reference can be accumulated; an additional folder `reference/FRAME.*` may hold
@@ -314,7 +314,6 @@ class KittiObject(RecordingBase):
 
     layout: ClassVar[str] = "velodyne/FRAME.bin, calib/FRAME.txt, label_2/FRAME.txt"
     sensors = ("velodyne",)
-    times_s = None
     ego_box: BoundingBox | None = BODY
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -350,9 +349,6 @@ class KittiObject(RecordingBase):
         """
         path = (self._references if sensor == "reference" else self._clouds)[self.frame_names[index]]
         return Scan(read_cloud(path), vehicle_T_velodyne, str(path))
-
-    def get_world_T_vehicle(self, index: int) -> None:
-        """Return None, since the benchmark has no poses."""
 
     def read_calibrations(self) -> SensorCalibrations:
         """Read the rectified cameras of the first frame; their sizes are those of its images, if there are any."""

@@ -35,7 +35,7 @@ from torchcover.recordings.formats.kitti import (
     vehicle_T_velodyne,
 )
 from torchcover.recordings.recording import (
-    RecordingBase,
+    Recording,
     Scan,
     SensorCalibrations,
     check_times,
@@ -43,7 +43,7 @@ from torchcover.recordings.recording import (
 )
 
 
-class KittiRaw(RecordingBase):
+class KittiRaw(Recording):
     """Drive `DATE/DATE_drive_NUMBER_sync` with `velodyne_points`, `oxts` and optional `tracklet_labels.xml`.
 
     Calibrations are in the folder `DATE`.
@@ -217,17 +217,12 @@ def read_tracklets(path: Path, vehicle_T_velodyne: Matrix) -> dict[int, Boxes]:
 
 def _build_boxes(entries: list[tuple[list[float], str, str]], vehicle_T_velodyne: Matrix) -> Boxes:
     """Build boxes in the vehicle frame from rows in the LiDAR frame with name and category."""
-    rows = np.array([row for row, _, _ in entries])
+    row_list, ids, categories = zip(*entries, strict=True)
+    rows, zeros = np.array(row_list), np.zeros(len(entries))
     rows[:, :3] = transform_points(vehicle_T_velodyne, rows[:, :3])
-    rotations = [
-        vehicle_T_velodyne[:3, :3] @ convert_euler_to_rotation(np.rad2deg(yaw), 0.0, 0.0) for yaw in rows[:, 6]
-    ]
-    rows[:, 6] = np.deg2rad(convert_rotation_to_euler(np.stack(rotations))[:, 0])
-    return Boxes.from_rows(
-        torch.from_numpy(rows).float(),
-        ids=tuple(name for _, name, _ in entries),
-        categories=tuple(category for _, _, category in entries),
-    )
+    rotations = vehicle_T_velodyne[:3, :3] @ convert_euler_to_rotation(np.rad2deg(rows[:, 6]), zeros, zeros)
+    rows[:, 6] = np.deg2rad(convert_rotation_to_euler(rotations)[:, 0])
+    return Boxes.from_rows(torch.from_numpy(rows).float(), ids=ids, categories=categories)
 
 
 def _parse_number(element: ElementTree.Element, name: str) -> float:

@@ -1,7 +1,7 @@
 """nuScenes data set (Caesar et al., CVPR 2020): sweeps and key frames of the roof LiDAR, and annotations."""
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
 from operator import itemgetter
@@ -25,7 +25,7 @@ from torchcover.recordings.objects import (
     build_track,
     group_by_name,
 )
-from torchcover.recordings.recording import Scan, SensorCalibrations, check_times
+from torchcover.recordings.recording import Recording, Scan, SensorCalibrations, check_times
 
 # The ego frame is on the ground below the rear axle; the center of a Renault Zoe is 1.385 m in front of it. The rig
 # `nuscenes` names the source.
@@ -34,32 +34,28 @@ vehicle_T_ego = build_transform(np.eye(3), [-1.385, 0.0, 0.0])
 CHANNEL = "LIDAR_TOP"
 
 
-class NuScenes:
+class NuScenes(Recording):
     """Data set with `v1.0-*/` tables, `samples/` and `sweeps/`; other sweeps only contribute to the reference.
 
     Args:
         path: Data set, or its folder of tables.
-        scenes: Names of scenes, such as `scene-0061`; None for all.
 
     Raises:
         FileNotFoundError: A table is missing.
-        ValueError: A table is invalid, a token or scene is unknown, a path leaves the data set, or no key frame exists.
+        ValueError: A table is invalid, a token is unknown, a path leaves the data set, or no key frame exists.
     """
 
     layout: ClassVar[str] = "v1.0-*/*.json, samples/LIDAR_TOP, sweeps/LIDAR_TOP"
     sensors = (CHANNEL,)
-    reference_sensors = ()
-    has_area_weights = False
-    block_indices = None
     # Outline of 4.08 x 1.73 m, up to a little above the LiDAR.
     ego_box: BoundingBox | None = BoundingBox((-2.042, -0.865, 0.05), (2.042, 0.865, 2.04))
 
-    def __init__(self, path: str | os.PathLike[str], scenes: Sequence[str] | None = None) -> None:
+    def __init__(self, path: str | os.PathLike[str]) -> None:
         tables = _find_tables(Path(path))
         self.path = tables.parent
         self.rigs = {"nuscenes": self.sensors}
         with report_bad_file(tables, "tables of nuScenes"):  # rows may lack a column or have invalid numbers
-            self._read_tables(tables, scenes)
+            self._read_tables(tables)
 
     @classmethod
     def can_read(cls, path: Path) -> bool:
@@ -97,13 +93,13 @@ class NuScenes:
         """Read the extrinsics of the LiDAR and the cameras of its first key frame."""
         with report_bad_file(self._tables, "tables of nuScenes"):
             sample_token = self._sample_tokens[self.key_frames[0]]
-            rows = []
+            rows = {}
             for row in read_json_table(self._tables / "sample_data.json").rows:
                 is_in_frame = row["sample_token"] == sample_token and row["is_key_frame"]
                 if is_in_frame and "/CAM_" in str(row["filename"]):
-                    rows.append(row)
+                    rows[str(row["filename"])] = row
             cameras = []
-            for row in sorted(rows, key=_get_file_name):
+            for _, row in sorted(rows.items()):
                 camera = read_nuscenes(
                     self._tables,
                     Path(row["filename"]).parent.name,
@@ -116,9 +112,13 @@ class NuScenes:
         source = f"calibrated_sensor.json for {self.frame_names[self.key_frames[0]]}"
         return SensorCalibrations(source, {CHANNEL: vehicle_T_ego @ self._mounts[self.key_frames[0]]}, tuple(cameras))
 
-    def _read_tables(self, tables: Path, scenes: Sequence[str] | None) -> None:
+    def _read_tables(self, tables: Path) -> None:
         """Read names, times, poses and extrinsics of all sweeps."""
-        samples = self._read_sample_times(tables, scenes)
+        scene_tokens = {row["token"] for row in read_json_table(tables / "scene.json").rows}
+        samples = {}
+        for row in read_json_table(tables / "sample.json").rows:
+            if row["scene_token"] in scene_tokens:
+                samples[row["token"]] = row["timestamp"] * 1e-6
         poses = read_json_table(tables / "ego_pose.json")
         calibrations = read_json_table(tables / "calibrated_sensor.json")
         data = []
@@ -147,16 +147,6 @@ class NuScenes:
         """Annotations of all key frames, read on first use."""
         with report_bad_file(self._tables, "annotations of nuScenes"):
             return ObjectInterpolator(_read_states(self._tables, self._sample_times))
-
-    def _read_sample_times(self, tables: Path, scenes: Sequence[str] | None) -> dict[str, float]:
-        """Read token and time in seconds of the key frames of the requested scenes."""
-        by_name = {row["name"]: row["token"] for row in read_json_table(tables / "scene.json").rows}
-        unknown = set(scenes or ()) - by_name.keys()
-        if unknown:
-            raise ValueError(f"no scene {', '.join(sorted(unknown))}; there are {', '.join(sorted(by_name))}")
-        scene_tokens = {token for name, token in by_name.items() if scenes is None or name in scenes}
-        rows = read_json_table(tables / "sample.json").rows
-        return {row["token"]: row["timestamp"] * 1e-6 for row in rows if row["scene_token"] in scene_tokens}
 
 
 def has_objects(path: Path) -> bool:
@@ -242,11 +232,6 @@ def _find_class(category: str) -> str | None:
         if category.lower().startswith(prefix):
             return vehicle_class
     return None
-
-
-def _get_file_name(row: Mapping[str, Any]) -> str:
-    """Get the file name of a row, which sorts cameras by channel."""
-    return str(row["filename"])
 
 
 def parse_pose(row: dict[str, Any]) -> Matrix:

@@ -32,7 +32,7 @@ from torchcover.recordings.formats.ros_poses import (
     read_static_transforms,
 )
 from torchcover.recordings.isolated_readers import METADATA, find_ros1_files
-from torchcover.recordings.recording import NO_RETURN_M, RecordingBase, Scan, SensorCalibrations, check_times
+from torchcover.recordings.recording import NO_RETURN_M, Recording, Scan, SensorCalibrations, check_times
 
 # Topics of this type are sensors.
 CLOUD_TYPE = "sensor_msgs/msg/PointCloud2"
@@ -63,7 +63,7 @@ class BagParams:
     time_resolution_s: float = 1e-5
 
 
-class RosBag(RecordingBase):
+class RosBag(Recording):
     """Recording in a ROS bag: folder with `metadata.yaml`, folder with `.bag` files, or one file of a bag.
 
     Sensors are the topics of `PointCloud2`, named without the leading slash, whose frame is fixed to the vehicle frame
@@ -139,7 +139,7 @@ class RosBag(RecordingBase):
                     "nodes send them? Record the bag again with one of them"
                 )
             first = self.sensors[0]
-            self.frame_names = tuple(str(log_time_ns) for log_time_ns in self._log_times_ns[first])
+            self.frame_names = tuple(self._log_times_ns[first].astype(str).tolist())
             times_s = np.asarray((self._stamps_ns[first] - self._stamps_ns[first][0]) * 1e-9)
             self.times_s = check_times(times_s, len(self.frame_names), f"stamps of {first}")
 
@@ -154,7 +154,7 @@ class RosBag(RecordingBase):
             return True
         if not path.is_dir():
             return path.suffix in SUFFIXES.values()
-        return (path / METADATA).exists() and any(any(path.glob(f"*{suffix}*")) for suffix in SUFFIXES.values())
+        return (path / METADATA).exists() and any([*path.glob("*.db3*"), *path.glob("*.mcap*")])
 
     def read_scan(self, sensor: str, index: int) -> Scan:
         """Read a cloud and compensate the motion of the vehicle to the time of the frame if poses are known.
@@ -197,9 +197,6 @@ class RosBag(RecordingBase):
         """Read the extrinsics of the sensors."""
         return SensorCalibrations(f"transforms to {self.vehicle_frame}", self._mounts)
 
-    def read_boxes(self, index: int) -> None:
-        """Return None, since bags have no labels."""
-
     def _find_cloud_frames(self) -> dict[str, str]:
         """Find the topics of frequent clouds with their frames; the topic with the fewest clouds comes first."""
         topics = self._bag.list_topics(CLOUD_TYPE)
@@ -225,20 +222,27 @@ class RosBag(RecordingBase):
         if unknown:
             known = ", ".join(topic.removeprefix("/") for topic in frames)
             raise ValueError(f"mount of {', '.join(unknown)}: there are clouds of {known}")
-        for name, mount in user_mounts.items():
-            tree.add(self.vehicle_frame, frames[self._get_topic(name)], mount)
-        mounts = {topic: tree.lookup_transform(self.vehicle_frame, frame) for topic, frame in frames.items()}
-        mounts |= {self._get_topic(name): mount for name, mount in user_mounts.items()}
-        missing = [f"{topic} ({frames[topic]})" for topic, mount in mounts.items() if mount is None]
+        mounts_by_topic = {self._get_topic(name): mount for name, mount in user_mounts.items()}
+        for topic, user_mount in mounts_by_topic.items():
+            tree.add(self.vehicle_frame, frames[topic], user_mount)
+        transforms = tree.find_transforms(self.vehicle_frame)
+        mounts: dict[str, Matrix] = {}
+        missing = []
+        for topic, frame in frames.items():
+            mount = mounts_by_topic.get(topic, transforms.get(frame))
+            if mount is None:
+                missing.append(f"{topic} ({frame})")
+            else:
+                mounts[topic.removeprefix("/")] = mount
         fault = f"no static transform links to {self.vehicle_frame} the frame of {', '.join(missing)}"
-        if len(missing) == len(mounts):
+        if not mounts:
             raise ValueError(
                 f"{fault}; static ones are of {', '.join(sorted(tree.frames)) or 'no frames'}: name the vehicle's "
                 "(--set recording.vehicle_frame=NAME), or give mounts (recording.yaml)"
             )
         if missing:
             self._warn(f"excluded, since {fault}")
-        return {topic.removeprefix("/"): mount for topic, mount in mounts.items() if mount is not None}
+        return mounts
 
     def _pair_scans(self) -> None:
         """Pair each scan of the first sensor with the scan of every other sensor that is nearest by stamp."""
@@ -300,8 +304,9 @@ class RosBag(RecordingBase):
             raise ValueError(
                 f"no scan lies between the first and the last pose of {self._poses.source}; do the clocks match?"
             )
-        self._log_times_ns = {sensor: times_ns[has_pose] for sensor, times_ns in self._log_times_ns.items()}
-        self._stamps_ns = {sensor: times_ns[has_pose] for sensor, times_ns in self._stamps_ns.items()}
+        for sensor in self.sensors:
+            self._log_times_ns[sensor] = self._log_times_ns[sensor][has_pose]
+            self._stamps_ns[sensor] = self._stamps_ns[sensor][has_pose]
 
     def _warn(self, message: str) -> None:
         """Warn with the path of the bag before the message."""

@@ -84,7 +84,7 @@ class FrameTree:
             child: Child frame.
             parent_T_child: (4, 4) transform.
         """
-        if self.lookup_transform(parent, child) is None:
+        if child not in self.find_transforms(parent):
             self._insert((parent, child), parent_T_child)
 
     def remove_edges(self, edges: Container[Edge]) -> "FrameTree":
@@ -98,14 +98,6 @@ class FrameTree:
             if edge not in edges:
                 tree._insert(edge, mount)
         return tree
-
-    def find_mounted_frames(self, frame: str) -> set[str]:
-        """Find all frames that are connected to a frame, including itself.
-
-        Args:
-            frame: Name of the frame.
-        """
-        return set(self._find_transforms(frame))
 
     @property
     def frames(self) -> set[str]:
@@ -128,17 +120,23 @@ class FrameTree:
             else:
                 yield parent, invert(parent_T_child)
 
-    def lookup_transform(self, destination: str, source: str) -> Matrix | None:
-        """Look up the transform between two frames.
+    def find_transforms(self, frame: str) -> dict[str, Matrix]:
+        """Find the frames that are connected to a frame, including itself, by breadth-first search.
 
         Args:
-            destination: Frame of the result.
-            source: Frame of the points.
+            frame: Name of the frame.
 
         Returns:
-            (4, 4) `destination_T_source`; None if the frames are not connected.
+            Name of each frame and the (4, 4) `frame_T_other`.
         """
-        return self._find_transforms(destination).get(source)
+        transforms = {frame: np.eye(4)}
+        queue = [frame]
+        for current in queue:
+            for neighbor, current_T_neighbor in self.list_neighbors(current):
+                if neighbor not in transforms:
+                    transforms[neighbor] = transforms[current] @ current_T_neighbor
+                    queue.append(neighbor)
+        return transforms
 
     def find_clashes(self, frame: str) -> list[str]:
         """Find transforms that contradict the used paths to a frame.
@@ -153,7 +151,7 @@ class FrameTree:
         for (parent, child), earlier in self._replaced.items():
             difference = _format_difference(earlier, self._mounts[parent, child])
             clashes.append(f"{parent} -> {child} is sent with two values, {difference} apart: the later one is used")
-        transforms = self._find_transforms(frame)
+        transforms = self.find_transforms(frame)
         for (parent, child), mount in self._mounts.items():
             if len(clashes) >= 3:
                 break
@@ -161,23 +159,14 @@ class FrameTree:
                 continue
             used = invert(transforms[parent]) @ transforms[child]
             if np.abs(used - mount).max() > MOUNT_TOLERANCE:
-                other_parents = [edge[0] for edge in self._mounts if edge[1] == child and edge[0] != parent]
-                used_edges = " and ".join(f"{other_parent} -> {child}" for other_parent in other_parents)
-                used_edges = used_edges or f"the other transforms from {frame} on"
+                used_edges = []
+                for other_parent, other_child in self._mounts:
+                    if other_child == child and other_parent != parent:
+                        used_edges.append(f"{other_parent} -> {child}")
+                used_path = " and ".join(used_edges) or f"the other transforms from {frame} on"
                 difference = _format_difference(used, mount)
-                clashes.append(f"{parent} -> {child} is not used: it is {difference} off {used_edges}")
+                clashes.append(f"{parent} -> {child} is not used: it is {difference} off {used_path}")
         return clashes[:3]
-
-    def _find_transforms(self, frame: str) -> dict[str, Matrix]:
-        """Find the frames connected to a frame by breadth-first search, and `frame_T_other` of each."""
-        transforms = {frame: np.eye(4)}
-        queue = [frame]
-        for current in queue:
-            for neighbor, current_T_neighbor in self.list_neighbors(current):
-                if neighbor not in transforms:
-                    transforms[neighbor] = transforms[current] @ current_T_neighbor
-                    queue.append(neighbor)
-        return transforms
 
 
 def check_transform_count(edges: Sized) -> None:
@@ -203,11 +192,12 @@ def normalize_frame_id(frame_id: str) -> str:
     return str(frame_id).removeprefix("/")
 
 
-def parse_edge(message: Any) -> tuple[Edge, Matrix]:  # noqa: ANN401  (of a type that rosbags creates)
+def parse_edge(message: Any, source: str = "") -> tuple[Edge, Matrix]:  # noqa: ANN401  (of a type that rosbags creates)
     """Parse a message `TransformStamped`.
 
     Args:
         message: Message of rosbags.
+        source: Prefix of messages.
 
     Returns:
         Parent and child frame, and the (4, 4) `parent_T_child`.
@@ -216,7 +206,7 @@ def parse_edge(message: Any) -> tuple[Edge, Matrix]:  # noqa: ANN401  (of a type
         ValueError: Coordinates are not finite, or the quaternion is 0.
     """
     parent, child = normalize_frame_id(message.header.frame_id), normalize_frame_id(message.child_frame_id)
-    return (parent, child), parse_pose(message.transform.translation, message.transform.rotation, child)
+    return (parent, child), parse_pose(message.transform.translation, message.transform.rotation, f"{source}{child}")
 
 
 def parse_pose(translation: Any, rotation: Any, name: str) -> Matrix:  # noqa: ANN401  (of types that rosbags creates)
@@ -328,37 +318,29 @@ class VehiclePoses:
         topic: Topic of odometry, transforms or poses.
         links: Transforms from the world to the vehicle: keys of `build_pose_series`, or static (4, 4) transforms.
         source: Description of the topic, for messages.
-        params: Limits of interpolation.
     """
 
-    def __init__(
-        self,
-        bag: Bag,
-        topic: str,
-        links: Sequence[Edge | Matrix],
-        source: str,
-        params: PoseSeriesParams = PoseSeriesParams(),
-    ) -> None:
+    def __init__(self, bag: Bag, topic: str, links: Sequence[Edge | Matrix], source: str) -> None:
         self.source = source
-        self._bag, self._topic, self._links, self._params = bag, topic, links, params
+        self._bag, self._topic, self._links = bag, topic, links
         log_times_ns = bag.get_log_times_ns(topic)
         self._window_ns = WINDOW_NS
         self._cached: tuple[int, Mapping[Edge, PoseSeries]] = (-1, {})  # log time, series around it
-        first, last = (self._read_series(int(log_times_ns[end])) for end in (0, -1))
-        moving = [link for link in links if isinstance(link, tuple)]
-        start_ns = max(int(first[link].times_ns[0]) for link in moving)
-        stop_ns = min(int(last[link].times_ns[-1]) if link in last else 0 for link in moving)
+        first, last = self._read_series(int(log_times_ns[0])), self._read_series(int(log_times_ns[-1]))
+        starts_ns, stops_ns, self.max_disagreement_m = list[int](), list[int](), 0.0
+        for link in links:
+            if isinstance(link, tuple):
+                starts_ns.append(int(first[link].times_ns[0]))
+                stops_ns.append(int(last[link].times_ns[-1]) if link in last else 0)
+                for series in (first[link], last.get(link, first[link])):
+                    disagreement_m = max(series.max_disagreement_m, series.estimate_zigzag_m())
+                    self.max_disagreement_m = max(self.max_disagreement_m, disagreement_m)
+        start_ns, stop_ns = max(starts_ns), min(stops_ns)
         self._span_ns = (start_ns, stop_ns)
         # A bag that was recorded while another one was replayed slowly needs longer windows of its log times. Bags are
         # replayed at least at a hundredth of real time.
         slowness = (log_times_ns[-1] - log_times_ns[0]) / max(stop_ns - start_ns, 1)
         self._window_ns = round(WINDOW_NS * np.clip(slowness, 1.0, 100.0))
-        self.max_disagreement_m = 0.0
-        for series in (first, last):
-            for link in moving:
-                if link in series:
-                    disagreement_m = max(series[link].max_disagreement_m, series[link].estimate_zigzag_m())
-                    self.max_disagreement_m = max(self.max_disagreement_m, disagreement_m)
 
     def mask_covered_times(self, times_ns: Int64, margin_s: float = 0.0) -> Bools:
         """Mask the times for which a pose can be interpolated or extrapolated.
@@ -370,7 +352,7 @@ class VehiclePoses:
         Returns:
             (N,) mask.
         """
-        margin_ns = (self._params.max_extrapolation_s - margin_s) * 1e9
+        margin_ns = (PoseSeriesParams().max_extrapolation_s - margin_s) * 1e9
         return (self._span_ns[0] - margin_ns <= times_ns) & (times_ns <= self._span_ns[1] + margin_ns)
 
     def interpolate(self, times_ns: Int64, log_time_ns: int) -> Matrix:
@@ -403,21 +385,18 @@ class VehiclePoses:
         if self._cached[0] != log_time_ns:
             start_ns, stop_ns = log_time_ns - self._window_ns, log_time_ns + self._window_ns
             messages = self._bag.read_messages(self._topic, start_ns, stop_ns)
-            series = build_pose_series(messages, self._bag.type_by_topic[self._topic], self._topic, self._params)
+            series = build_pose_series(messages, self._bag.type_by_topic[self._topic], self._topic)
             self._cached = (log_time_ns, series)
         return self._cached[1]
 
 
-def build_pose_series(
-    messages: Sequence[Any], message_type: str, name: str, params: PoseSeriesParams = PoseSeriesParams()
-) -> dict[Edge, PoseSeries]:
+def build_pose_series(messages: Sequence[Any], message_type: str, name: str) -> dict[Edge, PoseSeries]:
     """Build the poses of each transform in messages.
 
     Args:
         messages: Messages of one topic.
         message_type: Type of the messages: odometry, transforms or poses.
         name: Topic, for error messages.
-        params: Limits of interpolation.
 
     Returns:
         Parent and child frame of each transform and its poses; `Odometry` and `PoseStamped` have the key (type, "").
@@ -429,21 +408,13 @@ def build_pose_series(
     for message in messages:
         if message_type == TF_TYPE:
             for transform in message.transforms:
-                edge, pose = _parse_topic_edge(transform, name)
+                edge, pose = parse_edge(transform, f"{name}: ")
                 poses_by_edge.setdefault(edge, []).append((get_stamp_ns(transform.header), pose))
         else:
             content = message.pose.pose if message_type == ODOMETRY_TYPE else message.pose
             pose = parse_pose(content.position, content.orientation, name)
             poses_by_edge.setdefault((message_type, ""), []).append((get_stamp_ns(message.header), pose))
-    return {edge: _sort_poses(poses, params) for edge, poses in poses_by_edge.items()}
-
-
-def _parse_topic_edge(transform: Any, name: str) -> tuple[Edge, Matrix]:  # noqa: ANN401
-    """Parse a transform; errors name its topic."""
-    try:
-        return parse_edge(transform)
-    except ValueError as error:
-        raise ValueError(f"{name}: {error}") from error
+    return {edge: _sort_poses(poses) for edge, poses in poses_by_edge.items()}
 
 
 def read_static_transforms(bag: Bag) -> list[Any]:
@@ -465,22 +436,35 @@ def read_static_transforms(bag: Bag) -> list[Any]:
             for message in bag.read_messages(topic):
                 static.extend(message.transforms)
         else:
-            for edge, transforms in _sample_transforms(bag, topic).items():
-                sampled.setdefault(edge, []).extend(transforms)
-    moving = {edge for edge, transforms in sampled.items() if not _are_constant(transforms)}
-    ambiguous = {parse_edge(transform)[0] for transform in static} & moving
+            _sample_transforms(bag, topic, sampled)
+    moving, transforms_at_rest = set[Edge](), list[Any]()
+    for edge, transforms in sampled.items():
+        if not _are_constant(transforms):
+            moving.add(edge)
+        elif len(transforms) > 1:
+            transforms_at_rest.append(transforms[0])
+    ambiguous = set[Edge]()
+    for transform in static:
+        edge = parse_edge(transform)[0]
+        if edge in moving:
+            ambiguous.add(edge)
+        else:
+            transforms_at_rest.append(transform)
     if ambiguous:
-        names = ", ".join(sorted(f"{parent} -> {child}" for parent, child in ambiguous))
+        names = ", ".join(_format_edges(ambiguous))
         warnings.warn(
             f"{bag.path}: {names}: sent as static and as moving transforms; those that move are used", stacklevel=2
         )
-    constant = [transforms[0] for edge, transforms in sampled.items() if len(transforms) > 1 and edge not in moving]
-    return [*constant, *(transform for transform in static if parse_edge(transform)[0] not in moving)]
+    return transforms_at_rest
 
 
-def _sample_transforms(bag: Bag, topic: str) -> dict[Edge, list[Any]]:
-    """Read the messages `TransformStamped` at the beginning, in the middle and at the end of a topic."""
-    sampled: dict[Edge, list[Any]] = {}
+def _format_edges(edges: Iterable[Edge]) -> list[str]:
+    """Format transforms by their frames, sorted."""
+    return sorted(" -> ".join(edge) for edge in edges)
+
+
+def _sample_transforms(bag: Bag, topic: str, sampled: dict[Edge, list[Any]]) -> None:
+    """Add the messages `TransformStamped` at the beginning, in the middle and at the end of a topic to `sampled`."""
     log_times_ns, stop_ns = bag.get_log_times_ns(topic), 0
     for center_ns in (log_times_ns[0], log_times_ns[len(log_times_ns) // 2], log_times_ns[-1]):
         start_ns, stop_ns = max(int(center_ns) - WINDOW_NS, stop_ns), int(center_ns) + WINDOW_NS
@@ -489,7 +473,6 @@ def _sample_transforms(bag: Bag, topic: str) -> dict[Edge, list[Any]]:
                 edge = normalize_frame_id(transform.header.frame_id), normalize_frame_id(transform.child_frame_id)
                 sampled.setdefault(edge, []).append(transform)
     check_transform_count(sampled)
-    return sampled
 
 
 def _are_constant(transforms: Sequence[Any]) -> bool:
@@ -517,7 +500,7 @@ def find_vehicle_poses(bag: Bag, tree: FrameTree, vehicle_frame: str) -> list[Ve
     for topic in sorted(bag.list_topics(ODOMETRY_TYPE), key=lambda topic: -len(bag.get_log_times_ns(topic))):
         message = bag.read_message(topic, int(bag.get_log_times_ns(topic)[0]))
         child = normalize_frame_id(message.child_frame_id) or vehicle_frame
-        child_T_vehicle = tree.lookup_transform(child, vehicle_frame)
+        child_T_vehicle = tree.find_transforms(child).get(vehicle_frame)
         if child_T_vehicle is None:
             unconnected.append(f"{topic} ({child})")
         else:
@@ -536,13 +519,14 @@ def find_vehicle_poses(bag: Bag, tree: FrameTree, vehicle_frame: str) -> list[Ve
 
 def _find_tree_poses(bag: Bag, topic: str, tree: FrameTree, vehicle_frame: str) -> list[VehiclePoses]:
     """Find poses of the vehicle in each world frame of a topic of transforms, the best first."""
-    sampled = _sample_transforms(bag, topic)
+    sampled: dict[Edge, list[Any]] = {}
+    _sample_transforms(bag, topic, sampled)
     counts = {edge: len(transforms) for edge, transforms in sampled.items()}
     moving = {edge: count for edge, count in counts.items() if not _are_constant(sampled[edge])}
     # If the vehicle never moves, all transforms look static.
     static_tree = tree.remove_edges(counts)
     paths = _find_world_paths(moving, tree, vehicle_frame) or _find_world_paths(counts, static_tree, vehicle_frame)
-    mounted = static_tree.find_mounted_frames(vehicle_frame)
+    mounted = static_tree.find_transforms(vehicle_frame)
     parents = [f"{parent} -> {child}" for parent, child in counts if child in mounted]
     if parents and not paths:
         raise ValueError(f"{topic}: {', '.join(parents)}: the transforms from {vehicle_frame} upward are a loop")
@@ -559,14 +543,14 @@ def _list_unused_edges(
     moving: Mapping[Edge, int], tree: FrameTree, paths: Sequence[Sequence[Edge | Matrix]]
 ) -> list[str]:
     """List the transforms that move frames of the best path and are on no path."""
-    edges_by_path = [{link for link in path if isinstance(link, tuple)} for path in paths]
-    passed_frames = set[str]()
-    for _, child in edges_by_path[0] if edges_by_path else ():
-        if child not in passed_frames:
-            passed_frames |= tree.find_mounted_frames(child)
-    used = set[Edge]().union(*edges_by_path)
-    unused = [edge for edge in moving if edge[1] in passed_frames and edge not in used]
-    return sorted(f"{parent} -> {child}" for parent, child in unused)
+    used, passed_frames = set[Edge](), set[str]()
+    for path in paths:
+        for link in path:
+            if isinstance(link, tuple):
+                used.add(link)
+                if path is paths[0] and link[1] not in passed_frames:
+                    passed_frames.update(tree.find_transforms(link[1]))
+    return _format_edges(edge for edge in moving if edge[1] in passed_frames and edge not in used)
 
 
 def _find_world_paths(
@@ -584,7 +568,7 @@ def _find_world_paths(
     for frame in queue:
         path = paths[frame]
         if frame not in mounted_by_frame:
-            mounted_frames = tree.find_mounted_frames(frame)
+            mounted_frames = set(tree.find_transforms(frame))
             mounted_by_frame.update(dict.fromkeys(mounted_frames, mounted_frames))
         mounted = mounted_by_frame[frame]
         is_odom = frame == "odom"  # this frame never jumps (REP-105)
@@ -592,7 +576,10 @@ def _find_world_paths(
         if path and isinstance(path[0], tuple) and is_world:
             ranks[frame] = is_odom, min(moving[link] for link in path if isinstance(link, tuple))
             continue
-        neighbors: list[tuple[str, Edge | Matrix]] = [(edge[0], edge) for edge in moving if edge[1] == frame]
+        neighbors: list[tuple[str, Edge | Matrix]] = []
+        for edge in moving:
+            if edge[1] == frame:
+                neighbors.append((edge[0], edge))
         for neighbor, frame_T_neighbor in tree.list_neighbors(frame):
             neighbors.append((neighbor, invert(frame_T_neighbor)))
         for neighbor, link in neighbors:
@@ -602,7 +589,7 @@ def _find_world_paths(
     return {world: paths[world] for world in sorted(ranks, key=ranks.__getitem__, reverse=True)}
 
 
-def _sort_poses(stamped_poses: Sequence[tuple[int, Matrix]], params: PoseSeriesParams) -> PoseSeries:
+def _sort_poses(stamped_poses: Sequence[tuple[int, Matrix]]) -> PoseSeries:
     """Sort poses by stamp; the last pose of a stamp counts."""
     poses: dict[int, Matrix] = {}
     max_disagreement_m = 0.0
@@ -610,7 +597,9 @@ def _sort_poses(stamped_poses: Sequence[tuple[int, Matrix]], params: PoseSeriesP
         distance_m = float(np.linalg.norm(poses.get(stamp_ns, pose)[:3, 3] - pose[:3, 3]))
         max_disagreement_m = max(max_disagreement_m, distance_m)
         poses[stamp_ns] = pose
-    times_ns = np.array(sorted(poses), dtype=np.int64)
-    sorted_poses = np.array([poses[int(stamp_ns)] for stamp_ns in times_ns])
-    wxyz = np.array([convert_rotation_to_quaternion(pose[:3, :3]) for pose in sorted_poses])
-    return PoseSeries(times_ns, sorted_poses[:, :3, 3], wxyz, max_disagreement_m, params)
+    times_ns, sorted_poses, wxyz = sorted(poses), [], []
+    for stamp_ns in times_ns:
+        sorted_poses.append(poses[stamp_ns])
+        wxyz.append(convert_rotation_to_quaternion(poses[stamp_ns][:3, :3]))
+    positions_m = np.array(sorted_poses)[:, :3, 3]
+    return PoseSeries(np.array(times_ns, dtype=np.int64), positions_m, np.array(wxyz), max_disagreement_m)

@@ -238,10 +238,10 @@ def _parse_track(obstacle: Element, frame_interval_s: float) -> Track:
     rows = [_parse_state(state, frame_interval_s, f"id {name}") for state in states]
     if len(rows) > 1 and rows[0] == rows[1]:
         del rows[0]  # the trajectory of some scenarios repeats the initial state
-    times_s, yaw = np.array([row[0] for row in rows]), np.array([row[2] for row in rows])
+    times_s, positions_m, yaw = (np.array(column) for column in zip(*rows, strict=True))
     forward = np.stack([np.cos(yaw), np.sin(yaw), np.zeros(len(yaw))], axis=1)
     left = np.stack([-forward[:, 1], forward[:, 0], forward[:, 2]], axis=1)
-    positions_m = np.array([row[1] for row in rows]) + center_m[0] * forward + center_m[1] * left
+    positions_m = positions_m + center_m[0] * forward + center_m[1] * left
     angles_deg = np.column_stack([np.rad2deg(yaw + turn_rad), np.zeros((len(yaw), 2))])
     trajectory = build_trajectory(name, times_s, positions_m, angles_deg)
     if obstacle.tag == "staticObstacle" or (obstacle.findtext("role") or "").strip() == "static":
