@@ -69,12 +69,14 @@ class CheckParams:
     min_mirrored_share: float = 0.6
 
 
+PARAMS = CheckParams()
+
+
 def check_recording(
     recording: Recording,
     reference: Reference,
     rigs: Mapping[str, Sequence[str]],
     num_frames: int,
-    params: CheckParams = CheckParams(),
 ) -> list[str]:
     """Check a recording for known errors; a frame that cannot be read is skipped, and reported when it is measured.
 
@@ -83,17 +85,16 @@ def check_recording(
         reference: Source of its reference clouds.
         rigs: Name of each rig -> its sensors.
         num_frames: Number of frames that will be measured, from the first on.
-        params: Parameters of the checks.
 
     Returns:
         A message with a remedy for each error.
     """
     sensors = tuple(dict.fromkeys(chain.from_iterable(rigs.values())))
-    if num_frames and (message := check_units(recording, sensors[0], params)) is not None:
+    if num_frames and (message := check_units(recording, sensors[0])) is not None:
         return [f"{recording.path}: {message}"]
     reference_sensors = recording.reference_sensors if isinstance(reference, RecordedReference) else ()
     checked_sensors = tuple(dict.fromkeys((*sensors, *reference_sensors)))
-    frames = list(_read_frames(recording, checked_sensors, num_frames, params))
+    frames = list(_read_frames(recording, checked_sensors, num_frames))
     clouds: dict[str, list[Cloud]] = {}
     point_counts: dict[str, int] = {}
     for sensor in checked_sensors:
@@ -101,11 +102,11 @@ def check_recording(
         point_counts[sensor] = sum(len(cloud) for cloud in clouds[sensor])
     densest_sensor = max(sensors, key=point_counts.__getitem__)
     messages = [
-        check_ground_offset(clouds, params),
-        *(check_mirrored_axis(sensor, frames, params) for sensor in clouds),
-        *(check_identical_clouds(rig, rigs[rig], reference_sensors, frames, params) for rig in rigs),
+        check_ground_offset(clouds),
+        *(check_mirrored_axis(sensor, frames) for sensor in clouds),
+        *(check_identical_clouds(rig, rigs[rig], reference_sensors, frames) for rig in rigs),
         check_empty_clouds(clouds),
-        check_missing_labels(recording, num_frames, params),
+        check_missing_labels(recording, num_frames),
     ]
     segments = list(read_pose_segments(recording, num_frames))
     pose_message = check_frozen_poses(segments) or check_pose_conventions(recording, segments, densest_sensor)
@@ -115,13 +116,12 @@ def check_recording(
     return [f"{recording.path}: {message}" for message in messages if message is not None]
 
 
-def check_units(recording: Recording, sensor: str, params: CheckParams = CheckParams()) -> str | None:
+def check_units(recording: Recording, sensor: str) -> str | None:
     """Check whether coordinates are too large for meters.
 
     Args:
         recording: The recording.
         sensor: Sensor whose first cloud is checked.
-        params: Parameters of the checks.
 
     Returns:
         A message with the remedy; None if the unit is right or the cloud cannot be read.
@@ -131,28 +131,27 @@ def check_units(recording: Recording, sensor: str, params: CheckParams = CheckPa
     except (OSError, ValueError, IndexError):
         return None
     median_m = float(np.median(np.append(range_m[np.isfinite(range_m)], 0.0)))
-    if median_m < params.max_median_range_m:
+    if median_m < PARAMS.max_median_range_m:
         return None
-    unit = "mm" if median_m > params.max_median_range_cm else "cm"
+    unit = "mm" if median_m > PARAMS.max_median_range_cm else "cm"
     return f"half of the points of {sensor} are beyond {median_m:,.0f} m: is it {unit}? (--set recording.units={unit})"
 
 
-def check_ground_offset(clouds: Mapping[str, Sequence[Cloud]], params: CheckParams = CheckParams()) -> str | None:
+def check_ground_offset(clouds: Mapping[str, Sequence[Cloud]]) -> str | None:
     """Check whether the ground that sensors measure is far from z = 0.
 
     Args:
         clouds: Sensor -> (N, 3) points in the vehicle frame of each frame.
-        params: Parameters of the checks.
 
     Returns:
         A message with the remedy; None if the ground is near 0 or unknown.
     """
     offsets = []
     for sensor, sensor_clouds in clouds.items():
-        heights_m = [estimate_ground_height(cloud, params) for cloud in sensor_clouds]
+        heights_m = [estimate_ground_height(cloud) for cloud in sensor_clouds]
         measured_m = [height_m for height_m in heights_m if height_m is not None]
         height_m = float(np.median(measured_m)) if measured_m else 0.0
-        if abs(height_m) > params.max_ground_offset_m:
+        if abs(height_m) > PARAMS.max_ground_offset_m:
             offsets.append(f"{height_m:+.1f} m ({sensor})")
     if not offsets:
         return None
@@ -162,32 +161,28 @@ def check_ground_offset(clouds: Mapping[str, Sequence[Cloud]], params: CheckPara
     )
 
 
-def estimate_ground_height(points_m: NDArray[np.floating], params: CheckParams = CheckParams()) -> float | None:
+def estimate_ground_height(points_m: NDArray[np.floating]) -> float | None:
     """Estimate the height of the ground below the origin.
 
     Args:
         points_m: (N, 3) points in the vehicle frame.
-        params: Parameters of the checks.
 
     Returns:
         z in meters; None where no ground is measured near the origin.
     """
-    near_m = points_m[(np.abs(points_m) < params.ground_radius_m).all(axis=1)].astype(np.float64)
+    near_m = points_m[(np.abs(points_m) < PARAMS.ground_radius_m).all(axis=1)].astype(np.float64)
     origin_m = np.zeros((1, 3))
     ground = GroundModel.from_surfaces([extract_low_surfaces(near_m, origin_m[0])], origin_m[0])
     origin_height_m = np.nan if ground is None else float(ground.compute_heights_m(origin_m)[0])
     return None if np.isnan(origin_height_m) else -origin_height_m
 
 
-def check_mirrored_axis(
-    sensor: str, frames: Sequence["CheckedFrame"], params: CheckParams = CheckParams()
-) -> str | None:
+def check_mirrored_axis(sensor: str, frames: Sequence["CheckedFrame"]) -> str | None:
     """Check whether labeled boxes contain points only if left and right are exchanged.
 
     Args:
         sensor: Name of the sensor.
         frames: Frames with its clouds and with boxes.
-        params: Parameters of the checks.
 
     Returns:
         A message with the remedy; None if the axis is right or few boxes decide.
@@ -196,23 +191,23 @@ def check_mirrored_axis(
     for frame in frames:
         if frame.boxes is None:
             continue
-        is_near = torch.linalg.vector_norm(frame.boxes.center_m[:, :2], dim=1) < params.max_box_range_m
+        is_near = torch.linalg.vector_norm(frame.boxes.center_m[:, :2], dim=1) < PARAMS.max_box_range_m
         rows = frame.boxes.rows[is_near].clone()
-        rows[:, 2] += params.box_bottom_margin_m / 2
-        rows[:, 5] -= params.box_bottom_margin_m
+        rows[:, 2] += PARAMS.box_bottom_margin_m / 2
+        rows[:, 5] -= PARAMS.box_bottom_margin_m
         boxes = Boxes.from_rows(rows[rows[:, 5] > 0])
         box_count += len(boxes)
         points_m = frame.clouds[sensor]
         counts = _count_points_in_boxes(points_m, boxes)
         mirrored_counts = _count_points_in_boxes(points_m * np.array([1, -1, 1], np.float32), boxes)
-        min_counts = (params.min_point_count_ratio * mirrored_counts).clamp(min=params.min_box_points)
-        min_mirrored_counts = (params.min_point_count_ratio * counts).clamp(min=params.min_box_points)
+        min_counts = (PARAMS.min_point_count_ratio * mirrored_counts).clamp(min=PARAMS.min_box_points)
+        min_mirrored_counts = (PARAMS.min_point_count_ratio * counts).clamp(min=PARAMS.min_box_points)
         right_count += int((counts >= min_counts).sum())
         mirrored_count += int((mirrored_counts >= min_mirrored_counts).sum())
     if (
-        mirrored_count < params.min_mirrored_boxes
-        or mirrored_count < params.min_mirrored_ratio * right_count
-        or mirrored_count < params.min_mirrored_share * box_count
+        mirrored_count < PARAMS.min_mirrored_boxes
+        or mirrored_count < PARAMS.min_mirrored_ratio * right_count
+        or mirrored_count < PARAMS.min_mirrored_share * box_count
     ):
         return None
     return (
@@ -226,7 +221,6 @@ def check_identical_clouds(
     sensors: Sequence[str],
     reference_sensors: Sequence[str],
     frames: Sequence["CheckedFrame"],
-    params: CheckParams = CheckParams(),
 ) -> str | None:
     """Check whether all reference points are points of the rig, so that every radius is 0 m.
 
@@ -235,7 +229,6 @@ def check_identical_clouds(
         sensors: Its sensors.
         reference_sensors: Sensors of the reference.
         frames: Frames with the clouds of all of them.
-        params: Parameters of the checks.
 
     Returns:
         A message with the remedy; None if the clouds differ.
@@ -243,12 +236,12 @@ def check_identical_clouds(
     compared_count = 0
     for frame in frames:
         sensor_m, reference_m = frame.join_clouds(sensors), frame.join_clouds(reference_sensors)
-        if len(reference_m) < params.min_cloud_points:
+        if len(reference_m) < PARAMS.min_cloud_points:
             continue
         # Sampled at random: every n-th point may be of the same laser.
-        chosen = np.random.default_rng(0).integers(len(reference_m), size=params.num_identical_queries)
+        chosen = np.random.default_rng(0).integers(len(reference_m), size=PARAMS.num_identical_queries)
         query, points = torch.from_numpy(reference_m[chosen]), torch.from_numpy(sensor_m)
-        distance_m = nearest(query, points, max_distance=params.max_identical_distance_m).distance
+        distance_m = nearest(query, points, max_distance=PARAMS.max_identical_distance_m).distance
         if not bool(distance_m.isfinite().all()):
             return None
         compared_count += 1
@@ -282,19 +275,18 @@ def check_empty_clouds(clouds: Mapping[str, Sequence[Cloud]]) -> str | None:
     )
 
 
-def check_missing_labels(recording: Recording, num_frames: int, params: CheckParams = CheckParams()) -> str | None:
+def check_missing_labels(recording: Recording, num_frames: int) -> str | None:
     """Check whether a recording with labels has none in any frame; a complete one of torchcover may have none.
 
     Args:
         recording: The recording.
         num_frames: Number of frames that will be measured.
-        params: Parameters of the checks.
 
     Returns:
         A message with the remedy; None if there are labels, or the recording is not labeled.
     """
     try:
-        positions = _spread_indices(num_frames, params.num_label_frames)
+        positions = _spread_indices(num_frames, PARAMS.num_label_frames)
         labels = [recording.read_boxes(recording.key_frames[position]) for position in positions]
     except (OSError, ValueError):
         return None
@@ -370,10 +362,8 @@ class CheckedFrame:
         return np.concatenate([np.empty((0, 3), np.float32), *(self.clouds[sensor] for sensor in sensors)])
 
 
-def _read_frames(
-    recording: Recording, sensors: Sequence[str], num_frames: int, params: CheckParams
-) -> Iterator[CheckedFrame]:
-    for position in _spread_indices(num_frames, params.num_frames):
+def _read_frames(recording: Recording, sensors: Sequence[str], num_frames: int) -> Iterator[CheckedFrame]:
+    for position in _spread_indices(num_frames, PARAMS.num_frames):
         frame = recording.key_frames[position]
         clouds: dict[str, Cloud] = {}
         try:

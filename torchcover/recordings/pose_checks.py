@@ -148,6 +148,9 @@ class PoseCheckParams:
     min_motion_m: float = 0.1
 
 
+PARAMS = PoseCheckParams()
+
+
 class PoseSegment:
     """Consecutive frames of a recording.
 
@@ -155,20 +158,13 @@ class PoseSegment:
         times_s: (N,) times.
         world_T_vehicle: (N, 4, 4) poses.
         first_frame: Index of the first frame.
-        params: Parameters of the checks.
     """
 
-    def __init__(
-        self,
-        times_s: NDArray[np.float64],
-        world_T_vehicle: Matrix,
-        first_frame: int,
-        params: PoseCheckParams = PoseCheckParams(),
-    ) -> None:
+    def __init__(self, times_s: NDArray[np.float64], world_T_vehicle: Matrix, first_frame: int) -> None:
         self.times_s, self.world_T_vehicle, self.first_frame = times_s, world_T_vehicle, first_frame
         jumps = find_pose_discontinuities(times_s, world_T_vehicle)
         # Many jumps are no discontinuities: the poses are wrong in another way, which other checks find.
-        max_jumps = max(2, params.max_discontinuity_share * len(times_s))
+        max_jumps = max(2, PARAMS.max_discontinuity_share * len(times_s))
         self.discontinuities = jumps[:0] if len(jumps) > max_jumps else jumps
 
 
@@ -240,12 +236,11 @@ class ScanPair:
         return self._maps[0].match(transform_points(motion, self._maps[1].points_m))
 
 
-def check_frozen_poses(segments: Sequence[PoseSegment], params: PoseCheckParams = PoseCheckParams()) -> str | None:
+def check_frozen_poses(segments: Sequence[PoseSegment]) -> str | None:
     """Check whether poses repeat the previous one while the vehicle moves.
 
     Args:
         segments: Segments of the recording.
-        params: Parameters of the checks.
 
     Returns:
         A message with the remedy; None if the poses are right.
@@ -256,9 +251,9 @@ def check_frozen_poses(segments: Sequence[PoseSegment], params: PoseCheckParams 
         changes = np.concatenate([[-1], np.flatnonzero(~is_same), [len(is_same)]])
         run_lengths = np.diff(changes) - 1
         if run_lengths[1:-1].any():
-            repeated_count += int(run_lengths[run_lengths <= params.max_repeats].sum())
+            repeated_count += int(run_lengths[run_lengths <= PARAMS.max_repeats].sum())
             step_count += len(is_same)
-    if repeated_count < max(2, params.min_repeated_share * step_count):
+    if repeated_count < max(2, PARAMS.min_repeated_share * step_count):
         return None
     return (
         f"{repeated_count} of {step_count} poses repeat the previous one while the vehicle moves: give a pose for each "
@@ -270,7 +265,6 @@ def check_pose_conventions(
     recording: Recording,
     segments: Sequence[PoseSegment],
     sensor: str,
-    params: PoseCheckParams = PoseCheckParams(),
 ) -> str | None:
     """Check whether scans match better with other conventions of rotations, poses or axes, or with a time offset.
 
@@ -278,15 +272,14 @@ def check_pose_conventions(
         recording: The recording.
         segments: Segments of the recording.
         sensor: Sensor whose scans are matched.
-        params: Parameters of the checks.
 
     Returns:
         A message with the remedy; None if nothing matches better.
     """
-    pairs = [pair for pair in select_pairs(segments, params) if pair.read_scans(recording, sensor)]
+    pairs = [pair for pair in select_pairs(segments) if pair.read_scans(recording, sensor)]
     is_repeated = []
     for pair in pairs:
-        if pair.distance_m > params.min_motion_m:
+        if pair.distance_m > PARAMS.min_motion_m:
             first, second = pair.scans
             is_repeated.append(np.array_equal(first.points_m, second.points_m, equal_nan=True))
     if is_repeated and all(is_repeated):
@@ -303,10 +296,10 @@ def check_pose_conventions(
     matches = [_compute_mean_match(pairs, settings) for settings in conventions]
     best = int(np.argmax(matches))
     match, remedy = matches[best], conventions[best].command_line_options
-    if match < max(uncorrected_match + params.min_match_gain, params.min_match_gain_ratio * uncorrected_match):
-        time_offset_s, match = find_time_offset(pairs, params)
+    if match < max(uncorrected_match + PARAMS.min_match_gain, PARAMS.min_match_gain_ratio * uncorrected_match):
+        time_offset_s, match = find_time_offset(pairs)
         remedy = f"--set recording.time_offset_s={time_offset_s:.2f}"
-        if match < max(uncorrected_match + params.min_time_offset_gain, params.min_time_offset_match):
+        if match < max(uncorrected_match + PARAMS.min_time_offset_gain, PARAMS.min_time_offset_match):
             return None
     return (
         f"two scans of {sensor} match to {uncorrected_match:.0%} with the given poses, and to {match:.0%} with "
@@ -314,22 +307,21 @@ def check_pose_conventions(
     )
 
 
-def find_time_offset(pairs: Sequence[ScanPair], params: PoseCheckParams = PoseCheckParams()) -> tuple[float, float]:
+def find_time_offset(pairs: Sequence[ScanPair]) -> tuple[float, float]:
     """Find the time offset with which pairs match best.
 
     Args:
         pairs: Pairs whose scans were read.
-        params: Parameters of the checks.
 
     Returns:
         The offset in seconds and the mean match, 0 to 1; zeros if many offsets match better, as with noisy poses.
     """
-    offsets_s = params.time_offsets_s
+    offsets_s = PARAMS.time_offsets_s
     matches = np.array([_compute_mean_match(pairs, RecordingSettings(time_offset_s=value)) for value in offsets_s])
     best = int(matches.argmax())
     before, after = matches[best::-1], matches[best:]
     ripple = max((before - np.minimum.accumulate(before)).max(), (after - np.minimum.accumulate(after)).max())
-    return (0.0, 0.0) if ripple > params.max_time_offset_ripple else (offsets_s[best], float(matches[best]))
+    return (0.0, 0.0) if ripple > PARAMS.max_time_offset_ripple else (offsets_s[best], float(matches[best]))
 
 
 def check_pose_discontinuities(recording: Recording, segments: Sequence[PoseSegment]) -> str | None:
@@ -355,12 +347,11 @@ def check_pose_discontinuities(recording: Recording, segments: Sequence[PoseSegm
     )
 
 
-def select_pairs(segments: Sequence[PoseSegment], params: PoseCheckParams = PoseCheckParams()) -> list[ScanPair]:
+def select_pairs(segments: Sequence[PoseSegment]) -> list[ScanPair]:
     """Select pairs of scans that are spread over the recording, and those that a time offset would change most.
 
     Args:
         segments: Segments of the recording.
-        params: Parameters of the checks.
     """
     pairs = []
     for segment in segments:
@@ -370,30 +361,27 @@ def select_pairs(segments: Sequence[PoseSegment], params: PoseCheckParams = Pose
             for second in range(first + 1, end):
                 pair = ScanPair(segment, first, second)
                 is_far = (
-                    pair.distance_m > params.pair_distance_m
-                    or pair.rotation_deg > params.pair_rotation_deg
-                    or pair.interval_s > params.pair_interval_s - 1e-6
+                    pair.distance_m > PARAMS.pair_distance_m
+                    or pair.rotation_deg > PARAMS.pair_rotation_deg
+                    or pair.interval_s > PARAMS.pair_interval_s - 1e-6
                 )
-                if pair.interval_s <= params.max_pair_interval_s and (is_far or second == last):
+                if pair.interval_s <= PARAMS.max_pair_interval_s and (is_far or second == last):
                     pairs.append(pair)
                 if is_far:
                     break
     if not pairs:
         return []
-    spread = [pairs[position] for position in np.linspace(0, len(pairs) - 1, params.num_pairs).astype(int)]
-    sensitive = sorted(pairs, key=attrgetter("time_offset_effect_m"), reverse=True)[: params.num_pairs]
+    spread = [pairs[position] for position in np.linspace(0, len(pairs) - 1, PARAMS.num_pairs).astype(int)]
+    sensitive = sorted(pairs, key=attrgetter("time_offset_effect_m"), reverse=True)[: PARAMS.num_pairs]
     return list(dict.fromkeys((*spread, *sensitive)))
 
 
-def read_pose_segments(
-    recording: Recording, num_frames: int, params: PoseCheckParams = PoseCheckParams()
-) -> Iterator[PoseSegment]:
+def read_pose_segments(recording: Recording, num_frames: int) -> Iterator[PoseSegment]:
     """Read the poses of segments that are spread over the recording.
 
     Args:
         recording: The recording.
         num_frames: Number of frames that will be measured, from the first on.
-        params: Parameters of the checks.
 
     Yields:
         Segments whose poses are all known.
@@ -403,15 +391,15 @@ def read_pose_segments(
         return
     start = recording.key_frames[0]
     # The window of the last frame extends beyond it.
-    stop = min(recording.key_frames[num_frames - 1] + params.frames_per_segment, len(recording.frame_names))
+    stop = min(recording.key_frames[num_frames - 1] + PARAMS.frames_per_segment, len(recording.frame_names))
     first_frames, length = [start], stop - start
-    if length > params.num_segments * params.frames_per_segment:
-        length = params.frames_per_segment
-        first_frames = np.linspace(start, stop - length, params.num_segments).astype(int).tolist()
+    if length > PARAMS.num_segments * PARAMS.frames_per_segment:
+        length = PARAMS.frames_per_segment
+        first_frames = np.linspace(start, stop - length, PARAMS.num_segments).astype(int).tolist()
     for first_frame in first_frames if length > 1 else ():
         poses = [recording.get_world_T_vehicle(frame) for frame in range(first_frame, first_frame + length)]
         if all(pose is not None for pose in poses):
-            yield PoseSegment(times_s[first_frame : first_frame + length], np.array(poses), first_frame, params)
+            yield PoseSegment(times_s[first_frame : first_frame + length], np.array(poses), first_frame)
 
 
 def _compute_mean_match(pairs: Sequence[ScanPair], settings: RecordingSettings | None = None) -> float:

@@ -15,8 +15,8 @@ from torchcover.frames.frame import Frame
 from torchcover.geometry import BoundingBox, convert_rotation_to_quaternion, invert, transform_points
 from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.clouds.arrays import Points
-from torchcover.recordings.formats.folder import BOX_FOLDER, POSES_FILE, REFERENCE, SETTINGS_FILE
-from torchcover.recordings.formats.frame_files import POSITION_COLUMNS, QUATERNION_COLUMNS, write_boxes
+from torchcover.recordings.formats.folder import POSES_FILE, REFERENCE, SETTINGS_FILE
+from torchcover.recordings.formats.frame_files import BOX_FOLDER, POSITION_COLUMNS, QUATERNION_COLUMNS, write_boxes
 from torchcover.recordings.formats.kitti import vehicle_T_velodyne
 from torchcover.recordings.recording import GROUND_CLEARANCE_M
 

@@ -99,7 +99,6 @@ def check_seconds(
     times_s: NDArray[np.floating],
     source: str = "",
     positions_m: NDArray[np.floating] | None = None,
-    params: TimeCheckParams = TimeCheckParams(),
 ) -> None:
     """Check that ascending times are in seconds and not rounded too coarsely.
 
@@ -107,13 +106,12 @@ def check_seconds(
         times_s: (K,) times as stored.
         source: Prefix of the message.
         positions_m: (K, 3) positions at these times; their speed distinguishes milliseconds from seconds.
-        params: Limits of plausible times.
 
     Raises:
         ValueError: The median interval is longer than an hour, or than 10 s at a crawl, or float32 rounds the times.
     """
+    params, speed_mps = TimeCheckParams(), 0.0
     interval_s = float(np.median(np.diff(times_s))) if len(times_s) > 1 else 0.0
-    speed_mps = 0.0
     if positions_m is not None and interval_s:
         speed_mps = float(np.median(np.linalg.norm(np.diff(positions_m, axis=0), axis=1) / np.diff(times_s)))
     is_slow = 0.0 < speed_mps < params.min_speed_mps

@@ -363,22 +363,19 @@ class SweepWindow:
         return bool(np.diff(interval)[0])
 
 
-def find_pose_discontinuities(
-    times_s: Float64, world_T_vehicle: Matrix, params: DiscontinuityParams = DiscontinuityParams()
-) -> NDArray[np.intp]:
+def find_pose_discontinuities(times_s: Float64, world_T_vehicle: Matrix) -> NDArray[np.intp]:
     """Find the poses after which the position or heading jumps.
 
     Args:
         times_s: (N,) times, ascending.
         world_T_vehicle: (N, 4, 4) poses.
-        params: Parameters of the search.
 
     Returns:
         Indices of the last poses before a jump.
     """
     if len(times_s) < 3:
         return np.empty(0, np.intp)
-    interval_s = np.diff(times_s)[:, None]
+    params, interval_s = DiscontinuityParams(), np.diff(times_s)[:, None]
     rotation = world_T_vehicle[:-1, :3, :3].swapaxes(1, 2) @ world_T_vehicle[1:, :3, :3]
     lever_motion_m = params.lever_m * np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])
     motion_m = np.column_stack([np.diff(world_T_vehicle[:, :3, 3], axis=0), lever_motion_m])

@@ -158,7 +158,7 @@ def _parse_positive(words: Sequence[str], key: str) -> tuple[int, ...]:
 
 def _find_axis_fields(header: _Header) -> list[int]:
     """Find the indices of the fields x, y and z, which have to be single floats."""
-    missing = [axis for axis in AXES if axis not in header.fields]
+    missing = sorted(set(AXES) - set(header.fields))
     if missing:
         raise ValueError(f"no field {', '.join(missing)} among the fields {' '.join(header.fields)[:80]}")
     if any(header.fields.count(axis) > 1 for axis in AXES):

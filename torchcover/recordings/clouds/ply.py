@@ -139,7 +139,7 @@ def _add_property(element: _Element, declaration: list[str]) -> None:
 
 def _check_vertex(vertex: _Element) -> None:
     """Check that vertices have floating-point coordinates and no lists."""
-    missing = [axis for axis in AXES if axis not in vertex.types]
+    missing = sorted(set(AXES) - vertex.types.keys())
     if missing:
         raise ValueError(f"the vertices have no {', '.join(missing)}; got {', '.join(vertex.types) or 'nothing'}")
     if vertex.has_list:

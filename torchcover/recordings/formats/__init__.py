@@ -4,7 +4,7 @@ import os
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 from torchcover.files import RECORDING, allow_links, find_changed
 from torchcover.recordings.corrections import correct_recording

@@ -296,6 +296,9 @@ class PointTimeParams:
     min_absolute_ns: float = 1e15
 
 
+POINT_TIME_PARAMS = PointTimeParams()
+
+
 class PointTimes(NamedTuple):
     """Storage of the point times of a sensor.
 
@@ -327,14 +330,12 @@ class CloudMessage(NamedTuple):
 def parse_cloud(
     message: Any,  # noqa: ANN401  (of a type that rosbags creates)
     point_times: PointTimes,
-    params: PointTimeParams = PointTimeParams(),
 ) -> CloudMessage:
     """Parse coordinates, point times and rings of a cloud.
 
     Args:
         message: `sensor_msgs/msg/PointCloud2`.
         point_times: Result of `choose_point_times` for its sensor.
-        params: Limits of point times.
 
     Returns:
         The cloud.
@@ -358,15 +359,11 @@ def parse_cloud(
     stamp_ns = get_stamp_ns(message.header)
     if time_field is None:
         return CloudMessage(points_m, stamp_ns, None, rings)
-    offsets_s = _compute_offsets_s(table[time_field.name], stamp_ns, point_times, params)
-    return CloudMessage(points_m, stamp_ns, _check_offsets(offsets_s, points_m, time_field.name, params), rings)
+    offsets_s = _compute_offsets_s(table[time_field.name], stamp_ns, point_times)
+    return CloudMessage(points_m, stamp_ns, _check_offsets(offsets_s, points_m, time_field.name), rings)
 
 
-def choose_point_times(
-    message: Any,  # noqa: ANN401
-    period_s: float | None,
-    params: PointTimeParams = PointTimeParams(),
-) -> tuple[PointTimes | None, str]:
+def choose_point_times(message: Any, period_s: float | None) -> tuple[PointTimes | None, str]:  # noqa: ANN401
     """Choose the unit of point times by the scan period.
 
     By convention integers are nanoseconds and other numbers seconds. Another unit is chosen if only with that unit the
@@ -375,7 +372,6 @@ def choose_point_times(
     Args:
         message: Scan of the sensor.
         period_s: Scan period; None if the recording has one scan.
-        params: Limits of plausible point times.
 
     Returns:
         The choice, None if no unit fits, and a note if the choice is not the convention or uncertain.
@@ -383,6 +379,7 @@ def choose_point_times(
     Raises:
         ValueError: The cloud is inconsistent.
     """
+    params = POINT_TIME_PARAMS
     field, period_s = _find_time_field(message), period_s or params.default_period_s
     if field is None:
         return PointTimes("none", period_s), ""
@@ -398,7 +395,7 @@ def choose_point_times(
         units.append(SCAN_SHARE)
     shares = {}
     for unit in units:
-        offsets_s = _compute_offsets_s(stored, stamp_ns, PointTimes(unit, period_s), params)
+        offsets_s = _compute_offsets_s(stored, stamp_ns, PointTimes(unit, period_s))
         is_near = bool((np.abs(offsets_s) <= params.max_offset_s).all())
         shares[unit] = float(np.ptp(offsets_s)) / period_s if len(offsets_s) and is_near else np.inf * len(offsets_s)
     if shares[default] == 0 or np.isnan(shares[default]):  # no points, or all at one time
@@ -468,14 +465,14 @@ def _read_fields(message: Any, fields: list[Any]) -> NDArray[Any]:  # noqa: ANN4
     return grid.reshape(-1)
 
 
-def _compute_offsets_s(
-    stored: NDArray[Any], stamp_ns: int, point_times: PointTimes, params: PointTimeParams
-) -> Float64:
+def _compute_offsets_s(stored: NDArray[Any], stamp_ns: int, point_times: PointTimes) -> Float64:
     """Compute the (N,) seconds between the stamp and the stored point times."""
     if point_times.unit == SCAN_SHARE:
         return stored.astype(np.float64) * point_times.period_s
     unit_ns = UNITS_NS[point_times.unit]
-    is_absolute = float(np.abs(stored[np.isfinite(stored)]).max(initial=0)) * unit_ns > params.min_absolute_ns
+    is_absolute = (
+        float(np.abs(stored[np.isfinite(stored)]).max(initial=0)) * unit_ns > POINT_TIME_PARAMS.min_absolute_ns
+    )
     # Integer units are subtracted first, since float64 rounds nanoseconds since 1970 to 0.2 us.
     stamp_units, remainder_ns = divmod(stamp_ns, unit_ns) if is_absolute else (0, 0)
     number_type = np.int64 if stored.dtype.kind in "iu" else np.float64
@@ -483,9 +480,9 @@ def _compute_offsets_s(
     return np.asarray(units_since_stamp * (unit_ns * 1e-9) - remainder_ns * 1e-9, dtype=np.float64)
 
 
-def _check_offsets(offsets_s: Float64, points_m: Points, name: str, params: PointTimeParams) -> Float64:
+def _check_offsets(offsets_s: Float64, points_m: Points, name: str) -> Float64:
     """Check that finite points have times close to the stamp; other points get times within the limits."""
-    limit_s = params.max_offset_s
+    limit_s = POINT_TIME_PARAMS.max_offset_s
     finite_s = offsets_s[np.isfinite(points_m).all(axis=1)]
     is_near = np.abs(finite_s) <= limit_s
     if not is_near.all():

@@ -26,8 +26,13 @@ from torchcover.files import (
 from torchcover.geometry import BoundingBox, build_transform, convert_euler_to_rotation, invert, transform_points
 from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.clouds import read_cloud
-from torchcover.recordings.formats.folder import BOX_FOLDER, POSES_FILE, REFERENCE
-from torchcover.recordings.formats.frame_files import check_same_names, find_frame_files, find_frame_rows
+from torchcover.recordings.formats.folder import POSES_FILE, REFERENCE
+from torchcover.recordings.formats.frame_files import (
+    BOX_FOLDER,
+    check_frames_with_boxes,
+    find_frame_files,
+    find_frame_rows,
+)
 from torchcover.recordings.recording import GROUND_CLEARANCE_M, Recording, Scan, check_times
 
 # Blueprints of sensors that are read.
@@ -312,11 +317,7 @@ class Carla(Recording):
         self.reference_sensors = (REFERENCE,) if REFERENCE in self._mounts else ()
         self.sensors = tuple(name for name in self._mounts if name != REFERENCE)
         self.rigs = {"carla": self.sensors}
-        self._has_boxes = (self.path / BOX_FOLDER).is_dir()
-        files_by_folder = dict(self._files)
-        if self._has_boxes:
-            files_by_folder[BOX_FOLDER] = {file.stem: file for file in (self.path / BOX_FOLDER).glob("*.csv")}
-        check_same_names(self.path, files_by_folder)
+        self._has_boxes = check_frames_with_boxes(self.path, self._files)
         self._file_names = tuple(next(iter(self._files.values())))
         self._extrinsics = {}
         for name in self._mounts:

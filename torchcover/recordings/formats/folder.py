@@ -13,8 +13,9 @@ from torchcover.geometry.rigid import Matrix, check_rigid
 from torchcover.recordings.clouds import read_cloud
 from torchcover.recordings.clouds.arrays import read_cloud_with_weights, read_heights
 from torchcover.recordings.formats.frame_files import (
+    BOX_FOLDER,
     PoseTable,
-    check_same_names,
+    check_frames_with_boxes,
     find_frame_files,
     make_natural_sort_key,
     read_boxes,
@@ -25,7 +26,6 @@ from torchcover.recordings.recording import Recording, Scan, check_times
 SETTINGS_FILE = "frames.yaml"
 POSES_FILE = "poses.csv"
 REFERENCE = "reference"
-BOX_FOLDER = "boxes"
 
 
 class _StrictModel(BaseModel):
@@ -35,7 +35,13 @@ class _StrictModel(BaseModel):
 
 
 class _SensorEntry(_StrictModel):
-    """Entry of a sensor or rig."""
+    """Entry of a sensor or rig.
+
+    Args:
+        vehicle_T_sensor: (4, 4) extrinsics; None if the clouds are in the vehicle frame.
+        flip_y: True if y points to the right, as in CARLA.
+        min_range_m: Points closer to the sensor are missing returns.
+    """
 
     vehicle_T_sensor: list[list[float]] | None = None
     flip_y: bool = False
@@ -68,30 +74,18 @@ class _SettingsFile(_StrictModel):
     vehicle: _VehicleEntry | None = None
 
 
-class CloudSettings(NamedTuple):
-    """Settings of the clouds of one sensor.
-
-    Args:
-        vehicle_T_sensor: (4, 4) extrinsics; None if the clouds are in the vehicle frame.
-        flip_y: True if y points to the right, as in CARLA.
-        min_range_m: Points closer to the sensor are missing returns.
-    """
-
-    vehicle_T_sensor: Matrix | None = None
-    flip_y: bool = False
-    min_range_m: float = 0.0
-
-
 class FolderSettings(NamedTuple):
     """Content of `frames.yaml`.
 
     Args:
-        cloud_settings: Settings by folder: `sensor`, `sensors/NAME`, `rigs/NAME` or `reference`.
+        entries: Entries by folder: `sensor`, `sensors/NAME`, `rigs/NAME` or `reference`.
+        extrinsics: (4, 4) `vehicle_T_sensor` by folder, if it is given.
         has_area_weights: True if the files of the reference have weights.
         ego_box: Bounding box of the ego vehicle; None if unknown.
     """
 
-    cloud_settings: dict[str, CloudSettings]
+    entries: dict[str, _SensorEntry]
+    extrinsics: dict[str, Matrix]
     has_area_weights: bool = False
     ego_box: BoundingBox | None = None
 
@@ -108,7 +102,7 @@ def read_folder_settings(path: Path) -> FolderSettings:
     Raises:
         BadFileError: Keys are unknown, or values are invalid.
     """
-    return _read_settings_file(path) if path.exists() else FolderSettings({})
+    return _read_settings_file(path) if path.exists() else FolderSettings({}, {})
 
 
 @guard_reader("a file of poses")
@@ -125,34 +119,27 @@ def _read_settings_file(path: Path) -> FolderSettings:
         settings = _SettingsFile.model_validate(content)
     except ValidationError as error:
         raise ValueError(f"{'; '.join(explain_validation_error(error))}; {allowed}") from error
-    entries: dict[str, _SensorEntry | None] = {"sensor": settings.sensor, "reference": settings.reference}
+    entries: dict[str, _SensorEntry] = {}
+    if settings.sensor is not None:
+        entries["sensor"] = settings.sensor
+    if settings.reference is not None:
+        entries[REFERENCE] = settings.reference
     entries |= {f"sensors/{name}": entry for name, entry in settings.sensors.items()}
     entries |= {f"rigs/{name}": entry for name, entry in settings.rigs.items()}
-    cloud_settings = {}
+    extrinsics = {}
     for folder, entry in entries.items():
-        if entry is not None:
-            cloud_settings[folder] = _build_cloud_settings(folder.replace("/", "."), entry)
-    return FolderSettings(
-        cloud_settings,
-        settings.reference is not None and settings.reference.area_weights,
-        None if settings.vehicle is None else _build_ego_box(settings.vehicle),
-    )
-
-
-def _build_cloud_settings(key: str, entry: _SensorEntry) -> CloudSettings:
-    """Convert an entry and check that its extrinsics are rigid."""
-    pose = entry.vehicle_T_sensor
-    matrix = None if pose is None else check_rigid(pose, f"{key}.vehicle_T_sensor")
-    return CloudSettings(matrix, entry.flip_y, entry.min_range_m)
-
-
-def _build_ego_box(vehicle: _VehicleEntry) -> BoundingBox:
-    """Convert the entry of the vehicle and check that its corners are ordered."""
-    (x0, y0, z0), (x1, y1, z1) = vehicle.lower_m, vehicle.upper_m
-    try:
-        return BoundingBox((x0, y0, z0), (x1, y1, z1))
-    except ValueError as error:
-        raise ValueError(f"vehicle: {error}") from error
+        if entry.vehicle_T_sensor is not None:
+            key = f"{folder.replace('/', '.')}.vehicle_T_sensor"
+            extrinsics[folder] = check_rigid(entry.vehicle_T_sensor, key)
+    ego_box = None
+    if settings.vehicle is not None:
+        (x0, y0, z0), (x1, y1, z1) = settings.vehicle.lower_m, settings.vehicle.upper_m
+        try:
+            ego_box = BoundingBox((x0, y0, z0), (x1, y1, z1))
+        except ValueError as error:
+            raise ValueError(f"vehicle: {error}") from error
+    has_area_weights = settings.reference is not None and settings.reference.area_weights
+    return FolderSettings(entries, extrinsics, has_area_weights, ego_box)
 
 
 class FolderRecording(Recording):
@@ -208,11 +195,7 @@ class FolderRecording(Recording):
         self._files = {}
         for folder in self._folders.values():
             self._files[folder] = find_frame_files(self.path / folder, ignored_files=(POSES_FILE,))
-        self._has_boxes = (self.path / BOX_FOLDER).is_dir()
-        files_by_folder = dict(self._files)
-        if self._has_boxes:
-            files_by_folder[BOX_FOLDER] = {file.stem: file for file in (self.path / BOX_FOLDER).glob("*.csv")}
-        check_same_names(self.path, files_by_folder)
+        self._has_boxes = check_frames_with_boxes(self.path, self._files)
         self.frame_names = tuple(next(iter(self._files.values())))
         self._settings = read_folder_settings(self.path / SETTINGS_FILE)
         self.ego_box = self._settings.ego_box
@@ -259,12 +242,12 @@ class FolderRecording(Recording):
         else:
             points_m = read_cloud(path)
         heights_m = read_heights(path, len(points_m)) if sensor == REFERENCE else None
-        settings = self._settings.cloud_settings.get(folder, CloudSettings())
-        if settings.flip_y:
+        entry = self._settings.entries.get(folder, _SensorEntry())
+        if entry.flip_y:
             points_m[:, 1] *= -1
         extrinsics = self._extrinsics[folder]
-        vehicle_T_sensor = settings.vehicle_T_sensor if extrinsics is None else extrinsics[index]
-        return Scan(points_m, vehicle_T_sensor, str(path), settings.min_range_m, weights, heights_m)
+        vehicle_T_sensor = self._settings.extrinsics.get(folder) if extrinsics is None else extrinsics[index]
+        return Scan(points_m, vehicle_T_sensor, str(path), entry.min_range_m, weights, heights_m)
 
     def get_world_T_vehicle(self, index: int) -> Matrix | None:
         """Return the (4, 4) pose of the vehicle in a frame; None without `poses.csv`."""
@@ -282,15 +265,15 @@ class FolderRecording(Recording):
     def _check_settings(self) -> None:
         """Check that entries have folders, and that extrinsics are given once."""
         file = self.path / SETTINGS_FILE
-        for folder, settings in self._settings.cloud_settings.items():
+        for folder, entry in self._settings.entries.items():
             key = folder.replace("/", ".")
             if folder not in self._files:
                 raise ValueError(f"{file}: {key}: the folder {folder}/ does not exist in the recording")
             has_table = self._extrinsics[folder] is not None
-            has_matrix = settings.vehicle_T_sensor is not None
+            has_matrix = entry.vehicle_T_sensor is not None
             if has_table and has_matrix:
                 raise ValueError(f"{file}: {key}.vehicle_T_sensor: {folder}/{POSES_FILE} has it too; keep one of them")
-            if settings.min_range_m and not has_table and not has_matrix:
+            if entry.min_range_m and not has_table and not has_matrix:
                 raise ValueError(f"{file}: {key}.min_range_m: it needs vehicle_T_sensor, the pose of the sensor")
 
 

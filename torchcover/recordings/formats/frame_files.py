@@ -21,6 +21,8 @@ POSITION_COLUMNS = ("x_m", "y_m", "z_m")
 QUATERNION_COLUMNS = ("qw", "qx", "qy", "qz")
 BOX_COLUMNS = (*POSITION_COLUMNS, "length_m", "width_m", "height_m", "yaw_rad")
 VELOCITY_COLUMNS = ("vx_mps", "vy_mps")
+# Folder with a table of objects for each frame.
+BOX_FOLDER = "boxes"
 
 
 def find_frame_files(
@@ -88,6 +90,25 @@ def check_same_names(folder: Path, files_by_folder: Mapping[str, Mapping[str, ob
             complaints.append(f"{len(missing)} missing in {name}/ ({format_names(missing)})")
     if complaints:
         raise ValueError(f"{folder}: every frame needs a file in {folders}; {' and '.join(complaints)}")
+
+
+def check_frames_with_boxes(folder: Path, files_by_folder: Mapping[str, Mapping[str, Path]]) -> bool:
+    """Check that all folders of clouds, and the folder of boxes if there is one, have the same frames.
+
+    Args:
+        folder: Recording.
+        files_by_folder: Name of each folder of clouds and its files by frame name.
+
+    Returns:
+        Whether there is a folder of boxes.
+
+    Raises:
+        ValueError: There are no frames, or a folder lacks some of them.
+    """
+    has_boxes = (folder / BOX_FOLDER).is_dir()
+    box_files = {file.stem: file for file in (folder / BOX_FOLDER).glob("*.csv")}
+    check_same_names(folder, {**files_by_folder, BOX_FOLDER: box_files} if has_boxes else files_by_folder)
+    return has_boxes
 
 
 def find_frame_rows(table_frames: Sequence[str], frame_names: Sequence[str]) -> list[int]:

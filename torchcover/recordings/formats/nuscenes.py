@@ -46,6 +46,7 @@ class NuScenes(Recording):
     """
 
     layout: ClassVar[str] = "v1.0-*/*.json, samples/LIDAR_TOP, sweeps/LIDAR_TOP"
+    times_s: NDArray[np.float64]
     sensors = (CHANNEL,)
     # Outline of 4.08 x 1.73 m, up to a little above the LiDAR.
     ego_box: BoundingBox | None = BoundingBox((-2.042, -0.865, 0.05), (2.042, 0.865, 2.04))

@@ -15,11 +15,11 @@ from torchcover.geometry import invert
 from torchcover.geometry.arrays import Int64
 from torchcover.geometry.rigid import Matrix
 from torchcover.recordings.formats.bag import (
+    POINT_TIME_PARAMS,
     POINT_TIME_UNITS,
     SUFFIXES,
     Bag,
     CloudMessage,
-    PointTimeParams,
     PointTimes,
     choose_point_times,
     parse_cloud,
@@ -80,7 +80,6 @@ class RosBag(Recording):
         mounts: Name of a sensor and its (4, 4) `vehicle_T_sensor`, if the bag lacks it or is wrong.
         point_time_unit: Unit of point times: `s`, `ms`, `us`, `ns`, `scan_share` (shares of the scan period), or `none`
             to ignore them. Default: the unit that fits the scan period.
-        params: Selection and synchronization of scans.
 
     Raises:
         FileNotFoundError: A file is missing.
@@ -99,10 +98,9 @@ class RosBag(Recording):
         vehicle_frame: str | None = None,
         mounts: Mapping[str, Matrix] | None = None,
         point_time_unit: str | None = None,
-        params: BagParams = BagParams(),
     ) -> None:
         self.path = Path(path)
-        self._params = params
+        self._params = BagParams()
         if point_time_unit not in (None, *POINT_TIME_UNITS):
             raise ValueError(
                 f"point_time_unit: one of {', '.join(POINT_TIME_UNITS)} is needed; got {point_time_unit!r}"
@@ -133,7 +131,7 @@ class RosBag(Recording):
             if len(pose_sources) > 1:
                 unused = ", ".join(poses.source for poses in pose_sources[1:])
                 self._warn(f"poses are read from {pose_sources[0].source}, not from {unused}")
-            if self._poses is not None and self._poses.max_disagreement_m > params.max_disagreement_m:
+            if self._poses is not None and self._poses.max_disagreement_m > self._params.max_disagreement_m:
                 self._warn(
                     f"poses of {self._poses.source} jump to and fro by {self._poses.max_disagreement_m:.2g} m: do two "
                     "nodes send them? Record the bag again with one of them"
@@ -281,7 +279,7 @@ class RosBag(Recording):
         """Choose the unit of the point times of a sensor by its middle scan."""
         log_times_ns, stamps_ns = self._log_times_ns[sensor], np.unique(self._stamps_ns[sensor])
         period_s = float(np.median(np.diff(stamps_ns))) * 1e-9 if len(stamps_ns) > 1 else None
-        default_period_s = PointTimeParams().default_period_s
+        default_period_s = POINT_TIME_PARAMS.default_period_s
         if point_time_unit is not None:
             return PointTimes(point_time_unit, period_s or default_period_s)
         message = self._bag.read_message(self._get_topic(sensor), int(log_times_ns[len(log_times_ns) // 2]))
