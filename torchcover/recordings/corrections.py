@@ -3,7 +3,7 @@
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -89,9 +89,8 @@ def correct_recording(recording: Recording, settings: RecordingSettings) -> Reco
     Returns:
         The corrected recording, or `recording` itself if there is nothing to correct.
     """
-    corrected: Any = CorrectedRecording(recording, settings)  # mypy does not know the attributes that it passes on
-    result: Recording = corrected if settings.corrections else recording
-    return result
+    # mypy does not know the attributes that a corrected recording passes on.
+    return cast(Recording, CorrectedRecording(recording, settings)) if settings.corrections else recording
 
 
 def correct_poses(world_T_vehicle: Matrix, times_s: Float64, settings: RecordingSettings) -> Matrix:

@@ -84,6 +84,9 @@ class GroundModelParams:
         return int(2 * self.range_m / self.square_m) + 2 * self.reach_squares + 1
 
 
+PARAMS = GroundModelParams()
+
+
 class GroundModel(NamedTuple):
     """Ground around a vehicle, in the frame of the points that it was made of.
 
@@ -91,70 +94,59 @@ class GroundModel(NamedTuple):
         corner_m: (2,) corner of the area with the smallest x and y.
         height_field: Heights from that corner on.
         observed: (S * S,) squares with a known height, rows along y; they begin `reach_squares` before the corner.
-        params: Parameters of the model.
     """
 
     corner_m: Float64
     height_field: HeightField
     observed: Bools
-    params: GroundModelParams = GroundModelParams()
 
     @classmethod
-    def from_surfaces(
-        cls,
-        surfaces: Sequence[Float64],
-        vehicle_position_m: Float64,
-        params: GroundModelParams = GroundModelParams(),
-    ) -> "GroundModel | None":
+    def from_surfaces(cls, surfaces: Sequence[Float64], vehicle_position_m: Float64) -> "GroundModel | None":
         """Fit the ground that sweeps observed around a vehicle.
 
         Args:
             surfaces: (K, 4) result of `extract_low_surfaces` for each sweep.
             vehicle_position_m: (3,) position of the vehicle.
-            params: Parameters of the model.
 
         Returns:
             The model; None if there is no ground near the vehicle.
         """
-        low, object_bottom_m = _group_columns(np.concatenate([np.empty((0, 4)), *surfaces]), vehicle_position_m, params)
+        low, object_bottom_m = _group_columns(np.concatenate([np.empty((0, 4)), *surfaces]), vehicle_position_m)
         if not len(low):
             return None
-        corner_m = vehicle_position_m[:2] - params.range_m
-        has_object = object_bottom_m - low[:, 2] < params.max_object_height_m
-        is_clear = ~_mark_near_objects(low, has_object, corner_m, params)
+        corner_m = vehicle_position_m[:2] - PARAMS.range_m
+        has_object = object_bottom_m - low[:, 2] < PARAMS.max_object_height_m
+        is_clear = ~_mark_near_objects(low, has_object, corner_m)
         clear = np.flatnonzero(is_clear[~has_object])
         horizontal_m, heights_m = low[~has_object, :2] - corner_m, low[~has_object, 2]
-        square = _number_squares(horizontal_m, params)
+        square = _number_squares(horizontal_m)
         # Cells begin at multiples of the coarsest one, so that results do not depend on where points begin.
-        coarsest_m = params.coarse_cells_m[0]
+        coarsest_m = PARAMS.coarse_cells_m[0]
         first_m = coarsest_m * np.floor((low[:, :2].min(axis=0) - corner_m) / coarsest_m)
         horizontal_m -= first_m
         extent_m = low[:, :2].max(axis=0) - corner_m - first_m
-        chosen = clear[_choose_representatives(square[clear], heights_m[clear], params)]
+        chosen = clear[_choose_representatives(square[clear], heights_m[clear])]
         for _ in range(2):
-            connected = _connect_squares(square[chosen], heights_m[chosen] - vehicle_position_m[2], params)
+            connected = _connect_squares(square[chosen], heights_m[chosen] - vehicle_position_m[2])
             chosen = chosen[connected[square[chosen]]]
-            if len(chosen) < params.min_squares:
+            if len(chosen) < PARAMS.min_squares:
                 return None
+            cells_m, above_weight = PARAMS.coarse_cells_m, PARAMS.above_weight
             field = fit_height_field(
-                horizontal_m[chosen],
-                heights_m[chosen],
-                extent_m,
-                params.coarse_cells_m,
-                above_weight=params.above_weight,
+                horizontal_m[chosen], heights_m[chosen], extent_m, cells_m, above_weight=above_weight
             )
             residual_m = heights_m[chosen] - field.compute_heights_m(horizontal_m[chosen])
-            on_field = np.abs(residual_m) < params.max_residual_m
-            if on_field.mean() < params.min_fitted_share:
+            on_field = np.abs(residual_m) < PARAMS.max_residual_m
+            if on_field.mean() < PARAMS.min_fitted_share:
                 return None
             chosen = chosen[on_field]
         inside = connected[square]
         field = fit_height_field(
-            horizontal_m[inside], heights_m[inside], extent_m, params.fine_cells_m, base_field=field
+            horizontal_m[inside], heights_m[inside], extent_m, PARAMS.fine_cells_m, base_field=field
         )
-        observed = np.zeros(params.squares_per_side**2, dtype=np.bool_)
-        observed[square[chosen][:, None] + _list_neighbors(params)[0]] = True
-        return cls(corner_m, field._replace(origin_m=field.origin_m + first_m), observed, params)
+        observed = np.zeros(PARAMS.squares_per_side**2, dtype=np.bool_)
+        observed[square[chosen][:, None] + _list_neighbors()[0]] = True
+        return cls(corner_m, field._replace(origin_m=field.origin_m + first_m), observed)
 
     def compute_heights_m(self, points_m: NDArray[np.floating]) -> Float64:
         """Compute the height of points above the ground.
@@ -167,44 +159,41 @@ class GroundModel(NamedTuple):
         """
         horizontal_m = points_m[:, :2] - self.corner_m
         heights_m = np.full(len(points_m), np.nan)
-        inside = np.flatnonzero(((horizontal_m >= 0) & (horizontal_m < 2 * self.params.range_m)).all(axis=1))
-        inside = inside[self.observed[_number_squares(horizontal_m[inside], self.params)]]
+        inside = np.flatnonzero(((horizontal_m >= 0) & (horizontal_m < 2 * PARAMS.range_m)).all(axis=1))
+        inside = inside[self.observed[_number_squares(horizontal_m[inside])]]
         heights_m[inside] = points_m[inside, 2] - self.height_field.compute_heights_m(horizontal_m[inside])
         return heights_m
 
 
-def extract_low_surfaces(
-    points_m: Float64, vehicle_position_m: Float64, params: GroundModelParams = GroundModelParams()
-) -> Float64:
+def extract_low_surfaces(points_m: Float64, vehicle_position_m: Float64) -> Float64:
     """Extract what a sweep says about the ground, much less than all of its points.
 
     Args:
         points_m: (N, 3) points of static surfaces; z points up.
         vehicle_position_m: (3,) position of the vehicle in the same frame.
-        params: Parameters of the ground model.
 
     Returns:
         (K, 4) positions of the low surfaces of columns with their numbers of points, then the lowest point of what is
         above each, as one point.
     """
     weighted_points = np.column_stack([points_m, np.ones(len(points_m))])
-    low, object_bottom_m = _group_columns(weighted_points, vehicle_position_m, params)
+    low, object_bottom_m = _group_columns(weighted_points, vehicle_position_m)
     has_object = np.isfinite(object_bottom_m)
     count = np.ones(np.count_nonzero(has_object))
     return np.concatenate([low, np.column_stack([low[has_object, :2], object_bottom_m[has_object], count])])
 
 
-def _group_columns(points: Float64, vehicle_position_m: Float64, params: GroundModelParams) -> tuple[Float64, Float64]:
+def _group_columns(points: Float64, vehicle_position_m: Float64) -> tuple[Float64, Float64]:
     """Group (N, 4) points with counts by column.
 
     Returns:
         (K, 4) low surfaces, and (K,) height at which an object above each begins, inf without one.
     """
-    points = points[(np.abs(points[:, :3] - vehicle_position_m) < params.range_m).all(axis=1)]
-    first_cell = np.floor((vehicle_position_m[:2] - params.range_m) / params.column_m).astype(int)
-    cells = np.floor(points[:, :2] / params.column_m).astype(np.int64) - first_cell
+    points = points[(np.abs(points[:, :3] - vehicle_position_m) < PARAMS.range_m).all(axis=1)]
+    first_cell = np.floor((vehicle_position_m[:2] - PARAMS.range_m) / PARAMS.column_m).astype(int)
+    cells = np.floor(points[:, :2] / PARAMS.column_m).astype(np.int64) - first_cell
     key = (cells[:, 1] << 10) + cells[:, 0]  # 10 bits hold the columns of 400 m, 29 bits its micrometers
-    height_um = (1e6 * (points[:, 2] - vehicle_position_m[2] + params.range_m)).astype(np.int64)
+    height_um = (1e6 * (points[:, 2] - vehicle_position_m[2] + PARAMS.range_m)).astype(np.int64)
     order = np.argsort((key << 29) + height_um, kind="stable")
     key, points = key[order], points[order]
     if not len(key):
@@ -214,63 +203,63 @@ def _group_columns(points: Float64, vehicle_position_m: Float64, params: GroundM
     column = np.repeat(np.arange(len(first)), np.diff(np.append(first, len(key))))
     z, count = points[:, 2:].T
     is_confirmed = count > 1
-    is_confirmed[:-1] |= is_same_column & (np.diff(z) <= params.thickness_m)
+    is_confirmed[:-1] |= is_same_column & (np.diff(z) <= PARAMS.thickness_m)
     bottom = np.minimum.reduceat(np.where(is_confirmed, np.arange(len(z)), len(z)), first)
     height_m = z - z[np.where(bottom < len(z), bottom, first)][column]
-    weights = count * ((height_m >= 0) & (height_m <= params.thickness_m))
+    weights = count * ((height_m >= 0) & (height_m <= PARAMS.thickness_m))
     total_weight = np.bincount(column, weights)
     means = [np.bincount(column, weights * coordinate_m) / total_weight for coordinate_m in points[:, :3].T]
     low = np.stack([*means, total_weight], axis=1)
-    is_above = z > low[column, 2] + params.min_object_height_m
+    is_above = z > low[column, 2] + PARAMS.min_object_height_m
     return low, np.minimum.reduceat(np.where(is_above, z, np.inf), first)
 
 
-def _mark_near_objects(low: Float64, has_object: Bools, corner_m: Float64, params: GroundModelParams) -> Bools:
+def _mark_near_objects(low: Float64, has_object: Bools, corner_m: Float64) -> Bools:
     """Mark the (K,) columns with an object, or next to one that begins no higher."""
-    first_cell = np.floor(corner_m / params.column_m)
-    x, y = (np.floor(low[:, :2] / params.column_m) - first_cell).astype(np.int64).T + 1
-    bottom_m = np.full(np.full(2, int(2 * params.range_m / params.column_m) + 3), np.inf)
+    first_cell = np.floor(corner_m / PARAMS.column_m)
+    x, y = (np.floor(low[:, :2] / PARAMS.column_m) - first_cell).astype(np.int64).T + 1
+    bottom_m = np.full(np.full(2, int(2 * PARAMS.range_m / PARAMS.column_m) + 3), np.inf)
     bottom_m[y[has_object], x[has_object]] = low[has_object, 2]
     dy, dx = np.indices((3, 3)).reshape(2, -1, 1) - 1
     lowest_m = bottom_m[y + dy, x + dx].min(axis=0)
-    return np.asarray(low[:, 2] > lowest_m - params.thickness_m)
+    return np.asarray(low[:, 2] > lowest_m - PARAMS.thickness_m)
 
 
-def _number_squares(horizontal_m: Float64, params: GroundModelParams) -> Int64:
+def _number_squares(horizontal_m: Float64) -> Int64:
     """Number the squares of (N, 2) positions relative to the corner."""
-    x, y = (horizontal_m / params.square_m).astype(np.int64).T + params.reach_squares
-    return np.asarray(y * params.squares_per_side + x)
+    x, y = (horizontal_m / PARAMS.square_m).astype(np.int64).T + PARAMS.reach_squares
+    return np.asarray(y * PARAMS.squares_per_side + x)
 
 
-def _choose_representatives(square: Int64, heights_m: Float64, params: GroundModelParams) -> Int64:
+def _choose_representatives(square: Int64, heights_m: Float64) -> Int64:
     """Choose the column of each square that represents it."""
     order = np.lexsort((heights_m, square))
     first = np.flatnonzero(np.diff(square[order], prepend=-1))
     count = np.diff(np.append(first, len(order)))
-    return np.asarray(order[first + (params.quantile * count).astype(np.int64)])
+    return np.asarray(order[first + (PARAMS.quantile * count).astype(np.int64)])
 
 
-def _list_neighbors(params: GroundModelParams) -> tuple[Int64, Float64]:
+def _list_neighbors() -> tuple[Int64, Float64]:
     """List the steps from a square to all within reach, and their distances in meters."""
-    reach = params.reach_squares
+    reach = PARAMS.reach_squares
     y, x = np.indices((2 * reach + 1, 2 * reach + 1)).reshape(2, -1) - reach
     is_near = np.hypot(x, y) <= reach
-    return (y * params.squares_per_side + x)[is_near], params.square_m * np.hypot(x, y)[is_near]
+    return (y * PARAMS.squares_per_side + x)[is_near], PARAMS.square_m * np.hypot(x, y)[is_near]
 
 
-def _connect_squares(square: Int64, heights_m: Float64, params: GroundModelParams) -> Bools:
+def _connect_squares(square: Int64, heights_m: Float64) -> Bools:
     """Mark the (S * S,) squares that are connected with the vehicle; heights are above its origin."""
-    side = params.squares_per_side
+    side = PARAMS.squares_per_side
     height_m, connected = np.full(side**2, np.nan), np.zeros(side**2, dtype=np.bool_)
     height_m[square] = heights_m
-    distance_m = params.square_m * np.hypot(*(np.array(np.divmod(square, side)) - side // 2))
-    max_distance_m = distance_m.min(initial=2 * params.start_radius_m) + params.start_radius_m
-    is_start = (distance_m <= max_distance_m) & (heights_m < params.max_start_height_m)
+    distance_m = PARAMS.square_m * np.hypot(*(np.array(np.divmod(square, side)) - side // 2))
+    max_distance_m = distance_m.min(initial=2 * PARAMS.start_radius_m) + PARAMS.start_radius_m
+    is_start = (distance_m <= max_distance_m) & (heights_m < PARAMS.max_start_height_m)
     front = square[is_start]
     if len(front):
-        front = front[np.abs(heights_m[is_start] - np.median(heights_m[is_start])) < params.max_step_m]
-    steps, step_m = _list_neighbors(params)
-    max_rise_m = np.minimum(params.curb_m + params.max_slope * step_m, params.max_step_m)
+        front = front[np.abs(heights_m[is_start] - np.median(heights_m[is_start])) < PARAMS.max_step_m]
+    steps, step_m = _list_neighbors()
+    max_rise_m = np.minimum(PARAMS.curb_m + PARAMS.max_slope * step_m, PARAMS.max_step_m)
     while len(front):
         connected[front] = True
         neighbors = front[:, None] + steps

@@ -16,6 +16,7 @@ from torchcover.files import load_road_user_classes, report_bad_file
 from torchcover.geometry import BoundingBox, build_transform, convert_quaternion_to_rotation, invert
 from torchcover.geometry.rigid import Matrix
 from torchcover.geometry.trajectory import Trajectory
+from torchcover.recordings.formats.frame_files import stack_columns
 from torchcover.recordings.isolated_readers import read_feather
 from torchcover.recordings.objects import (
     Ego,
@@ -243,7 +244,7 @@ def read_objects(path: Path) -> RecordedObjects:
 def _build_states(columns: Mapping[str, NDArray[Any]], origin_ns: int) -> list[ObjectState]:
     """Build the states of cuboids in the ego frame at their times, relative to an origin."""
     times_s, poses = _to_seconds(columns, origin_ns).tolist(), build_poses(columns)
-    sizes_m = np.column_stack([columns[name] for name in SIZE_COLUMNS]).tolist()
+    sizes_m = stack_columns(columns, SIZE_COLUMNS).tolist()
     rows = zip(columns["track_uuid"], columns["category"], times_s, poses, sizes_m, strict=True)
     states = []
     for name, category, time_s, pose, size_m in rows:
@@ -265,8 +266,7 @@ def build_poses(columns: Mapping[str, NDArray[Any]]) -> Matrix:
     Returns:
         (N, 4, 4) transforms.
     """
-    quaternions = np.column_stack([columns[name] for name in POSE_COLUMNS[:4]])
-    positions_m = np.column_stack([columns[name] for name in POSE_COLUMNS[4:]])
+    quaternions, positions_m = stack_columns(columns, POSE_COLUMNS[:4]), stack_columns(columns, POSE_COLUMNS[4:])
     return build_transform(convert_quaternion_to_rotation(quaternions), positions_m)
 
 

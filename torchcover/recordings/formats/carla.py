@@ -9,7 +9,7 @@ from typing import Annotated, ClassVar, Self
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pydantic import AliasChoices, BaseModel, ConfigDict, Field, TypeAdapter, ValidationError, model_validator
 
 from torchcover.cameras import Camera, read_depth
@@ -32,6 +32,7 @@ from torchcover.recordings.formats.frame_files import (
     check_frames_with_boxes,
     find_frame_files,
     find_frame_rows,
+    stack_columns,
 )
 from torchcover.recordings.recording import GROUND_CLEARANCE_M, Recording, Scan, check_times
 
@@ -225,7 +226,7 @@ def read_carla_boxes(path: Path, vehicle_T_world: Matrix) -> Boxes:
         UserWarning: Boxes without a size are excluded; CARLA 0.9.8 to 0.9.14 writes some for bicycles and walkers.
     """
     table = read_csv(path, (*POSE_COLUMNS, *EXTENT_COLUMNS), ("id", "category"), VELOCITY_COLUMNS)
-    has_size = np.all([table.numbers[name] > 0 for name in EXTENT_COLUMNS], axis=0)
+    has_size = (stack_columns(table.numbers, EXTENT_COLUMNS) > 0).all(axis=1)
     numbers, count = {name: column[has_size] for name, column in table.numbers.items()}, int(has_size.sum())
     if count < len(has_size):
         empty = int(np.argmin(has_size))
@@ -235,8 +236,8 @@ def read_carla_boxes(path: Path, vehicle_T_world: Matrix) -> Boxes:
             f"in one frame, such as {table.texts['id'][empty]} ({table.texts['category'][empty]}): {extent}",
             stacklevel=2,
         )
-    poses = to_right_handed([numbers[name] for name in POSE_COLUMNS])
-    size_m = 2 * np.column_stack([numbers[name] for name in EXTENT_COLUMNS])
+    poses = to_right_handed(stack_columns(numbers, POSE_COLUMNS).T)
+    size_m = 2 * stack_columns(numbers, EXTENT_COLUMNS)
     unknown = np.full(count, np.nan)
     velocity_mps = np.column_stack([numbers.get(name, unknown) for name in VELOCITY_COLUMNS]) * [1.0, -1.0]
     velocity_mps = velocity_mps @ vehicle_T_world[:2, :2].T
@@ -249,16 +250,16 @@ def read_carla_boxes(path: Path, vehicle_T_world: Matrix) -> Boxes:
         )
 
 
-def to_right_handed(pose: list[float] | list[NDArray[np.float64]]) -> Matrix:
+def to_right_handed(pose: ArrayLike) -> Matrix:
     """Convert poses from CARLA's axes (y to the right, positive yaw right, positive pitch up) to right-handed ones.
 
     Args:
-        pose: x, y, z in meters and roll, pitch, yaw in degrees, each a number or an (N,) array.
+        pose: (6,) or (6, N) x, y, z in meters and roll, pitch, yaw in degrees.
 
     Returns:
         (..., 4, 4) transforms.
     """
-    x, y, z, roll, pitch, yaw = (np.asarray(values) for values in pose)
+    x, y, z, roll, pitch, yaw = np.asarray(pose)
     return build_transform(convert_euler_to_rotation(-yaw, -pitch, roll), np.stack([x, -y, z], axis=-1))
 
 
@@ -436,7 +437,7 @@ class Carla(Recording):
         table = read_csv(path, (*time_columns, *POSE_COLUMNS), ("frame",))
         with report_bad_file(path, "a table of poses"):
             order = find_frame_rows(table.texts["frame"], self._file_names)
-        poses = to_right_handed([table.numbers[name][order] for name in POSE_COLUMNS])
+        poses = to_right_handed(stack_columns(table.numbers, POSE_COLUMNS)[order].T)
         return (table.numbers["time_s"][order] if time_columns else np.empty(0)), poses
 
 

@@ -5,6 +5,7 @@ import re
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -136,6 +137,19 @@ def find_frame_rows(table_frames: Sequence[str], frame_names: Sequence[str]) -> 
     return [rows[name] for name in frame_names]
 
 
+def stack_columns(columns: Mapping[str, NDArray[Any]], names: Sequence[str]) -> NDArray[Any]:
+    """Stack columns of a table.
+
+    Args:
+        columns: Columns of equal length by name.
+        names: Names of the columns in the desired order.
+
+    Returns:
+        (rows, names) values.
+    """
+    return np.column_stack([columns[name] for name in names])
+
+
 def make_natural_sort_key(name: str) -> tuple[list[str | int], str]:
     """Make a key that sorts names with the numbers in them by value.
 
@@ -187,8 +201,8 @@ class PoseTable:
         with report_bad_file(path, "a table of poses"):
             order = find_frame_rows(table.texts["frame"], frame_names)
             columns = {name: values[order] for name, values in table.numbers.items()}
-            self._positions_m = np.column_stack([columns[name] for name in POSITION_COLUMNS])
-            self._wxyz = np.column_stack([columns[name] for name in QUATERNION_COLUMNS])
+            self._positions_m = stack_columns(columns, POSITION_COLUMNS)
+            self._wxyz = stack_columns(columns, QUATERNION_COLUMNS)
             norms = np.linalg.norm(self._wxyz, axis=1)
             bad = np.flatnonzero(~(np.abs(norms - 1) <= RIGID_TOLERANCE))
             if len(bad):
@@ -238,8 +252,7 @@ def read_boxes(path: Path) -> Boxes:
             fields["sampled_points"] = torch.tensor(counts, device="cpu")
         if "bottom_height_m" in numbers:
             fields["bottom_heights_m"] = torch.from_numpy(numbers["bottom_height_m"]).float()
-        rows = np.column_stack([numbers[name] for name in BOX_COLUMNS])
-        return Boxes.from_rows(torch.from_numpy(rows).float(), **fields)
+        return Boxes.from_rows(torch.from_numpy(stack_columns(numbers, BOX_COLUMNS)).float(), **fields)
 
 
 def write_boxes(path: Path, boxes: Boxes) -> None:

@@ -93,10 +93,9 @@ class NuScenes(Recording):
     def read_calibrations(self) -> SensorCalibrations:
         """Read the extrinsics of the LiDAR and the cameras of its first key frame."""
         with report_bad_file(self._tables, "tables of nuScenes"):
-            sample_token = self._sample_tokens[self.key_frames[0]]
             rows = {}
             for row in read_json_table(self._tables / "sample_data.json").rows:
-                is_in_frame = row["sample_token"] == sample_token and row["is_key_frame"]
+                is_in_frame = row["sample_token"] == self._sample_token and row["is_key_frame"]
                 if is_in_frame and "/CAM_" in str(row["filename"]):
                     rows[str(row["filename"])] = row
             cameras = []
@@ -127,20 +126,26 @@ class NuScenes(Recording):
             if f"/{CHANNEL}/" in str(row["filename"]) and row["sample_token"] in samples:
                 data.append(row)
         data.sort(key=itemgetter("timestamp"))
-        self.frame_names = tuple(row["filename"].rpartition("/")[2].removesuffix(".pcd.bin") for row in data)
         self.key_frames = [index for index, row in enumerate(data) if row["is_key_frame"]]
         if not self.key_frames:
             raise ValueError(f"no key frame of {CHANNEL}")
         self.times_s = check_times(np.array([row["timestamp"] for row in data]) * 1e-6, len(data), CHANNEL)
-        self._files = [check_path_within(self.path, row["filename"]) for row in data]
-        pose_rows = [poses.get_row(row["ego_pose_token"]) for row in data]
-        self._rotations = np.array([row["rotation"] for row in pose_rows], dtype=np.float64)
-        self._positions_m = np.array([row["translation"] for row in pose_rows], dtype=np.float64)
+        self._files, self._mounts, names, rotations, positions_m = list[str](), list[Matrix](), [], [], []
+        mounts: dict[str, Matrix] = {}
+        for row in data:
+            names.append(row["filename"].rpartition("/")[2].removesuffix(".pcd.bin"))
+            self._files.append(check_path_within(self.path, row["filename"]))
+            pose, token = poses.get_row(row["ego_pose_token"]), row["calibrated_sensor_token"]
+            rotations.append(pose["rotation"])
+            positions_m.append(pose["translation"])
+            if token not in mounts:
+                mounts[token] = parse_pose(calibrations.get_row(token))
+            self._mounts.append(mounts[token])
+        self.frame_names = tuple(names)
+        self._rotations = np.array(rotations, dtype=np.float64)
+        self._positions_m = np.array(positions_m, dtype=np.float64)
         _check_poses(self._rotations, self._positions_m)
-        calibration_tokens = [row["calibrated_sensor_token"] for row in data]
-        mounts = {token: parse_pose(calibrations.get_row(token)) for token in set(calibration_tokens)}
-        self._mounts = [mounts[token] for token in calibration_tokens]
-        self._sample_tokens = [row["sample_token"] for row in data]
+        self._sample_token = data[self.key_frames[0]]["sample_token"]
         self._tables, self._sample_times = tables, samples
 
     @cached_property

@@ -14,6 +14,7 @@ from torchcover.geometry import build_transform, check_rigid, convert_euler_to_r
 from torchcover.geometry.arrays import Float64
 from torchcover.geometry.rigid import Matrix, warn_about_radians
 from torchcover.geometry.trajectory import Trajectory
+from torchcover.recordings.formats.frame_files import stack_columns
 from torchcover.recordings.objects import (
     Ego,
     RecordedObjects,
@@ -130,7 +131,7 @@ def _check_degrees(drives: Sequence[tuple[Float64, Float64]]) -> None:
 
 def _stack_columns(numbers: Mapping[str, Float64], names: Sequence[str]) -> Float64:
     """Stack columns of a table as (rows, names)."""
-    rows = np.column_stack([numbers[name] for name in names])
+    rows = stack_columns(numbers, names)
     if not len(rows):
         raise ValueError("holds no row")
     return rows
