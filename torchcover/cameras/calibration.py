@@ -198,7 +198,7 @@ def read_opencv(
         FileNotFoundError: There is no such file.
         BadFileError: An entry is missing or invalid; the message lists the entries of the file.
     """
-    content = _read_yaml(path)
+    content = _check_mapping(parse_yaml(read_short_text(path)))
     required = [matrix_key, distortion_key] + ([] if size else ["image_width", "image_height"])
     missing = [key for key in required if key not in content]
     if missing:
@@ -319,10 +319,6 @@ def _apply_region_and_binning(
         K[axis] /= binning
         sides.append((cut or length) // binning)
     return (sides[0], sides[1]), K
-
-
-def _read_yaml(path: Path) -> dict[str, Any]:
-    return _check_mapping(parse_yaml(read_short_text(path)))
 
 
 def _check_mapping(content: object) -> dict[str, Any]:

@@ -182,18 +182,13 @@ class RayTable:
         rows = torch.arange(height, dtype=torch.float64, device=device)
         columns = torch.arange(width, dtype=torch.float64, device=device)
         max_pixels = 1 << 20  # limits the memory of the float64 rays while a table is made
-        parts = []
-        statuses = []
+        parts, statuses = [], []
         for rows_of_part in torch.split(rows, max(1, max_pixels // width)):
-            part, part_status = self._trace_rows(rows_of_part, columns, dtype)
-            parts.append(part)
-            statuses.append(part_status)
+            y, x = torch.meshgrid(rows_of_part, columns, indexing="ij")
+            directions, part_status = self._optics.unproject(torch.stack((x, y), dim=-1).reshape(-1, 2))
+            parts.append(directions.to(dtype).reshape(*y.shape, 3))
+            statuses.append(part_status.reshape(y.shape))
         status = torch.cat(statuses)
         codes = {"pixels_valid": ANSWERED, "pixels_outside": OUTSIDE, "pixels_unconverged": UNCONVERGED}
         self._pixel_counts = {name: int((status == code).sum()) for name, code in codes.items()}
         return torch.cat(parts), status == ANSWERED
-
-    def _trace_rows(self, rows: Tensor, columns: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-        y, x = torch.meshgrid(rows, columns, indexing="ij")
-        directions, status = self._optics.unproject(torch.stack((x, y), dim=-1).reshape(-1, 2))
-        return directions.to(dtype).reshape(*y.shape, 3), status.reshape(y.shape)

@@ -228,12 +228,10 @@ class BestCorrelation(NamedTuple):
     """Strongest rank correlation of several series with one target, compared with chance.
 
     Args:
-        strongest: Absolute rank correlation of the best series; NaN if none is known.
         p_value: Two-sided probability that the best series is as strong by chance.
         chance_correlations: (P,) strongest correlation for each permutation of the target.
     """
 
-    strongest: float
     p_value: float
     chance_correlations: Float64
 
@@ -249,7 +247,7 @@ def check_best_correlation(first: ArrayLike, second: ArrayLike, seed: int = 0) -
         seed: Seed of sampled permutations.
 
     Returns:
-        Strongest correlation and its p-value, corrected for the choice among k series.
+        p-value of the strongest correlation, corrected for the choice among k series.
     """
     series, target = np.atleast_2d(np.asarray(first, dtype=np.float64)), np.asarray(second, dtype=np.float64)
 
@@ -261,7 +259,7 @@ def check_best_correlation(first: ArrayLike, second: ArrayLike, seed: int = 0) -
 
     observed = np.abs([compute_spearman(values, target) for values in series])
     if np.isnan(observed).all():
-        return BestCorrelation(math.nan, math.nan, np.empty(0))
+        return BestCorrelation(math.nan, np.empty(0))
     test = permutation_test(
         (target,),
         find_strongest,
@@ -271,7 +269,7 @@ def check_best_correlation(first: ArrayLike, second: ArrayLike, seed: int = 0) -
         alternative="greater",
         rng=np.random.default_rng(seed),
     )
-    return BestCorrelation(float(np.nanmax(observed)), float(test.pvalue), test.null_distribution)
+    return BestCorrelation(float(test.pvalue), test.null_distribution)
 
 
 def _mask_unknown(first: ArrayLike, second: ArrayLike) -> tuple[Float64, Float64]:

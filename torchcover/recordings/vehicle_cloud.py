@@ -67,10 +67,16 @@ def transform_to_vehicle(scan: Scan, ego_box: BoundingBox | None = None) -> Vehi
             inside = find_points_in_box(block_m, ego_box)
             block_m = np.delete(block_m, inside, axis=0) if len(inside) else block_m
             ego_rows.append(rows.start + inside)
-        with np.errstate(over="ignore"):  # _check_range refuses such coordinates
+        with np.errstate(over="ignore"):  # such coordinates are refused below
             cloud_m[count : count + len(block_m)] = block_m
         count += len(block_m)
-    _check_range(max_coordinate_m, scan.source)
+    limit_m = 1e5  # float32 resolves 8 mm here; clouds in world coordinates lie far beyond and would lose digits
+    if max_coordinate_m > limit_m:
+        raise ValueError(
+            f"{scan.source}: a coordinate of {max_coordinate_m:.6g} m in the vehicle frame, at most {limit_m:g} m is "
+            "allowed; if it is in millimeters, say so (--set recording.units=mm); for world coordinates give the pose "
+            "of the sensor (vehicle_T_sensor in frames.yaml)"
+        )
     if ego_box is not None:
         excluded["ego_vehicle"] = len(points_m) - count
     excluded_rows = np.concatenate(ego_rows)
@@ -135,14 +141,3 @@ def find_points_in_box(points_m: Points, box: BoundingBox) -> NDArray[np.intp]:
         candidates_m = coordinates_m[inside]
         inside = inside[(box.lower_m[axis] < candidates_m) & (candidates_m < box.upper_m[axis])]
     return inside
-
-
-def _check_range(max_coordinate_m: float, source: str) -> None:
-    """Check that coordinates are small enough for float32."""
-    limit_m = 1e5  # float32 resolves 8 mm here; clouds in world coordinates lie far beyond and would lose digits
-    if max_coordinate_m > limit_m:
-        raise ValueError(
-            f"{source}: a coordinate of {max_coordinate_m:.6g} m in the vehicle frame, at most {limit_m:g} m is "
-            "allowed; if it is in millimeters, say so (--set recording.units=mm); for world coordinates give the pose "
-            "of the sensor (vehicle_T_sensor in frames.yaml)"
-        )

@@ -63,7 +63,8 @@ def _choose_scale(contents: Mapping[int, bytes]) -> NDArray[np.float64]:
         UserWarning: Coordinates are converted, or only a code without a unit is given.
     """
     wkt_record, geo_keys_record = contents.get(2112, b""), contents.get(34735, b"")  # identifiers of the LAS format
-    keys = _parse_geo_keys(geo_keys_record)
+    numbers = np.frombuffer(geo_keys_record[: len(geo_keys_record) // 8 * 8], "<u2").reshape(-1, 4)[1:]
+    keys = dict(numbers[numbers[:, 1] == 0][:, [0, 3]].tolist())  # keys whose values are in the record itself
     units = _find_wkt_units(wkt_record) or _find_geo_key_units(keys)
     if units is None:
         return np.ones(3)
@@ -77,12 +78,6 @@ def _choose_scale(contents: Mapping[int, bytes]) -> NDArray[np.float64]:
             stacklevel=2,
         )
     return np.array([horizontal.meters, horizontal.meters, vertical.meters])
-
-
-def _parse_geo_keys(data: bytes) -> dict[int, int]:
-    """Parse the GeoKeys whose values are in the record itself."""
-    numbers = np.frombuffer(data[: len(data) // 8 * 8], "<u2").reshape(-1, 4)[1:].tolist()
-    return {key: value for key, location, _, value in numbers if location == 0}
 
 
 def _find_geo_key_units(keys: Mapping[int, int]) -> tuple[_Unit, _Unit | None] | None:

@@ -360,7 +360,17 @@ def parse_cloud(
     if time_field is None:
         return CloudMessage(points_m, stamp_ns, None, rings)
     offsets_s = _compute_offsets_s(table[time_field.name], stamp_ns, point_times)
-    return CloudMessage(points_m, stamp_ns, _check_offsets(offsets_s, points_m, time_field.name), rings)
+    limit_s = POINT_TIME_PARAMS.max_offset_s
+    finite_s = offsets_s[np.isfinite(points_m).all(axis=1)]
+    is_near = np.abs(finite_s) <= limit_s
+    if not is_near.all():
+        raise ValueError(
+            f"{time_field.name}: point times within {limit_s:g} s of the cloud are needed; got "
+            f"{finite_s[np.argmin(is_near)]:g} s"
+        )
+    # Other points get times within the limits.
+    offsets_s = np.nan_to_num(offsets_s, nan=0.0, posinf=0.0, neginf=0.0).clip(-limit_s, limit_s)
+    return CloudMessage(points_m, stamp_ns, offsets_s, rings)
 
 
 def choose_point_times(message: Any, period_s: float | None) -> tuple[PointTimes | None, str]:  # noqa: ANN401
@@ -478,15 +488,3 @@ def _compute_offsets_s(stored: NDArray[Any], stamp_ns: int, point_times: PointTi
     number_type = np.int64 if stored.dtype.kind in "iu" else np.float64
     units_since_stamp = stored.astype(number_type) - stamp_units
     return np.asarray(units_since_stamp * (unit_ns * 1e-9) - remainder_ns * 1e-9, dtype=np.float64)
-
-
-def _check_offsets(offsets_s: Float64, points_m: Points, name: str) -> Float64:
-    """Check that finite points have times close to the stamp; other points get times within the limits."""
-    limit_s = POINT_TIME_PARAMS.max_offset_s
-    finite_s = offsets_s[np.isfinite(points_m).all(axis=1)]
-    is_near = np.abs(finite_s) <= limit_s
-    if not is_near.all():
-        raise ValueError(
-            f"{name}: point times within {limit_s:g} s of the cloud are needed; got {finite_s[np.argmin(is_near)]:g} s"
-        )
-    return np.nan_to_num(offsets_s, nan=0.0, posinf=0.0, neginf=0.0).clip(-limit_s, limit_s)
