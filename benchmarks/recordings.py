@@ -32,6 +32,7 @@ from torchcover.data import (
 from torchcover.detection import find_points_in_boxes
 from torchcover.geometry import build_transform, convert_euler_to_rotation, invert, transform_points
 from torchcover.recordings.moving_clusters import MovingClusterParams, find_moving_clusters
+from torchcover.recordings.recording import Recording
 from torchcover.simulation import Lidar, PaperReference, Rig, Scenario
 
 EVERY_S = 0.1
@@ -73,12 +74,9 @@ class Case(NamedTuple):
         return f"{', '.join(self.sensors)}, {self.window_s:g} s, {labels}{', imperfect' if self.imperfect else ''}"
 
 
-class SimulatedDrive:
+class SimulatedDrive(Recording):
     """A `Recording` of sweeps around one instant, which is its only frame; scans are kept."""
 
-    reference_sensors = ()
-    has_area_weights = False
-    block_indices = None
     path = Path("simulated")
 
     def __init__(self, sweeps, instant, window_s, *, labelled=True):

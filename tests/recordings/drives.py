@@ -9,12 +9,13 @@ import torch
 from torchcover.data import Scan
 from torchcover.detection import Boxes
 from torchcover.geometry import BoundingBox, build_transform, convert_euler_to_rotation, invert, transform_points
+from torchcover.recordings.recording import Recording
 
 CAR_SIZE_M = (4.0, 2.0, 1.5)
 
 
 @dataclass
-class Drive:
+class Drive(Recording):
     """Straight drive past a wall, behind a faster car. Points lie on the wall and on the rear of the car.
 
     Sensor `left` observes the wall at negative x of the vehicle frame, `right` the whole wall and the car.
@@ -26,9 +27,6 @@ class Drive:
     origin_m: tuple = (0.0, 0.0, 0.0)
     ego_box: BoundingBox | None = None
     sensors = ("left", "right")
-    reference_sensors = ()
-    has_area_weights = False
-    block_indices = None
     path = Path("drive")
 
     def __post_init__(self):

@@ -226,7 +226,7 @@ def read_carla_boxes(path: Path, vehicle_T_world: Matrix) -> Boxes:
         UserWarning: Boxes without a size are excluded; CARLA 0.9.8 to 0.9.14 writes some for bicycles and walkers.
     """
     table = read_csv(path, (*POSE_COLUMNS, *EXTENT_COLUMNS), ("id", "category"), VELOCITY_COLUMNS)
-    has_size = (stack_columns(table.numbers, EXTENT_COLUMNS) > 0).all(axis=1)
+    has_size = np.asarray((stack_columns(table.numbers, EXTENT_COLUMNS) > 0).all(axis=1))
     numbers, count = {name: column[has_size] for name, column in table.numbers.items()}, int(has_size.sum())
     if count < len(has_size):
         empty = int(np.argmin(has_size))
