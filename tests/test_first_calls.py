@@ -27,7 +27,7 @@ print(json.dumps(seen))
 @pytest.mark.parametrize(
     "module",
     [
-        "torchcover.cameras.build_camera",
+        "torchcover.cameras.camera",
         "torchcover.contrib.ratio_metrics",
     ],
 )

@@ -52,14 +52,14 @@ def coverage():
     reference = PaperReference(rows=256, columns=256)
     rigs = (*RIGS, *FITTED)
     frames = SimulatedFrames(ROAD, rigs={name: name for name in rigs}, num_frames=8, seed=0, reference_sensor=reference)
-    observers = {name: CoverageObserver(CoverageMetric(GRID, max_radius=GRID.diagonal_m), name) for name in rigs}
+    observers = {name: CoverageObserver(CoverageMetric(GRID, max_radius_m=GRID.diagonal_m), name) for name in rigs}
     observe(frames, observers.values())
     return {name: observer.compute() for name, observer in observers.items()}
 
 
-def row(coverage, rig, x, y=(-8.0, 8.0), height="ground"):
+def row(coverage, rig, x, y=(-8.0, 8.0), band="ground"):
     rows = coverage[rig].summary([Region("here", x, y)])
-    (found,) = [row for row in rows if row.height == height]
+    (found,) = [row for row in rows if row.band == band]
     assert found.observed_cells > 0
     return Here(found.numbers["radius_m"].value, found.numbers["detection_0.4m"].value)
 
@@ -133,4 +133,4 @@ def test_resolution_matters_for_ground_and_long_range(coverage):
 
 def test_the_rigs_are_compared_on_the_same_cells(coverage):
     for name in RIGS[1:]:
-        assert torch.equal(coverage[name].points, coverage[RIGS[0]].points)
+        assert torch.equal(coverage[name].point_counts, coverage[RIGS[0]].point_counts)
