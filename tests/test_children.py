@@ -184,7 +184,7 @@ def test_a_stopped_sumo_is_reported(stopped, tmp_path, monkeypatch):
     assert [message.split(" (process ")[0] for message in stopped] == ["SUMO's sumo"]
 
 
-def test_program_that_is_stopped_before_it_runs_is_reported(stopped, tmp_path, monkeypatch):
+def test_program_stopped_before_it_runs_is_reported(stopped, tmp_path, monkeypatch):
     monkeypatch.setattr(processes, "report_stopped_processes", partial(report_stopped_processes, poll_interval_s=0.1))
     stop = lambda *_: os.kill(os.getpid(), signal.SIGSTOP)  # noqa: E731
     monkeypatch.setattr(isolated, "end_with_parent", lambda: stop)
