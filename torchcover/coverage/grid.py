@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from types import MappingProxyType
 from typing import Literal, NamedTuple, get_args
 
@@ -70,7 +71,7 @@ class BevGrid:
     x_m: tuple[float, float]
     y_m: tuple[float, float]
     cell_m: float = 0.25
-    heights: Mapping[str, tuple[float, float]] = field(default_factory=lambda: dict(PAPER_HEIGHTS))
+    heights: Mapping[str, tuple[float, float]] = field(default_factory=partial(dict, PAPER_HEIGHTS))
     band_frame: BandFrame = "vehicle"
 
     def __post_init__(self) -> None:

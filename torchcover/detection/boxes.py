@@ -4,6 +4,7 @@ import math
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -219,7 +220,7 @@ class Boxes:
         Returns:
             The copy; its tensors are float32 if the device does not support float64.
         """
-        return self._transform_tensors(lambda tensor: move_tensor(tensor, device))
+        return self._transform_tensors(partial(move_tensor, device=device))
 
     def _transform_tensors(self, transform: Callable[[Tensor], Tensor], **names: tuple[str, ...]) -> "Boxes":
         """Copy the boxes with every tensor transformed, and with other names if the number of boxes changes."""

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -87,7 +88,7 @@ class BoxVisibility:
         Returns:
             The copy; its tensors are float32 if the device does not support float64.
         """
-        return self._transform_tensors(lambda tensor: move_tensor(tensor, device))
+        return self._transform_tensors(partial(move_tensor, device=device))
 
     def _transform_tensors(self, transform: Callable[[Tensor], Tensor]) -> "BoxVisibility":
         names = ("share", "mean_radius_m", "reference_points", "sampled_points", "sensor_points")

@@ -4,6 +4,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from itertools import groupby
+from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -209,7 +210,7 @@ class EncounterResults:
     def _build_time_table(self, rows: Sequence[EncounterRow], rigs: Sequence[str]) -> PageTable:
         """Build the table of the times to collision in a set of encounters."""
         cells = []
-        for (encounter, speed), group in groupby(rows, key=lambda row: (row.encounter, row.speed_label)):
+        for (encounter, speed), group in groupby(rows, key=attrgetter("encounter", "speed_label")):
             row_by_rig = {row.rig: row for row in group}
             # The braking time does not depend on the rig.
             braking_time_s = next(iter(row_by_rig.values())).braking_time_s

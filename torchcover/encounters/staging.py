@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import combinations
+from operator import attrgetter
 
 import numpy as np
 
@@ -142,7 +143,7 @@ class StagedEncounter:
         ego_box, is_reversing = self.ego_solid.bounding_box, self.encounter.ego.speed_kmh < 0
         placed_obstacles = []
         row_ends_m: dict[tuple[str, str], float] = {}
-        rows = sorted(self.encounter.obstacles, key=lambda obstacle: (obstacle.side, obstacle.position))
+        rows = sorted(self.encounter.obstacles, key=attrgetter("side", "position"))
         for obstacle in rows:
             row = obstacle.side, obstacle.position
             # The ego vehicle comes from -x, in reverse from x.

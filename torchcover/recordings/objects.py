@@ -4,6 +4,7 @@ import hashlib
 import math
 from bisect import bisect_left
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -48,7 +49,7 @@ def group_by_name(states: Iterable[ObjectState]) -> dict[str, list[ObjectState]]
         Name of each object and its states, ordered by time.
     """
     states_by_name: dict[str, list[ObjectState]] = {}
-    for state in sorted(states, key=lambda state: state.time_s):
+    for state in sorted(states, key=attrgetter("time_s")):
         states_by_name.setdefault(state.name, []).append(state)
     return states_by_name
 

@@ -4,6 +4,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -212,7 +213,7 @@ def map_drive(
         static_points_m = static_points_m[find_first_occurrences(compute_voxel_indices(static_points_m, CELL_M))]
         ground_map.add(recording, reference, index, poses[index])
         last_frame = max(sweeps.find_frames_in_window(recording, index))
-    dynamic_scans.sort(key=lambda scan: scan.time_s)
+    dynamic_scans.sort(key=attrgetter("time_s"))
     return MappedDrive(ground_map.build_height_field(recording), static_points_m, dynamic_scans, range_images)
 
 

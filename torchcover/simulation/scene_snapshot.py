@@ -4,6 +4,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
@@ -109,8 +110,8 @@ class SceneSnapshot:
     moving_bodies: MovingBodies
     ego_index: int
     num_out_of_range: int = 0
-    ground: LocalGround = field(default_factory=lambda: LocalGround([], np.zeros(3)))
-    world_T_vehicle: Matrix = field(default_factory=lambda: np.eye(4))
+    ground: LocalGround = field(default_factory=partial(LocalGround, [], np.zeros(3)))
+    world_T_vehicle: Matrix = field(default_factory=partial(np.eye, 4))
     sample_motion: MotionSampler = sample_no_motion
     _motions: dict[tuple[float, float], ScanMotion | None] = field(default_factory=dict)
 

@@ -3,6 +3,7 @@
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from functools import cache, lru_cache
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -291,7 +292,7 @@ def _is_blocked(agent: Agent, passages: Sequence[JunctionPassage], gap_m: float,
     """Test whether an agent is on a junction, or closer than a gap to a junction or to a neighbor."""
     rear_m, front_m = agent.lane_position_m - agent.length_m / 2, agent.lane_position_m + agent.length_m / 2
     # Passages are in order: the first one that is not behind is the nearest.
-    next_passage = bisect_right(passages, rear_m, key=lambda passage: passage.exit_m)
+    next_passage = bisect_right(passages, rear_m, key=attrgetter("exit_m"))
     if next_passage < len(passages) and front_m > passages[next_passage].stop_line_m - gap_m:
         return True
     return any(
