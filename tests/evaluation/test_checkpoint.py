@@ -396,3 +396,35 @@ def test_edited_checkpoint_is_rejected(frame_of, path):
                 archive.comment = comment
             with pytest.raises(BadFileError, match="the file was edited or is damaged; start again"):
                 evaluate(SyntheticFrames(frame_of), path, num_frames=3)
+
+
+@pytest.mark.parametrize(
+    ("part", "change"),
+    [
+        ("identity", {"seed": 5}),
+        ("run", {"num_frames": "3"}),
+        ("run", {"num_frames": 10**30}),
+        ("run", {"counts": "abc"}),
+        ("run", {"counts": {"a": "b"}}),
+        ("run", {"skipped_frames": 5}),
+        ("run", {"duration_s": None}),
+        ("run", {"duration_s": float("nan")}),
+    ],
+)
+def test_checkpoint_with_values_of_other_types_is_rejected(frame_of, path, part, change):
+    evaluate(SyntheticFrames(frame_of), path, num_frames=3)
+    header = read_header(path)
+    states = {name: read_state(path, header, name) for name in header["states"]}
+    parts = {name: header[name] for name in ("identity", "run")}
+    parts[part] = {**parts[part], **change}
+    write_checkpoint(path, parts, states)
+    with pytest.raises(BadFileError, match="values of other types than written"):
+        evaluate(SyntheticFrames(frame_of), path, num_frames=4)
+
+
+def test_checkpoint_with_other_states_is_named(frame_of, path):
+    evaluate(SyntheticFrames(frame_of), path, num_frames=3)
+    header = read_header(path)
+    write_checkpoint(path, {name: header[name] for name in ("identity", "run")}, dict.fromkeys(header["states"], 5))
+    with pytest.raises(BadFileError, match=r"checkpoint\.npz: "):
+        evaluate(SyntheticFrames(frame_of), path, num_frames=4)

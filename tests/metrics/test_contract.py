@@ -17,6 +17,7 @@ from torchmetrics.wrappers import BootStrapper, MinMaxMetric
 import torchcover.contrib
 import torchcover.coverage
 import torchcover.detection
+from torchcover import BevGrid, CoverageMetric
 from torchcover.contrib import FrameMetric, SceneRatios
 from torchcover.coverage import CoverageSums
 from torchcover.metrics import BlockedSums, MergeableMetric
@@ -451,6 +452,21 @@ def test_states_with_gaps_or_other_shapes_raise(case):
             with pytest.raises(RuntimeError, match=f"'{name}'|belongs to another metric"):
                 metric.load_state_dict(broken)
     assert_states(metric, before)
+
+
+@pytest.mark.parametrize("name", ["fingerprint", "num_frames"])
+@pytest.mark.parametrize("kind", ["number", "meta", "sparse", "expanded"])
+def test_stored_states_that_are_no_dense_tensors_raise(name, kind):
+    metric = CoverageMetric(BevGrid(x_m=(-8.0, 8.0), y_m=(-8.0, 8.0), cell_m=8.0))
+    state = metric.metric_state[name]
+    values = {
+        "number": 5,
+        "meta": torch.empty(state.shape, device="meta"),
+        "sparse": state.reshape(1, -1).to_sparse(),
+        "expanded": torch.zeros(1).expand(2**45),  # 4 bytes in a file, 2**48 bytes as int64
+    }
+    with pytest.raises(ValueError, match=r"belongs to another metric|is needed; got"):
+        metric.merge_state({**metric.metric_state, name: values[kind]})
 
 
 @EVERY

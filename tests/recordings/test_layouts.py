@@ -92,6 +92,9 @@ def test_readers_read_scans_only_on_request(written, monkeypatch):
         ("sample_data", lambda row: row.update(filename="x/LIDAR_TOP/../../a.bin"), "which is not within it"),
         ("ego_pose", lambda row: row.update(rotation=[0, 0, 0, 0]), "norm 0"),
         ("sample_annotation", lambda row: row.pop("size"), "KeyError: 'size'"),
+        ("sample_annotation", lambda row: row.update(size=[{}, 4.0, 1.5]), "'dict'"),
+        ("sample_annotation", lambda row: row.update(size=[10**400, 4.0, 1.5]), "too large"),
+        ("sample_annotation", lambda row: row.update(size=[float("nan"), 4.0, 1.5]), "three finite numbers"),
     ],
 )
 def test_inconsistent_tables_are_bad_files(tmp_path, table, change, named):

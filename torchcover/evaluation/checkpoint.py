@@ -24,7 +24,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchcover.evaluation.observers import CoverageObserver, Stateful
-from torchcover.files import check_dtype_kind, check_memory, guard_reader, parse_json, read_npz, write_atomically
+from torchcover.files import (
+    check_dtype_kind,
+    check_memory,
+    guard_reader,
+    parse_json,
+    read_npz,
+    report_bad_file,
+    write_atomically,
+)
 
 FORMAT_VERSION = 3
 HEADER = "header"
@@ -131,7 +139,8 @@ class CheckpointManager:
                 "choose another folder"
             )
         for name, stateful in self._states.items():
-            stateful.load_state_dict(read_state(self.path, header, name))
+            with report_bad_file(self.path, "a checkpoint"):
+                stateful.load_state_dict(read_state(self.path, header, name))
         saved = header["run"]
         run.num_frames = saved["num_frames"]
         run.skipped_frames = saved["skipped_frames"]
@@ -240,7 +249,23 @@ def read_header(path: Path) -> dict[str, Any]:
     for name, keys in (("identity", ()), ("run", RUN_KEYS), ("states", ())):
         if not isinstance(header.get(name), dict) or not set(keys) <= header[name].keys():
             raise ValueError(f"incomplete checkpoint: {name} is missing, or parts of it")
+    _check_value_types(header)
     return header
+
+
+def _check_value_types(header: Mapping[str, Any]) -> None:
+    """Check the values of a header, which may come from an edited file with a correct checksum."""
+    run = header["run"]
+    has_texts = isinstance(run["skipped_frames"], list)
+    has_texts = has_texts and all(
+        isinstance(text, str) for text in (*header["identity"].values(), *run["skipped_frames"])
+    )
+    numbers = [run["num_frames"], run["duration_s"]]
+    has_counts = isinstance(run["counts"], dict)
+    numbers += run["counts"].values() if has_counts else []
+    has_numbers = all(type(number) in (int, float) and 0 <= number < 2**63 for number in numbers)
+    if not (has_texts and has_counts and has_numbers and isinstance(run["num_frames"], int)):
+        raise ValueError("the identity or the run has values of other types than written; start again")
 
 
 @guard_reader("a checkpoint")

@@ -4,7 +4,7 @@ import hashlib
 import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, TypeGuard
 
 import numpy as np
 import torch
@@ -217,7 +217,9 @@ class MergeableSums:
     def _copy_states(self, states: Mapping[str, Tensor]) -> dict[str, Any]:
         """Copy the states of a metric with the same definition to this device and these types."""
         fingerprint = states.get("fingerprint")
-        if fingerprint is None or not torch.equal(fingerprint.to(self.fingerprint), self.fingerprint):
+        # Shapes are compared first: a stored tensor of few bytes may claim any size.
+        has_shape = _is_dense(fingerprint) and fingerprint.shape == self.fingerprint.shape
+        if not (has_shape and torch.equal(fingerprint.to(self.fingerprint), self.fingerprint)):
             raise ValueError(
                 f"the state belongs to another metric than this {type(self).__name__}, or to one with other "
                 f"{', '.join(self.definition)}"
@@ -226,16 +228,24 @@ class MergeableSums:
         for name in self._defaults:
             state, incoming = getattr(self, name), states.get(name)
             needed = tuple(state.shape)
-            if name in self._tables and incoming is not None:
+            is_dense = _is_dense(incoming)
+            if name in self._tables and is_dense:
                 needed = (*incoming.shape[:1], *needed[1:])
-            if incoming is None or tuple(incoming.shape) != needed:
-                arrived = "none" if incoming is None else tuple(incoming.shape)
+            if not is_dense or tuple(incoming.shape) != needed:
+                arrived = tuple(incoming.shape) if is_dense else "none"
                 raise ValueError(f"state {name!r} of shape {needed} is needed; got {arrived}")
             copies[name] = incoming.to(device=state.device, dtype=state.dtype, copy=True)
         return copies
 
     def _handle_added_frames(self) -> None:
         """React to frames that were not added by `update`."""
+
+
+def _is_dense(value: object) -> TypeGuard[Tensor]:
+    """Return whether a value is a tensor whose elements are all stored."""
+    if not isinstance(value, Tensor) or value.layout != torch.strided or value.is_meta:
+        return False
+    return value.nbytes <= value.untyped_storage().nbytes()
 
 
 def insert_rows(table: Tensor, new_rows: Tensor) -> Tensor:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from torchcover.cameras.calibration import read_nuscenes
+from torchcover.cameras.calibration_values import describe_value
 from torchcover.detection.boxes import Boxes
 from torchcover.files import load_road_user_classes, read_json_table, report_bad_file
 from torchcover.geometry import BoundingBox, build_transform, convert_quaternion_to_rotation, invert
@@ -205,7 +206,7 @@ def _read_states(tables: Path, times_s: Mapping[str, float]) -> list[ObjectState
     states = []
     for row in read_json_table(tables / "sample_annotation.json").rows:
         if row["sample_token"] in times_s:
-            width, length, height = row["size"]
+            width, length, height = _parse_size(row)
             name = row["instance_token"]
             category = str(categories.get_row(instances.get_row(name)["category_token"])["name"])
             world_T_box = build_transform(convert_quaternion_to_rotation(row["rotation"]), row["translation"])
@@ -213,6 +214,14 @@ def _read_states(tables: Path, times_s: Mapping[str, float]) -> list[ObjectState
             size_m = (length, width, height)
             states.append(ObjectState(name, times_s[row["sample_token"]], world_T_box, size_m, category, visibility))
     return states
+
+
+def _parse_size(row: dict[str, Any]) -> list[float]:
+    """Parse the width, length and height of an annotation; ValueError for anything but three finite numbers."""
+    size_m = np.asarray(row["size"], dtype=np.float64)
+    if size_m.shape != (3,) or not np.isfinite(size_m).all():
+        raise ValueError(f"sample_annotation: size: three finite numbers are needed; got {describe_value(row['size'])}")
+    return [float(value) for value in size_m]
 
 
 def _find_scene_token(samples: list[dict[str, Any]], path: Path, scene: str | None) -> str:
