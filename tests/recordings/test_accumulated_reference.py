@@ -278,3 +278,13 @@ def test_unreadable_labels_fail_only_their_sweep():
     for index in (0, 1, 11):  # whose boxes half a second before or after are not to be had
         assert frames[index].counts.get("reference_sweeps_skipped", 0) == 0
     assert frames[5].counts["reference_sweeps_skipped"] == 2
+
+
+@pytest.mark.parametrize("position_m", [1e11, -1e12])
+def test_a_position_far_from_the_first_one_is_a_bad_frame(position_m):
+    drive = Drive()
+    drive.read_scan = Drive().read_scan
+    drive.get_world_T_vehicle = lambda index: build_transform(np.eye(3), [position_m * (index > 0), -position_m, 0.0])
+    frames = RecordedFrames(drive, reference=AccumulatedReference())
+    with pytest.raises(BadFrameError, match="m from its position in"):
+        frames[1]

@@ -22,6 +22,9 @@ from torchcover.recordings.ground_model import GroundModel, extract_low_surfaces
 from torchcover.recordings.recording import Recording, Scan
 from torchcover.recordings.vehicle_cloud import VehicleCloud, transform_to_vehicle
 
+# Farther from the first position, indices of voxels and columns would overflow; UTM coordinates in mm are smaller.
+MAX_DISTANCE_M = 1e10
+
 
 @dataclass(frozen=True)
 class SweepParams:
@@ -215,9 +218,21 @@ class SweepWindow:
         Args:
             recording: The recording.
             index: Index of the frame.
+
+        Raises:
+            BadFrameError: The vehicle is more than `MAX_DISTANCE_M` from its first position.
         """
         first_position_m = _get_pose_or_identity(recording, 0)[:3, 3]
-        return build_transform(np.eye(3), -first_position_m) @ _get_pose_or_identity(recording, index)
+        pose = _get_pose_or_identity(recording, index)
+        offset_m = pose[:3, 3] / 2 - first_position_m / 2  # half of the offset, which cannot overflow
+        distance_m = 2.0 * float(np.abs(offset_m).max())
+        if not distance_m <= MAX_DISTANCE_M:
+            name = recording.frame_names[index]
+            raise BadFrameError(
+                f"{name}: the vehicle is {distance_m:.3g} m from its position in {recording.frame_names[0]}; "
+                "correct its poses, which need meters"
+            )
+        return build_transform(np.eye(3), -first_position_m) @ pose
 
     def get_ground_model(self, recording: Recording, index: int) -> GroundModel | None:
         """Get the ground that all sensors observed within the window.
