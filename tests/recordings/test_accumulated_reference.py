@@ -281,7 +281,7 @@ def test_unreadable_labels_fail_only_their_sweep():
 
 
 @pytest.mark.parametrize("position_m", [1e11, -1e12])
-def test_a_position_far_from_the_first_one_is_a_bad_frame(position_m):
+def test_positions_far_from_the_first_are_bad_frames(position_m):
     drive = Drive()
     drive.read_scan = Drive().read_scan
     drive.get_world_T_vehicle = lambda index: build_transform(np.eye(3), [position_m * (index > 0), -position_m, 0.0])

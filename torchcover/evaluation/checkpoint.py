@@ -256,15 +256,13 @@ def read_header(path: Path) -> dict[str, Any]:
 def _check_value_types(header: Mapping[str, Any]) -> None:
     """Check the values of a header, which may come from an edited file with a correct checksum."""
     run = header["run"]
-    has_texts = isinstance(run["skipped_frames"], list)
-    has_texts = has_texts and all(
-        isinstance(text, str) for text in (*header["identity"].values(), *run["skipped_frames"])
-    )
-    numbers = [run["num_frames"], run["duration_s"]]
-    has_counts = isinstance(run["counts"], dict)
-    numbers += run["counts"].values() if has_counts else []
-    has_numbers = all(type(number) in (int, float) and 0 <= number < 2**63 for number in numbers)
-    if not (has_texts and has_counts and has_numbers and isinstance(run["num_frames"], int)):
+    is_valid = isinstance(run["skipped_frames"], list) and isinstance(run["counts"], dict)
+    if is_valid:
+        for text in (*header["identity"].values(), *run["skipped_frames"]):
+            is_valid &= isinstance(text, str)
+        for number in (run["num_frames"], run["duration_s"], *run["counts"].values()):
+            is_valid &= type(number) in (int, float) and 0 <= number < 2**63
+    if not (is_valid and isinstance(run["num_frames"], int)):
         raise ValueError("the identity or the run has values of other types than written; start again")
 
 

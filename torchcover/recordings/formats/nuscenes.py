@@ -206,7 +206,7 @@ def _read_states(tables: Path, times_s: Mapping[str, float]) -> list[ObjectState
     states = []
     for row in read_json_table(tables / "sample_annotation.json").rows:
         if row["sample_token"] in times_s:
-            width, length, height = _parse_size(row)
+            width, length, height = _parse_size(row).tolist()
             name = row["instance_token"]
             category = str(categories.get_row(instances.get_row(name)["category_token"])["name"])
             world_T_box = build_transform(convert_quaternion_to_rotation(row["rotation"]), row["translation"])
@@ -216,12 +216,12 @@ def _read_states(tables: Path, times_s: Mapping[str, float]) -> list[ObjectState
     return states
 
 
-def _parse_size(row: dict[str, Any]) -> list[float]:
+def _parse_size(row: dict[str, Any]) -> NDArray[np.float64]:
     """Parse the width, length and height of an annotation; ValueError for anything but three finite numbers."""
     size_m = np.asarray(row["size"], dtype=np.float64)
     if size_m.shape != (3,) or not np.isfinite(size_m).all():
         raise ValueError(f"sample_annotation: size: three finite numbers are needed; got {describe_value(row['size'])}")
-    return [float(value) for value in size_m]
+    return size_m
 
 
 def _find_scene_token(samples: list[dict[str, Any]], path: Path, scene: str | None) -> str:
