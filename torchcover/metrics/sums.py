@@ -4,7 +4,7 @@ import hashlib
 import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any, Self, TypeGuard
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import torch
@@ -216,23 +216,24 @@ class MergeableSums:
 
     def _copy_states(self, states: Mapping[str, Tensor]) -> dict[str, Any]:
         """Copy the states of a metric with the same definition to this device and these types."""
-        fingerprint = states.get("fingerprint")
-        # Shapes are compared first: a stored tensor of few bytes may claim any size.
-        has_shape = _is_dense(fingerprint) and fingerprint.shape == self.fingerprint.shape
-        if not (has_shape and torch.equal(fingerprint.to(self.fingerprint), self.fingerprint)):
+        fingerprint = _get_stored_tensor(states.get("fingerprint"))
+        if (
+            fingerprint is None
+            or fingerprint.shape != self.fingerprint.shape
+            or not torch.equal(fingerprint.to(self.fingerprint), self.fingerprint)
+        ):
             raise ValueError(
                 f"the state belongs to another metric than this {type(self).__name__}, or to one with other "
                 f"{', '.join(self.definition)}"
             )
         copies = {}
         for name in self._defaults:
-            state, incoming = getattr(self, name), states.get(name)
+            state, incoming = getattr(self, name), _get_stored_tensor(states.get(name))
             needed = tuple(state.shape)
-            is_dense = _is_dense(incoming)
-            if name in self._tables and is_dense:
+            if name in self._tables and incoming is not None:
                 needed = (*incoming.shape[:1], *needed[1:])
-            if not is_dense or tuple(incoming.shape) != needed:
-                arrived = tuple(incoming.shape) if is_dense else "none"
+            if incoming is None or tuple(incoming.shape) != needed:
+                arrived = "none" if incoming is None else tuple(incoming.shape)
                 raise ValueError(f"state {name!r} of shape {needed} is needed; got {arrived}")
             copies[name] = incoming.to(device=state.device, dtype=state.dtype, copy=True)
         return copies
@@ -241,11 +242,11 @@ class MergeableSums:
         """React to frames that were not added by `update`."""
 
 
-def _is_dense(value: object) -> TypeGuard[Tensor]:
-    """Return whether a value is a tensor whose elements are all stored."""
+def _get_stored_tensor(value: object) -> Tensor | None:
+    """Return a tensor whose elements are all stored, since a few bytes may claim any size; None for other values."""
     if not isinstance(value, Tensor) or value.layout != torch.strided or value.is_meta:
-        return False
-    return value.nbytes <= value.untyped_storage().nbytes()
+        return None
+    return value if value.nbytes <= value.untyped_storage().nbytes() else None
 
 
 def insert_rows(table: Tensor, new_rows: Tensor) -> Tensor:
